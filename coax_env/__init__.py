@@ -1,0 +1,78 @@
+"""coax: a Gymnasium environment and controller design workbench for a micro coaxial helicopter.
+
+One compiled model of the flight dynamics (dynamics.py) stands in the middle::
+
+    vehicles/*.toml -> vehicle -> dynamics (+ effects) -> sensors -> env -> controllers -> scripts
+    flight folder -> flight -> engine (innovations, likelihood) -> identification -> vehicle file
+    flight + model -> innovations -> signatures -> diagnosis -> extended vehicle -> gain, report
+
+The names below are imported when first used, so that ``import coax_env`` is light and works without
+torch, plotly and control. Importing it registers ``CoaxHeli-v0`` with Gymnasium.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from coax_env.errors import InputError
+
+if TYPE_CHECKING:
+    from coax_env.diagnosis import diagnose
+    from coax_env.dynamics import derivative, hover_trim
+    from coax_env.flight import read_flight, write_flight
+    from coax_env.identification import identify
+    from coax_env.linear import linearize
+    from coax_env.prediction import replay
+    from coax_env.simulation import simulate
+    from coax_env.vehicle import Vehicle, load_vehicle
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Vehicle": "vehicle",
+    "load_vehicle": "vehicle",
+    "derivative": "dynamics",
+    "hover_trim": "dynamics",
+    "linearize": "linear",
+    "read_flight": "flight",
+    "write_flight": "flight",
+    "simulate": "simulation",
+    "replay": "prediction",
+    "identify": "identification",
+    "diagnose": "diagnosis",
+}
+
+__all__ = [
+    "InputError",
+    "Vehicle",
+    "derivative",
+    "diagnose",
+    "hover_trim",
+    "identify",
+    "linearize",
+    "load_vehicle",
+    "read_flight",
+    "replay",
+    "simulate",
+    "write_flight",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"coax_env.{_HOME[name]}"), name)
+
+
+def _register() -> None:
+    from gymnasium.envs.registration import register, registry
+
+    if "CoaxHeli-v0" not in registry:
+        register(
+            id="CoaxHeli-v0",
+            entry_point="coax_env.env:CoaxEnv",
+            vector_entry_point="coax_env.env:CoaxVectorEnv",
+            max_episode_steps=2000,
+        )
+
+
+_register()

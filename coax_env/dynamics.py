@@ -1,0 +1,412 @@
+"""The model, equations (1)-(44) of the paper, as one compiled kernel, and its Python faces.
+
+Data flow of one step::
+
+    properties(p) -> actuators(x, u, dt) -> rates(x) four times (RK4) -> x at the row's end
+                                            |
+                              AIR, SWASH, ROTOR, LOAD effects of effects.py
+
+`measure` runs the same flow once and turns it into readings of every canonical channel. The env, the
+batch env, the estimator, identification, diagnosis and linearisation all call `step`, `rates` and
+`measure`; there is no second copy of the physics.
+
+Time: the command of a row holds until the next row (zero-order hold). Actuators are discretised
+exactly over the step. A reading at a row is taken just after the row's command has been given
+(READING_DELAY), so that an actuator without lag has already moved.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import float64, types
+
+from coax_env import effects
+from coax_env import flow as F
+from coax_env import parameters as P
+from coax_env.errors import InputError
+from coax_env.jit import compiled, pointer
+from coax_env.layout import CHANNELS, N_CHANNELS, N_COMMANDS, N_FULL, N_INPUTS, N_STATES, TIME
+from coax_env.vehicle import Vehicle, load_vehicle
+
+READING_DELAY = 1e-4  # [s] after the command of the same row
+LONGEST_STEP = 0.02  # [s] a longer row is split
+SHORTEST_LAG = 1e-9  # [s] stands for none: exp(-READING_DELAY/SHORTEST_LAG) is zero
+
+_air_effects = effects.stage_function(effects.AIR)
+_swash_effects = effects.stage_function(effects.SWASH)
+_rotor_effects = effects.stage_function(effects.ROTOR)
+_load_effects = effects.stage_function(effects.LOAD)
+_sensor_effects = effects.stage_function(effects.SENSOR)
+_property_effects = effects.stage_function(effects.PROPERTY)
+
+WORK_SIZE = F.N_FLOW + N_FULL + 2 * N_STATES
+"""Doubles of scratch that `step` and `measure` need."""
+
+
+@compiled()
+def _properties(x, u, p, f):
+    """Vehicle file's numbers into the workspace, once a step. (15)-(20)."""
+    f[F.TIME] = u[TIME]
+    f[F.MASS] = p[P.MASS]
+    f[F.INERTIA_XX] = p[P.INERTIA_XX]
+    f[F.INERTIA_YY] = p[P.INERTIA_YY]
+    f[F.INERTIA_ZZ] = p[P.INERTIA_ZZ]
+    f[F.SWASH_TO_FLAP] = p[P.SWASH_TO_FLAP]
+    f[F.FLAP_TIME] = p[P.FLAP_TIME]
+    f[F.FLYBAR_TIME] = p[P.FLYBAR_TIME]
+    radius = p[P.ROTOR_RADIUS]
+    k_T = p[P.AIR_DENSITY] * math.pi * radius * radius * radius * radius
+    k_Q = k_T * radius
+    f[F.THRUST_FACTOR_U] = p[P.C_TU] * k_T
+    f[F.THRUST_FACTOR_L] = p[P.C_TL] * k_T
+    f[F.TORQUE_FACTOR_U] = p[P.C_QU] * k_Q
+    f[F.TORQUE_FACTOR_L] = p[P.C_QL] * k_Q
+    f[F.MOTOR_LAG_U] = 0.0
+    f[F.MOTOR_LAG_L] = 0.0
+    f[F.SERVO_LAG] = 0.0
+    f[F.SPEED_SCALE] = 1.0
+    f[F.OMEGA_U_DOT] = 0.0
+    f[F.OMEGA_L_DOT] = 0.0
+    if p[effects.PROPERTY] != 0.0:
+        _property_effects(x, f, p)
+
+
+@compiled()
+def _follow(start, command, time, lag):
+    """Exact first-order response to a held command."""
+    return command + (start - command) * math.exp(-time / max(lag, SHORTEST_LAG))
+
+
+@compiled()
+def _actuate(x, u, time, f, out):
+    """Rotor speeds and swash tilt at `time` after the row's command, into the state `out`."""
+    out[16] = _follow(x[16], u[0] * f[F.SPEED_SCALE], time, f[F.MOTOR_LAG_U])
+    out[17] = _follow(x[17], u[1] * f[F.SPEED_SCALE], time, f[F.MOTOR_LAG_L])
+    out[18] = _follow(x[18], u[2], time, f[F.SERVO_LAG])
+    out[19] = _follow(x[19], u[3], time, f[F.SERVO_LAG])
+
+
+@compiled()
+def _rates(x, p, f, dx):
+    """Rates of the paper's sixteen states, (26)-(44), shape (16,), into `dx`.
+
+    Needs `_properties` before it. Leaves loads and rates in the workspace `f`.
+    """
+    p_, q_, r_ = x[3], x[4], x[5]
+    sin_phi, cos_phi = math.sin(x[10]), math.cos(x[10])
+    sin_theta, cos_theta = math.sin(x[11]), math.cos(x[11])
+    sin_psi, cos_psi = math.sin(x[12]), math.cos(x[12])
+    f[F.SIN_PHI], f[F.COS_PHI] = sin_phi, cos_phi
+    f[F.SIN_THETA], f[F.COS_THETA] = sin_theta, cos_theta
+    f[F.SIN_PSI], f[F.COS_PSI] = sin_psi, cos_psi
+    f[F.HEIGHT] = -x[15]
+
+    f[F.AIR_U], f[F.AIR_V], f[F.AIR_W] = x[0], x[1], x[2]
+    if p[effects.AIR] != 0.0:
+        _air_effects(x, f, p)
+
+    f[F.DELTA_LON], f[F.DELTA_LAT] = x[18], x[19]
+    if p[effects.SWASH] != 0.0:
+        _swash_effects(x, f, p)
+
+    # (15)-(20); upper tilt by the fly-bar, (30)-(31)
+    omega_u, omega_l = x[16], x[17]
+    f[F.OMEGA_U], f[F.OMEGA_L] = omega_u, omega_l
+    f[F.THRUST_U] = f[F.THRUST_FACTOR_U] * omega_u * omega_u
+    f[F.THRUST_L] = f[F.THRUST_FACTOR_L] * omega_l * omega_l
+    f[F.TORQUE_U] = f[F.TORQUE_FACTOR_U] * omega_u * omega_u
+    f[F.TORQUE_L] = f[F.TORQUE_FACTOR_L] * omega_l * omega_l
+    f[F.ALPHA_U] = p[P.FLYBAR_TO_ROTOR_LON] * x[8]
+    f[F.BETA_U] = p[P.FLYBAR_TO_ROTOR_LAT] * x[9]
+    f[F.ALPHA_L], f[F.BETA_L] = x[6], x[7]
+    if p[effects.ROTOR] != 0.0:
+        _rotor_effects(x, f, p)
+
+    # (26)-(27)
+    tau = f[F.FLAP_TIME]
+    gain = f[F.SWASH_TO_FLAP]
+    f[F.ALPHA_L_DOT] = (
+        gain * f[F.DELTA_LON] - x[6] - p[P.FLAP_COUPLING_LON] * x[7]
+    ) / tau - q_
+    f[F.BETA_L_DOT] = (gain * f[F.DELTA_LAT] - x[7] + p[P.FLAP_COUPLING_LAT] * x[6]) / tau - p_
+
+    # (13)-(14): thrust along [-tan a, tan b, -1], normalised
+    tan_a, tan_b = math.tan(f[F.ALPHA_U]), math.tan(f[F.BETA_U])
+    along = f[F.THRUST_U] / math.sqrt(1.0 + tan_a * tan_a + tan_b * tan_b)
+    x_u, y_u, z_u = -tan_a * along, tan_b * along, -along
+    tan_a, tan_b = math.tan(f[F.ALPHA_L]), math.tan(f[F.BETA_L])
+    along = f[F.THRUST_L] / math.sqrt(1.0 + tan_a * tan_a + tan_b * tan_b)
+    x_l, y_l, z_l = -tan_a * along, tan_b * along, -along
+
+    # (21): the upper rotor's wake on the fuselage, V_i^2 = T_u / (2 rho pi R^2)
+    area = p[P.FUSELAGE_LENGTH] * p[P.FUSELAGE_WIDTH] * p[P.FUSELAGE_DRAG]
+    radius = p[P.ROTOR_RADIUS]
+    download = f[F.THRUST_U] * area / (4.0 * math.pi * radius * radius)
+
+    f[F.FORCE_X] = x_u + x_l + x[20]
+    f[F.FORCE_Y] = y_u + y_l + x[21]
+    f[F.FORCE_Z] = z_u + z_l + download + x[22]
+
+    # (35)-(37): hubs at (0, 0, -d); gyroscopic moment -omega x (0, 0, H), (23)-(25)
+    momentum = (
+        p[P.ROTOR_INERTIA_L] * omega_l - (p[P.ROTOR_INERTIA_U] + p[P.FLYBAR_INERTIA]) * omega_u
+    )
+    f[F.MOMENT_X] = p[P.ARM_U] * y_u + p[P.ARM_L] * y_l - q_ * momentum + x[23]
+    f[F.MOMENT_Y] = -p[P.ARM_U] * x_u - p[P.ARM_L] * x_l + p_ * momentum + x[24]
+    f[F.MOMENT_Z] = f[F.TORQUE_U] - f[F.TORQUE_L] + x[25]
+    if p[effects.LOAD] != 0.0:
+        _load_effects(x, f, p)
+
+    # (32)-(34)
+    g = p[P.GRAVITY]
+    u_, v_, w_ = x[0], x[1], x[2]
+    dx[0] = r_ * v_ - q_ * w_ - g * sin_theta + f[F.FORCE_X] / f[F.MASS]
+    dx[1] = p_ * w_ - r_ * u_ + g * cos_theta * sin_phi + f[F.FORCE_Y] / f[F.MASS]
+    dx[2] = q_ * u_ - p_ * v_ + g * cos_theta * cos_phi + f[F.FORCE_Z] / f[F.MASS]
+    # (35)-(37)
+    dx[3] = f[F.P_DOT] = f[F.MOMENT_X] / f[F.INERTIA_XX]
+    dx[4] = f[F.Q_DOT] = f[F.MOMENT_Y] / f[F.INERTIA_YY]
+    dx[5] = f[F.R_DOT] = f[F.MOMENT_Z] / f[F.INERTIA_ZZ]
+    # (26)-(29)
+    dx[6] = f[F.ALPHA_L_DOT]
+    dx[7] = f[F.BETA_L_DOT]
+    dx[8] = -x[8] / f[F.FLYBAR_TIME] - q_
+    dx[9] = -x[9] / f[F.FLYBAR_TIME] - p_
+    # (38)-(40)
+    turn = q_ * sin_phi + r_ * cos_phi
+    dx[10] = p_ + turn * sin_theta / cos_theta
+    dx[11] = q_ * cos_phi - r_ * sin_phi
+    dx[12] = turn / cos_theta
+    # (41)-(43)
+    forward = u_ * cos_theta + (v_ * sin_phi + w_ * cos_phi) * sin_theta
+    right = v_ * cos_phi - w_ * sin_phi
+    dx[13] = forward * cos_psi - right * sin_psi
+    dx[14] = forward * sin_psi + right * cos_psi
+    dx[15] = -u_ * sin_theta + (v_ * sin_phi + w_ * cos_phi) * cos_theta
+
+
+@compiled()
+def step(x, u, dt, p, work, out):
+    """Fly one row: full state (26,) after `dt` seconds of held input, into `out`.
+
+    RK4 on the paper's states; actuators and gusts exactly, at each stage's own time.
+
+    Args:
+        x: full state, shape (26,). u: commands and time since the run's start, shape (5,).
+        dt: seconds; rows longer than LONGEST_STEP are split. p: parameter vector.
+        work: scratch, shape (WORK_SIZE,). out: full state, shape (26,); may be `x` itself.
+    """
+    f = work[: F.N_FLOW]
+    stage = work[F.N_FLOW : F.N_FLOW + N_FULL]
+    slope = work[F.N_FLOW + N_FULL : F.N_FLOW + N_FULL + N_STATES]
+    total = work[F.N_FLOW + N_FULL + N_STATES : WORK_SIZE]
+    parts = max(1, math.ceil(dt / LONGEST_STEP - 1e-9))
+    h = dt / parts
+    for i in range(N_FULL):
+        out[i] = x[i]
+    _properties(out, u, p, f)
+    for _ in range(parts):
+        # rotor acceleration: the mean over the step, so that angular momentum is kept exactly
+        f[F.OMEGA_U_DOT] = (
+            _follow(out[16], u[0] * f[F.SPEED_SCALE], h, f[F.MOTOR_LAG_U]) - out[16]
+        ) / h
+        f[F.OMEGA_L_DOT] = (
+            _follow(out[17], u[1] * f[F.SPEED_SCALE], h, f[F.MOTOR_LAG_L]) - out[17]
+        ) / h
+        half_gust = math.exp(-0.5 * h / p[P.GUST_MEMORY])
+        for k in range(4):
+            time = 0.0 if k == 0 else (h if k == 3 else 0.5 * h)
+            fade = 1.0 if k == 0 else (half_gust * half_gust if k == 3 else half_gust)
+            for i in range(N_STATES):
+                stage[i] = out[i] if k == 0 else out[i] + time * slope[i]
+            _actuate(out, u, time + READING_DELAY, f, stage)
+            for i in range(20, N_FULL):
+                stage[i] = fade * out[i]
+            _rates(stage, p, f, slope)
+            weight = 1.0 if k == 0 or k == 3 else 2.0
+            for i in range(N_STATES):
+                total[i] = weight * slope[i] if k == 0 else total[i] + weight * slope[i]
+        for i in range(N_STATES):
+            out[i] += h / 6.0 * total[i]
+        _actuate(out, u, h, f, out)
+        for i in range(20, N_FULL):
+            out[i] *= half_gust * half_gust
+
+
+@compiled()
+def measure(x, u, p, work, out):
+    """Readings of every canonical channel, contract units, shape (18,), into `out`. Eq. (45)."""
+    f = work[: F.N_FLOW]
+    now = work[F.N_FLOW : F.N_FLOW + N_FULL]
+    slope = work[F.N_FLOW + N_FULL : F.N_FLOW + N_FULL + N_STATES]
+    _properties(x, u, p, f)
+    for i in range(N_FULL):
+        now[i] = x[i]
+    _actuate(x, u, READING_DELAY, f, now)
+    # a lagging rotor still accelerates; one without lag has arrived
+    if f[F.MOTOR_LAG_U] > 10.0 * READING_DELAY:
+        f[F.OMEGA_U_DOT] = (u[0] * f[F.SPEED_SCALE] - now[16]) / f[F.MOTOR_LAG_U]
+    if f[F.MOTOR_LAG_L] > 10.0 * READING_DELAY:
+        f[F.OMEGA_L_DOT] = (u[1] * f[F.SPEED_SCALE] - now[17]) / f[F.MOTOR_LAG_L]
+    _rates(now, p, f, slope)
+    z = f[F.READING :]
+    z[0] = now[16] * (30.0 / math.pi)
+    z[1] = now[17] * (30.0 / math.pi)
+    z[2], z[3], z[4] = x[3], x[4], x[5]
+    z[5] = f[F.FORCE_X] / f[F.MASS]
+    z[6] = f[F.FORCE_Y] / f[F.MASS]
+    z[7] = f[F.FORCE_Z] / f[F.MASS]
+    z[8], z[9], z[10] = x[10], x[11], x[12]
+    z[11] = -x[15]
+    z[12], z[13], z[14] = slope[13], slope[14], slope[15]
+    z[15], z[16] = x[13], x[14]
+    z[17] = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    if p[effects.SENSOR] != 0.0:
+        _sensor_effects(x, f, p)
+    for i in range(N_CHANNELS):
+        out[i] = z[i]
+
+
+_A = float64[::1]
+STEP = types.void(_A, _A, float64, _A, _A, _A)
+MEASURE = types.void(_A, _A, _A, _A, _A)
+
+
+@pointer(STEP)
+def step_pointer(x, u, dt, p, work, out):
+    """`step`, in the form in which the engine takes a model."""
+    step(x, u, dt, p, work, out)
+
+
+@pointer(MEASURE)
+def measure_pointer(x, u, p, work, out):
+    """`measure`, in the form in which the engine takes a model."""
+    measure(x, u, p, work, out)
+
+
+@compiled(types.void(_A, _A, _A, _A, _A))
+def _full_derivative(x, u, p, work, dx):
+    """Rates of the full state at held input, lags as first-order states."""
+    f = work[: F.N_FLOW]
+    _properties(x, u, p, f)
+    targets = (u[0] * f[F.SPEED_SCALE], u[1] * f[F.SPEED_SCALE], u[2], u[3])
+    lags = (f[F.MOTOR_LAG_U], f[F.MOTOR_LAG_L], f[F.SERVO_LAG], f[F.SERVO_LAG])
+    now = work[F.N_FLOW : F.N_FLOW + N_FULL]
+    for i in range(N_FULL):
+        now[i] = x[i]
+    for i in range(4):
+        if lags[i] > SHORTEST_LAG:
+            dx[16 + i] = (targets[i] - x[16 + i]) / lags[i]
+        else:
+            now[16 + i] = targets[i]
+            dx[16 + i] = 0.0
+    f[F.OMEGA_U_DOT] = dx[16]
+    f[F.OMEGA_L_DOT] = dx[17]
+    for i in range(20, N_FULL):
+        dx[i] = -x[i] / p[P.GUST_MEMORY]
+    _rates(now, p, f, dx)
+
+
+def full_state(state: np.ndarray, command: np.ndarray, vehicle: Vehicle) -> np.ndarray:
+    """The full state (26,): the paper's sixteen, actuators settled on the command, no gust."""
+    x = np.zeros(N_FULL)
+    x[:N_STATES] = state
+    x[16:20] = command
+    return x
+
+
+def kernel_input(command: np.ndarray, time: float = 0.0) -> np.ndarray:
+    """Commands (4,) and time [s] as the kernel's input (5,)."""
+    u = np.empty(N_INPUTS)
+    u[:N_COMMANDS] = command
+    u[TIME] = time
+    return u
+
+
+def full_derivative(x: np.ndarray, u: np.ndarray, vehicle: Vehicle) -> np.ndarray:
+    """Rates of the full state (26,) for an input (5,); actuators as first-order states."""
+    dx = np.zeros(N_FULL)
+    _full_derivative(
+        np.ascontiguousarray(x, float), np.ascontiguousarray(u, float), vehicle.vector,
+        np.zeros(WORK_SIZE), dx,
+    )  # fmt: skip
+    return dx
+
+
+def derivative(state: Any, command: Any, vehicle: Vehicle | str) -> np.ndarray:
+    """Rates of the paper's states, equations (26)-(44), actuator lags at their static limit.
+
+    Args:
+        state: shape (16,), u v w p q r alpha_l beta_l alpha_f beta_f phi theta psi x y z, SI.
+        command: shape (4,), omega_u omega_l [rad/s], delta_lon delta_lat [rad].
+        vehicle: a Vehicle, or what `load_vehicle` takes.
+
+    Returns:
+        shape (16,), in the state's order and units per second.
+    """
+    vehicle = load_vehicle(vehicle)
+    state = np.asarray(state, float)
+    command = np.asarray(command, float)
+    if state.shape != (N_STATES,) or command.shape != (N_COMMANDS,):
+        raise InputError(
+            f"derivative needs a state (16,) and a command (4,), found {state.shape}, {command.shape}"
+        )
+    values = vehicle.vector.copy()
+    for lag in ("motor_lag", "servo_lag"):
+        entry = effects.CATALOGUE[lag]
+        values[entry.index : entry.index + len(entry.parameters)] = 0.0
+    dx = np.zeros(N_FULL)
+    _full_derivative(
+        full_state(state, command, vehicle), kernel_input(command), values, np.zeros(WORK_SIZE), dx
+    )
+    return dx[:N_STATES]
+
+
+def readings(state: Any, command: Any, vehicle: Vehicle) -> dict[str, float]:
+    """Noise-free readings of every canonical channel at a full or a paper state."""
+    state = np.asarray(state, float)
+    command = np.asarray(command, float)
+    x = full_state(state, command, vehicle) if state.size == N_STATES else state.copy()
+    out = np.empty(N_CHANNELS)
+    measure(x, kernel_input(command), vehicle.vector, np.zeros(WORK_SIZE), out)
+    return dict(zip(CHANNELS, out.tolist(), strict=True))
+
+
+def hover_trim(vehicle: Vehicle | str, height: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
+    """State (16,) and command (4,) that hold the vehicle still over the ground, heading north.
+
+    Args:
+        height: of the centre of gravity above ground [m]; matters near the ground only.
+
+    Raises:
+        InputError: where the vehicle cannot hover.
+    """
+    from scipy.optimize import least_squares
+
+    vehicle = load_vehicle(vehicle)
+    values = vehicle.values()
+    k_T = values["air_density"] * math.pi * values["rotor_radius"] ** 4
+    ratio = math.sqrt(values["torque_coefficient_upper"] / values["torque_coefficient_lower"])
+    lift = values["thrust_coefficient_upper"] + values["thrust_coefficient_lower"] * ratio**2
+    omega = math.sqrt(values["mass"] * values["gravity"] / (k_T * lift))
+    scale = np.array([omega, omega, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
+
+    def unpack(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        z = z * scale
+        state = np.zeros(N_STATES)
+        state[10:12] = z[4:6]
+        state[6:8] = z[6:8]
+        state[15] = -height
+        return state, z[:4]
+
+    def residual(z: np.ndarray) -> np.ndarray:
+        state, command = unpack(z)
+        return derivative(state, command, vehicle)[:8]
+
+    start = np.array([1.0, ratio, 0, 0, 0, 0, 0, 0])
+    found = least_squares(residual, start, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    state, command = unpack(found.x)
+    if np.abs(found.fun).max() > 1e-6 or command[:2].min() <= 0.0:
+        raise InputError(f"vehicle {vehicle.name!r} has no hover: its forces do not balance")
+    return state, command

@@ -1,0 +1,332 @@
+"""Fits on top of the passes: innovations, signatures, Gauss-Newton under priors, noise levels.
+
+One engine, three uses: every parameter fixed is the simulation check, base parameters free is
+identification, effects' parameters free is diagnosis.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from coax_env.engine import kalman
+from coax_env.engine.model import FreeParameter, Model, Noise, Record
+
+GATE = 8.0  # sigmas
+REFRESH = 4  # rows between new Jacobians
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class RunPass:
+    """What a filter pass leaves of one run.
+
+    innovations: (n, m) whitened, NaN where there is no reading. states: (n, nx) filtered.
+    gains, whitening: see kalman.py, empty unless kept. start_covariances: (s, nx, nx) of the filtered
+    state at `start_rows`.
+    """
+
+    record: Record
+    inputs: np.ndarray
+    log_likelihood: float
+    innovations: np.ndarray
+    states: np.ndarray
+    left_out: int
+    gains: np.ndarray
+    whitening: np.ndarray
+    start_rows: np.ndarray
+    start_covariances: np.ndarray
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Likelihood to second order about a point, per run.
+
+    information: (runs, k, k) Gram matrices of the signatures. slope: (runs, k) signatures times
+    innovations. by_channel: (runs, k, m) squared signatures summed per channel; residual_by_channel:
+    (runs, k, m) their products with the innovations.
+    """
+
+    names: tuple[str, ...]
+    information: np.ndarray
+    slope: np.ndarray
+    by_channel: np.ndarray
+    slope_by_channel: np.ndarray
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Result of a fit: values of the free parameters with their covariance.
+
+    objective: minus log-likelihood plus the priors' penalty, nats.
+    """
+
+    names: tuple[str, ...]
+    values: dict[str, float]
+    covariance: np.ndarray
+    objective: float
+    log_likelihood: float
+    iterations: int
+    converged: bool
+
+    @property
+    def std(self) -> dict[str, float]:
+        """Standard deviation by name."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+
+class Engine:
+    """A model, the records it is held against, and the two passes over them."""
+
+    def __init__(self, model: Model, records: Sequence[Record], threads: int = 2) -> None:
+        self.model = model
+        self.records = list(records)
+        self.threads = threads
+        self._dt = [np.append(np.diff(r.t), 0.0) for r in self.records]
+
+    def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
+        indices = range(len(self.records)) if which is None else which
+        with ThreadPoolExecutor(self.threads) as pool:
+            return list(pool.map(work, indices))
+
+    def filter(
+        self,
+        values: Mapping[str, float],
+        noise: Noise,
+        keep: bool = False,
+        which: Sequence[int] | None = None,
+        start_rows: Sequence[np.ndarray] | None = None,
+    ) -> list[RunPass]:
+        """Filter every run (or those in `which`) with these parameter values and noise levels.
+
+        start_rows: per record, rows at which to keep the filtered covariance.
+        """
+        p = self.model.vector(values)
+        q = self.model.process_noise(noise)
+        R = np.array([noise.reading.get(c, 1.0) for c in self.model.channels]) ** 2
+
+        def one(i: int) -> RunPass:
+            record = self.records[i]
+            n, m = record.z.shape
+            nx = q.size
+            u = self.model.inputs(record, p)
+            x0, P0 = self.model.start(record, noise)
+            e = np.full((n, m), np.nan)
+            states = np.zeros((n, nx))
+            rows = n if keep else 0
+            K = np.zeros((rows, nx, m), np.float32)
+            W = np.zeros((rows, m, m), np.float32)
+            starts = np.empty(0, np.int64) if start_rows is None else start_rows[i]
+            slots = np.full(n, -1, np.int64)
+            slots[starts] = np.arange(starts.size)
+            P = np.zeros((starts.size, nx, nx))
+            log_likelihood, left_out = kalman.filter_pass(
+                self.model.step, self.model.measure, self._dt[i], u, record.z, self.model.wraps,
+                x0, P0, R, q, p, self.model.state_scale, self.model.work_size, GATE, REFRESH,
+                keep, states, e, K, W, slots, P,
+            )  # fmt: skip
+            return RunPass(record, u, log_likelihood, e, states, left_out, K, W, starts, P)
+
+        return self._each(one, which)
+
+    def log_likelihood(
+        self, values: Mapping[str, float], noise: Noise, which: Sequence[int] | None = None
+    ) -> float:
+        """Log-likelihood of the records, nats; -inf where a filter diverged."""
+        return float(sum(p.log_likelihood for p in self.filter(values, noise, which=which)))
+
+    def linearise(
+        self, values: Mapping[str, float], noise: Noise, free: Sequence[FreeParameter]
+    ) -> tuple[list[RunPass], Linearised]:
+        """Filter, then one mean pass per free parameter with the gains frozen."""
+        passes = self.filter(values, noise, keep=True)
+        base = self.model.vector(values)
+        moved, steps = [], []
+        for f in free:
+            now = values[f.name]
+            size = f.probe if f.probe > 0.0 and now < 0.25 * f.probe else 0.02 * f.std
+            if now + size > f.upper:
+                size = -size
+            moved.append(self.model.vector({**values, f.name: now + size}))
+            steps.append(size)
+
+        def one(i: int) -> tuple[np.ndarray, ...]:
+            run = passes[i]
+            n, m = run.record.z.shape
+            x0, _ = self.model.start(run.record, noise)
+
+            def innovations(p: np.ndarray, out: np.ndarray) -> bool:
+                return kalman.mean_pass(
+                    self.model.step, self.model.measure, self._dt[i],
+                    self.model.inputs(run.record, p), run.record.z, self.model.wraps,
+                    x0, p, self.model.work_size, run.gains, run.whitening, out,
+                )  # fmt: skip
+
+            e = np.zeros((n, m))
+            innovations(base, e)
+            J = np.zeros((len(free), n, m))
+            for k, (p, size) in enumerate(zip(moved, steps, strict=True)):
+                if innovations(p, J[k]):
+                    J[k] -= e
+                    J[k] /= size
+                else:
+                    J[k] = 0.0
+            by_channel = np.einsum("knm,knm->km", J, J)
+            slope_by_channel = np.einsum("knm,nm->km", J, e)
+            flat = J.reshape(len(free), -1)
+            return flat @ flat.T, flat @ e.ravel(), by_channel, slope_by_channel
+
+        parts = list(zip(*self._each(one), strict=True))
+        return passes, Linearised(
+            tuple(f.name for f in free), *(np.array(part) for part in parts)
+        )
+
+    def fit(
+        self,
+        free: Sequence[FreeParameter],
+        values: Mapping[str, float],
+        noise: Noise,
+        iterations: int = 6,
+        tolerance: float = 0.1,
+        progress: Progress | None = None,
+    ) -> Estimate:
+        """Gauss-Newton for the free parameters under their priors, damped and within bounds.
+
+        Stops when a step promises less than `tolerance` nats. A step that raises the objective is
+        halved.
+        """
+        values = dict(values)
+        passes, lin = self.linearise(values, noise, free)
+        best = objective(passes, free, values)
+        converged = False
+        count = 0
+        for count in range(1, iterations + 1):
+            step, promised = newton_step(lin, free, values)
+            if promised < tolerance:
+                converged = True
+                break
+            for damping in (1.0, 0.5, 0.25, 0.1):
+                trial = dict(values)
+                for f, change in zip(free, step, strict=True):
+                    trial[f.name] = float(np.clip(values[f.name] + damping * change, f.lower, f.upper))
+                reached = objective(self.filter(trial, noise), free, trial)
+                if reached < best:
+                    break
+            else:
+                break
+            gained = best - reached
+            best, values = reached, trial
+            if progress:
+                progress(f"fit: step {count}, gained {gained:.1f} nats")
+            passes, lin = self.linearise(values, noise, free)
+            if gained < tolerance:
+                converged = True
+                break
+        information = lin.information.sum(0) + np.diag([1.0 / f.std**2 for f in free])
+        return Estimate(
+            names=tuple(f.name for f in free),
+            values={f.name: values[f.name] for f in free},
+            covariance=np.linalg.inv(information),
+            objective=best,
+            log_likelihood=float(sum(p.log_likelihood for p in passes)),
+            iterations=count,
+            converged=converged,
+        )
+
+    def fit_noise(
+        self,
+        values: Mapping[str, float],
+        noise: Noise,
+        process: Sequence[str],
+        reading: Sequence[Sequence[str]] = (),
+        seconds: float = 4.0,
+        iterations: int = 12,
+        progress: Progress | None = None,
+    ) -> Noise:
+        """Noise levels of largest likelihood, on an excerpt of every run.
+
+        Args:
+            process: names of the process-noise levels to fit.
+            reading: groups of channels whose common std is fitted; others keep theirs.
+            seconds: length of the excerpt from each run.
+        """
+        excerpt = Engine(self.model, [_excerpt(r, seconds) for r in self.records], self.threads)
+
+        def changed(logs: np.ndarray) -> Noise:
+            levels = dict(noise.process)
+            stds = dict(noise.reading)
+            for name, log in zip(process, logs, strict=False):
+                levels[name] = float(np.exp(log))
+            for group, log in zip(reading, logs[len(process) :], strict=True):
+                for channel in group:
+                    stds[channel] = noise.reading[channel] * float(np.exp(log))
+            return replace(noise, process=levels, reading=stds)
+
+        def cost(logs: np.ndarray) -> float:
+            result = -excerpt.log_likelihood(values, changed(logs))
+            return result if np.isfinite(result) else 1e12
+
+        start = np.array([np.log(noise.process[name]) for name in process] + [0.0] * len(reading))
+        floors = [noise.floor.get(name, 1e-9) for name in process]
+        bounds = [(np.log(v), np.log(1e4 * v)) for v in floors] + [(-3.0, 4.0)] * len(reading)
+        found = minimize(
+            cost, start, method="L-BFGS-B", bounds=bounds,
+            options={"maxiter": iterations, "eps": 0.03, "ftol": 1e-5},
+        )  # fmt: skip
+        if progress:
+            progress(f"noise levels: {found.nfev} passes")
+        return changed(found.x)
+
+
+def _excerpt(record: Record, seconds: float) -> Record:
+    """The middle `seconds` of a record."""
+    span = record.t[-1] - record.t[0]
+    first = record.t[0] + max(0.0, 0.5 * (span - seconds))
+    rows = (record.t >= first) & (record.t <= first + seconds)
+    return replace(record, t=record.t[rows], command=record.command[rows], z=record.z[rows])
+
+
+def objective(
+    passes: Sequence[RunPass], free: Sequence[FreeParameter], values: Mapping[str, float]
+) -> float:
+    """Minus log-likelihood plus half the squared distance to the priors, nats."""
+    penalty = sum(((values[f.name] - f.value) / f.std) ** 2 for f in free)
+    return 0.5 * penalty - float(sum(p.log_likelihood for p in passes))
+
+
+def newton_step(
+    lin: Linearised, free: Sequence[FreeParameter], values: Mapping[str, float]
+) -> tuple[np.ndarray, float]:
+    """Gauss-Newton step within bounds, and the gain in nats it promises."""
+    prior = np.array([1.0 / f.std**2 for f in free])
+    away = np.array([values[f.name] - f.value for f in free])
+    A = lin.information.sum(0) + np.diag(prior)
+    g = lin.slope.sum(0) + prior * away
+    now = np.array([values[f.name] for f in free])
+    lower = np.array([f.lower for f in free]) - now
+    upper = np.array([f.upper for f in free]) - now
+    step = bounded_solve(A, -g, lower, upper)
+    return step, float(-(g @ step) - 0.5 * step @ A @ step)
+
+
+def bounded_solve(
+    A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> np.ndarray:
+    """Minimise 1/2 x'A x - b'x within bounds, by an active set (A positive definite)."""
+    k = b.size
+    x = np.zeros(k)
+    fixed = np.zeros(k, bool)
+    for _ in range(k + 1):
+        loose = ~fixed
+        x[loose] = np.linalg.solve(
+            A[np.ix_(loose, loose)], b[loose] - A[np.ix_(loose, fixed)] @ x[fixed]
+        )
+        out = loose & ((x < lower - 1e-15) | (x > upper + 1e-15))
+        if not out.any():
+            break
+        x[out] = np.clip(x[out], lower[out], upper[out])
+        fixed |= out
+    return x

@@ -1,0 +1,290 @@
+"""The two passes over a run: the extended Kalman filter, and the mean pass with its gains frozen.
+
+The filter gives whitened innovations e = L^-1 (z - h), L L' = S, and so the likelihood
+
+    -2 log L = sum over rows of  e'e + log det S + m log 2 pi.
+
+It keeps its gains K and whitening matrices L^-1. The mean pass repeats only the propagation of the
+mean with those gains: with a parameter moved a little, the change of e is that parameter's
+*signature*. A row's missing readings have zero columns in K and zero rows in L^-1.
+
+Bar-Shalom, Li and Kirubarajan 2001, ch. 5 and 10; Maybeck 1979; the frozen gains are the
+approximation of Maine and Iliff 1985 (NASA RP-1138, filter error method).
+"""
+
+import math
+
+import numpy as np
+from numba import boolean, float32, float64, int64, types
+
+from coax_env.jit import compiled
+
+_A = float64[::1]
+_M = float64[:, ::1]
+STEP = types.FunctionType(types.void(_A, _A, float64, _A, _A, _A))
+MEASURE = types.FunctionType(types.void(_A, _A, _A, _A, _A))
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+@compiled(types.float64(float64))
+def wrap_angle(angle):
+    """Angle in [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@compiled(
+    types.Tuple((float64, int64))(
+        STEP, MEASURE, _A, _M, _M, boolean[::1], _A, _M, _A, _A, _A, _A, int64, float64, int64,
+        boolean, _M, _M, float32[:, :, ::1], float32[:, :, ::1], int64[::1], float64[:, :, ::1],
+    )
+)  # fmt: skip
+def filter_pass(
+    step, measure, dt, u, z, wraps, x0, P0, R, q, p, scale, work_size, gate, refresh,
+    keep, states, e, K_all, W_all, slots, P_all,
+):  # fmt: skip
+    """Extended Kalman filter over one run.
+
+    Args:
+        dt: (n,) seconds from each row to the next. u: (n, nu). z: (n, m), NaN where missing.
+        R: (m,) reading variances. q: (nx,) growth of state variance per second. p: parameters.
+        gate: readings further than this many sigmas from their prediction are left out.
+        refresh: rows between new Jacobians where dt does not change.
+        keep: also store gains and whitening matrices.
+        states: (n, nx) filtered states, out. e: (n, m) whitened innovations, out, NaN where missing.
+        K_all: (n, nx, m), W_all: (n, m, m), out, if `keep`.
+        slots: (n,) place in P_all where a row's filtered covariance is stored, or -1.
+        P_all: (slots, nx, nx), out.
+
+    Returns:
+        log-likelihood (-inf where the filter diverged) and the number of readings left out.
+    """
+    n, m = z.shape
+    nx = x0.size
+    x = x0.copy()
+    P = P0.copy()
+    work = np.zeros(work_size)
+    x_next = np.zeros(nx)
+    x_probe = np.zeros(nx)
+    x_moved = np.zeros(nx)
+    h = np.zeros(m)
+    h_probe = np.zeros(m)
+    H = np.zeros((m, nx))
+    F = np.eye(nx)
+    dt_of_F = -1.0
+    HP = np.zeros((m, nx))
+    S = np.zeros((m, m))
+    W = np.zeros((m, m))
+    FP = np.zeros((nx, nx))
+    who = np.zeros(m, dtype=np.int64)
+    nu = np.zeros(m)
+    log_likelihood = 0.0
+    left_out = 0
+    for k in range(n):
+        fresh = k % refresh == 0
+        # --- correct ---------------------------------------------------------------------------
+        measure(x, u[k], p, work, h)
+        if fresh:
+            for j in range(nx):
+                for i in range(nx):
+                    x_probe[i] = x[i]
+                x_probe[j] += scale[j]
+                measure(x_probe, u[k], p, work, h_probe)
+                for i in range(m):
+                    H[i, j] = (h_probe[i] - h[i]) / scale[j]
+        count = 0
+        for i in range(m):
+            e[k, i] = np.nan
+            if not math.isnan(z[k, i]):
+                innovation = z[k, i] - h[i]
+                if wraps[i]:
+                    innovation = wrap_angle(innovation)
+                if not math.isfinite(innovation):
+                    return -np.inf, left_out
+                # H P of this channel, by the non-zeros of H
+                for b in range(nx):
+                    HP[count, b] = 0.0
+                for a in range(nx):
+                    if H[i, a] != 0.0:
+                        weight = H[i, a]
+                        for b in range(nx):
+                            HP[count, b] += weight * P[a, b]
+                variance = R[i]
+                for a in range(nx):
+                    if H[i, a] != 0.0:
+                        variance += HP[count, a] * H[i, a]
+                if innovation * innovation > gate * gate * variance:
+                    left_out += 1
+                    continue
+                who[count] = i
+                nu[count] = innovation
+                S[count, count] = variance
+                count += 1
+        for a in range(count):
+            for b in range(a):
+                total = 0.0
+                for j in range(nx):
+                    if H[who[b], j] != 0.0:
+                        total += HP[a, j] * H[who[b], j]
+                S[a, b] = total
+        # Cholesky in place, then its inverse W
+        for a in range(count):
+            for b in range(a + 1):
+                total = S[a, b]
+                for c in range(b):
+                    total -= S[a, c] * S[b, c]
+                if a == b:
+                    if not total > 0.0:
+                        return -np.inf, left_out
+                    S[a, a] = math.sqrt(total)
+                    log_likelihood -= math.log(S[a, a])
+                else:
+                    S[a, b] = total / S[b, b]
+        for a in range(count):
+            for b in range(a):
+                total = 0.0
+                for c in range(b, a):
+                    total -= S[a, c] * W[c, b]
+                W[a, b] = total / S[a, a]
+            W[a, a] = 1.0 / S[a, a]
+        # G = W H P, then P -= G'G, x += G' e
+        for a in range(count - 1, -1, -1):
+            for j in range(nx):
+                HP[a, j] *= W[a, a]
+            for b in range(a):
+                for j in range(nx):
+                    HP[a, j] += W[a, b] * HP[b, j]
+        for a in range(count):
+            total = 0.0
+            for b in range(a + 1):
+                total += W[a, b] * nu[b]
+            e[k, who[a]] = total
+            log_likelihood -= 0.5 * (total * total + _LOG_2PI)
+            for j in range(nx):
+                x[j] += HP[a, j] * total
+        for a in range(count):
+            for i in range(nx):
+                weight = HP[a, i]
+                if weight != 0.0:
+                    for j in range(nx):
+                        P[i, j] -= weight * HP[a, j]
+        if keep:
+            for a in range(count):
+                for b in range(a + 1):
+                    W_all[k, who[a], who[b]] = W[a, b]
+                    for j in range(nx):
+                        K_all[k, j, who[b]] += HP[a, j] * W[a, b]
+        for j in range(nx):
+            states[k, j] = x[j]
+            if not math.isfinite(x[j]):
+                return -np.inf, left_out
+        if slots[k] >= 0:
+            for i in range(nx):
+                for j in range(nx):
+                    P_all[slots[k], i, j] = P[i, j]
+        # --- predict -----------------------------------------------------------------------------
+        if k == n - 1:
+            break
+        step(x, u[k], dt[k], p, work, x_next)
+        if fresh or abs(dt[k] - dt_of_F) > 0.02 * dt_of_F:
+            dt_of_F = dt[k]
+            for j in range(nx):
+                for i in range(nx):
+                    x_probe[i] = x[i]
+                x_probe[j] += scale[j]
+                step(x_probe, u[k], dt[k], p, work, x_moved)
+                for i in range(nx):
+                    F[i, j] = (x_moved[i] - x_next[i]) / scale[j]
+        for i in range(nx):
+            for j in range(nx):
+                FP[i, j] = 0.0
+            for a in range(nx):
+                weight = F[i, a]
+                if weight != 0.0:
+                    for j in range(nx):
+                        FP[i, j] += weight * P[a, j]
+        for i in range(nx):
+            for j in range(i + 1):
+                total = 0.0
+                for a in range(nx):
+                    total += FP[i, a] * F[j, a]
+                P[i, j] = total
+                P[j, i] = total
+            P[i, i] += q[i] * dt[k]
+            x[i] = x_next[i]
+    return log_likelihood, left_out
+
+
+@compiled(
+    boolean(
+        STEP, MEASURE, _A, _M, _M, boolean[::1], _A, _A, int64,
+        float32[:, :, ::1], float32[:, :, ::1], _M,
+    )
+)  # fmt: skip
+def mean_pass(step, measure, dt, u, z, wraps, x0, p, work_size, K_all, W_all, e):
+    """Whitened innovations (n, m) of the mean with the gains of a filter pass; 0 where missing.
+
+    Returns False where the mean diverged.
+    """
+    n, m = z.shape
+    nx = x0.size
+    x = x0.copy()
+    x_next = np.zeros(nx)
+    work = np.zeros(work_size)
+    h = np.zeros(m)
+    who = np.zeros(m, dtype=np.int64)
+    for k in range(n):
+        measure(x, u[k], p, work, h)
+        count = 0
+        for i in range(m):
+            e[k, i] = 0.0
+            if W_all[k, i, i] != 0.0:
+                h[i] = z[k, i] - h[i]
+                if wraps[i]:
+                    h[i] = wrap_angle(h[i])
+                if not math.isfinite(h[i]):
+                    return False
+                who[count] = i
+                count += 1
+        for a in range(count):
+            i = who[a]
+            total = 0.0
+            for b in range(a + 1):
+                total += W_all[k, i, who[b]] * h[who[b]]
+            e[k, i] = total
+        for j in range(nx):
+            total = 0.0
+            for a in range(count):
+                total += K_all[k, j, who[a]] * h[who[a]]
+            x[j] += total
+        if k < n - 1:
+            step(x, u[k], dt[k], p, work, x_next)
+            for j in range(nx):
+                x[j] = x_next[j]
+    return True
+
+
+@compiled(
+    boolean(STEP, MEASURE, _A, _M, _A, _A, int64, int64, int64, _A)
+)
+def fly_open_loop(step, measure, dt, u, x, p, work_size, first, last, h):
+    """Fly from row `first` to row `last` with the recorded inputs and read there.
+
+    Args:
+        x: (nx,) state at `first`; on return the state at `last`.
+        h: (m,) readings at `last`, out.
+
+    Returns False where the flight diverged.
+    """
+    work = np.zeros(work_size)
+    x_next = np.zeros(x.size)
+    for k in range(first, last):
+        step(x, u[k], dt[k], p, work, x_next)
+        for j in range(x.size):
+            x[j] = x_next[j]
+            if not math.isfinite(x[j]):
+                return False
+    measure(x, u[last], p, work, h)
+    for i in range(h.size):
+        if not math.isfinite(h[i]):
+            return False
+    return True

@@ -1,0 +1,74 @@
+"""What the engine asks of a model, and the records it works on."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class FreeParameter:
+    """A number the engine may change.
+
+    ``value`` is the prior's mean and ``std`` its width; ``probe`` the finite step used for its
+    signature (0: a small one, for the derivative).
+    """
+
+    name: str
+    value: float
+    std: float
+    lower: float = -np.inf
+    upper: float = np.inf
+    probe: float = 0.0
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run as the engine sees it.
+
+    t: (n,) seconds, increasing. command: (n, k), held from each row to the next.
+    z: (n, m) readings in the order of the model's channels, NaN where there is no new sample.
+    """
+
+    name: str
+    t: np.ndarray
+    command: np.ndarray
+    z: np.ndarray
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Spread of what the model does not say.
+
+    process: named levels of the model's process noise (for the helicopter: gust force [N] and moment
+    [N m]). reading: std of each channel, in its unit. floor: the least that a process level can be, since
+    no model is exact.
+    """
+
+    process: Mapping[str, float]
+    reading: Mapping[str, float] = field(default_factory=dict)
+    floor: Mapping[str, float] = field(default_factory=dict)
+
+
+class Model(Protocol):
+    """A system that can be put through the engine."""
+
+    channels: tuple[str, ...]
+    wraps: np.ndarray  # (m,) True where an innovation is an angle
+    state_scale: np.ndarray  # (nx,) size of a small change of each state, for derivatives
+    step: Any  # compiled pointer: (x, u, dt, p, work, out)
+    measure: Any  # compiled pointer: (x, u, p, work, out)
+    work_size: int
+
+    def vector(self, values: Mapping[str, float]) -> np.ndarray:
+        """The compiled functions' parameter vector for named values; others as in the model."""
+
+    def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
+        """Inputs (n, nu) of the compiled functions, row by row."""
+
+    def start(self, record: Record, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+        """First state (nx,) and its covariance (nx, nx), from the record's first readings."""
+
+    def process_noise(self, noise: Noise) -> np.ndarray:
+        """Growth of each state's variance per second (nx,)."""

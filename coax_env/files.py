@@ -1,0 +1,77 @@
+"""Writing files so that a reader never sees half of one."""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from coax_env.errors import InputError
+
+
+def write_text(path: str | Path, text: str) -> Path:
+    """Write a text file whole or not at all; missing folders are made."""
+    path = Path(path)
+    make_folder(path.parent)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+    return path
+
+
+def write_json(path: str | Path, content: Any) -> Path:
+    """Write JSON that any reader understands: NaN and infinity are refused (``ValueError``)."""
+    return write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def make_folder(path: str | Path) -> Path:
+    """Make a folder and those above it, or say in one line why it cannot be."""
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {path}: {error.strerror}") from error
+    return path
+
+
+@contextmanager
+def staged_folder(path: str | Path) -> Iterator[Path]:
+    """A temporary folder that becomes ``path`` when the block ends well, and vanishes otherwise.
+
+    Where ``path`` is already a folder, the new files join it one by one, each replacing its
+    namesake; what else lies there is left alone.
+    """
+    path = Path(path)
+    make_folder(path.parent)
+    if path.exists() and not path.is_dir():
+        raise InputError(f"cannot write the folder {path}: a file has that name")
+    try:
+        stage = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    except OSError as error:
+        raise InputError(f"cannot write in {path.parent}: {error.strerror}") from error
+    try:
+        yield stage
+        stage.chmod(0o777 & ~_umask())
+        if path.is_dir():
+            for file in sorted(stage.iterdir()):
+                os.replace(file, path / file.name)
+        else:
+            os.rename(stage, path)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

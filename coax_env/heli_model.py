@@ -1,0 +1,216 @@
+"""The helicopter as the engine sees it: the compiled kernel, its parameters with priors, its noise.
+
+Command delay enters here: with servo_delay the swash commands are looked up late and, where a row's
+interval holds two commands, replaced by their mean over it (the step is split to second order).
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from coax_env import dynamics, effects
+from coax_env.engine.model import FreeParameter, Noise, Record
+from coax_env.flight import Flight, Run
+from coax_env.layout import (
+    ANGLES,
+    CHANNELS,
+    N_FULL,
+    N_INPUTS,
+    TIME,
+)
+from coax_env.vehicle import Vehicle
+
+GUST_LEVELS = ("force_xy", "force_z", "moment_xy", "moment_z")
+"""Std of the gust states [N, N m]; x and y share one level."""
+
+HELD = (
+    "gravity", "air_density", "rotor_radius",
+    "fuselage_length", "fuselage_width", "fuselage_drag_coefficient", "flybar_inertia",
+    "flap_coupling_lon", "flap_coupling_lat",
+)  # fmt: skip
+"""Base parameters that are never fitted: exact, or one column with others that are."""
+
+DEFAULT_READING_STD = {
+    "rpm_upper": 2.0, "rpm_lower": 2.0, "p": 0.035, "q": 0.035, "r": 0.035,
+    "ax": 0.1, "ay": 0.1, "az": 0.1, "phi": 0.0087, "theta": 0.0087, "psi": 0.0087,
+    "h": 0.05, "vn": 0.2, "ve": 0.2, "vd": 0.2, "pn": 0.02, "pe": 0.02, "v": 0.5,
+}  # fmt: skip
+"""Where neither the card nor the data say: Table V and the sensor classes of contract.md."""
+
+
+class HeliModel:
+    """A vehicle, through the engine's protocol."""
+
+    channels = CHANNELS
+    wraps = np.array([c in ANGLES for c in CHANNELS])
+    step = dynamics.step_pointer
+    measure = dynamics.measure_pointer
+    work_size = dynamics.WORK_SIZE
+    state_scale = np.array(
+        [1e-4] * 6 + [1e-5] * 4 + [1e-5] * 3 + [1e-4] * 3 + [1e-2] * 2 + [1e-5] * 2
+        + [1e-4] * 3 + [1e-5] * 3
+    )  # fmt: skip
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        self.bare_values = vehicle.values()
+
+    def vector(self, values: Mapping[str, float]) -> np.ndarray:
+        """Parameter vector of the vehicle with some values changed, effects included."""
+        return effects.pack({**self.bare_values, **values})
+
+    def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
+        """Commands and time since the run's start, (n, 5)."""
+        u = np.empty((record.t.size, N_INPUTS))
+        u[:, :TIME] = record.command
+        u[:, TIME] = record.t - record.t[0]
+        delay = vector[_DELAY]
+        if delay > 0.0:
+            for column in (2, 3):
+                u[:, column] = _mean_of_late(record.t, record.command[:, column], delay)
+        return u
+
+    def start(self, record: Record, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+        """First state from the medians of the first half second, with a wide covariance."""
+        early = record.t <= record.t[0] + 0.5
+
+        def first(channel: str, otherwise: float, spread: float) -> tuple[float, float]:
+            values = record.z[early, CHANNELS.index(channel)]
+            values = values[np.isfinite(values)]
+            if values.size == 0:
+                return otherwise, spread
+            if channel in ANGLES:
+                values = np.unwrap(values[:3])
+            return float(np.median(values)), min(spread, 0.5)
+
+        x = np.zeros(N_FULL)
+        spread = np.zeros(N_FULL)
+        for i, channel in ((10, "phi"), (11, "theta"), (12, "psi")):
+            x[i], spread[i] = first(channel, 0.0, 0.2)
+        height, spread[15] = first("h", 1.0, 1.0)
+        x[15] = -height
+        x[13], spread[13] = first("pn", 0.0, 1e-3)
+        x[14], spread[14] = first("pe", 0.0, 1e-3)
+        spread[0:3] = 1.0
+        spread[3:6] = 0.6
+        spread[6:10] = 0.06
+        x[16:20] = record.command[0]
+        spread[16:18] = 4.0
+        spread[18:20] = 0.03
+        levels = _gust_levels(noise)
+        spread[20:26] = levels
+        return x, np.diag(spread**2 + 1e-12)
+
+    def process_noise(self, noise: Noise) -> np.ndarray:
+        """Growth of the states' variances per second (26,): gusts, and a little everywhere."""
+        q = np.zeros(N_FULL)
+        q[0:3] = 1e-4**2
+        q[3:6] = 1e-3**2
+        q[6:10] = 1e-4**2
+        q[10:16] = 1e-5**2
+        q[16:18] = 1.0**2
+        q[18:20] = 1e-4**2
+        q[20:26] = 2.0 * _gust_levels(noise) ** 2 / noise.process["memory"]
+        return q
+
+    # --- what may be fitted -------------------------------------------------------------------------
+
+    def base_parameters(self, without: Sequence[str] = ()) -> list[FreeParameter]:
+        """The vehicle's own numbers under their priors, those in `without` left out."""
+        return [
+            FreeParameter(name, p.value, p.std, lower=0.05 * p.value, upper=20.0 * p.value)
+            for name, p in self.vehicle.parameters.items()
+            if p.std > 0.0 and name not in HELD and name not in without
+        ]
+
+    @staticmethod
+    def effect_parameters(effect: str) -> list[FreeParameter]:
+        """An effect's parameters; the prior is centred on its off-value."""
+        entry = effects.CATALOGUE[effect]
+        return [
+            FreeParameter(full, p.off, p.usual, p.lower, p.upper, p.probe)
+            for full, p in zip(entry.names(), entry.parameters, strict=True)
+        ]
+
+
+_DELAY = effects.parameter_index("servo_delay.time")
+
+
+def _gust_levels(noise: Noise) -> np.ndarray:
+    level = noise.process
+    return np.array(
+        [level["force_xy"]] * 2 + [level["force_z"]] + [level["moment_xy"]] * 2 + [level["moment_z"]]
+    )
+
+
+def _mean_of_late(t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
+    """Mean over each row's interval of a held command that arrives late."""
+    area = np.concatenate([[0.0], np.cumsum(command[:-1] * np.diff(t))])
+
+    def integral(time: np.ndarray) -> np.ndarray:
+        inside = np.interp(time, t, area)
+        return inside + np.minimum(time - t[0], 0.0) * command[0]
+
+    end = np.append(t[1:], t[-1] + (t[-1] - t[-2]))
+    start = t - delay
+    stop = np.minimum(end - delay, t[-1])
+    return (integral(stop) - integral(start)) / np.maximum(stop - start, 1e-9)
+
+
+def record_of(run: Run) -> Record:
+    """A run as the engine sees it."""
+    z = np.full((run.t.size, len(CHANNELS)), np.nan)
+    for channel, values in run.measured.items():
+        z[:, CHANNELS.index(channel)] = values
+    return Record(run.name, run.t, run.command, z)
+
+
+def starting_noise(flight: Flight, vehicle: Vehicle) -> tuple[Noise, list[list[str]]]:
+    """Noise to start from, and the channels whose std must be estimated (the card gives none)."""
+    weight = vehicle["mass"].value * vehicle["gravity"].value
+    arm = vehicle["arm_upper"].value
+    process = {
+        "force_xy": 0.01 * weight,
+        "force_z": 0.01 * weight,
+        "moment_xy": 0.005 * weight * arm,
+        "moment_z": 0.003 * weight * arm,
+        "memory": 0.5,
+    }
+    floor = {
+        "force_xy": 5e-4 * weight,
+        "force_z": 5e-4 * weight,
+        "moment_xy": 3e-4 * weight * arm,
+        "moment_z": 1e-4 * weight * arm,
+    }
+    reading = {}
+    unknown: list[list[str]] = []
+    groups = {
+        "rpm_upper": ["rpm_upper", "rpm_lower"], "p": ["p", "q"], "r": ["r"], "ax": ["ax", "ay"],
+        "az": ["az"], "phi": ["phi", "theta"], "psi": ["psi"], "h": ["h"], "vn": ["vn", "ve"],
+        "vd": ["vd"], "pn": ["pn", "pe"], "v": ["v"],
+    }  # fmt: skip
+    present = set(flight.channels)
+    for group in groups.values():
+        here = [c for c in group if c in present]
+        missing = [c for c in here if c not in flight.noise]
+        for channel in here:
+            reading[channel] = flight.noise.get(channel) or _white_std(flight, channel)
+        if missing:
+            unknown.append(missing)
+    return Noise(process, reading, floor), unknown
+
+
+def _white_std(flight: Flight, channel: str) -> float:
+    """Std of white noise from third differences, robustly; at least a hundredth of the default."""
+    parts = []
+    for run in flight.runs:
+        if channel in run.measured:
+            values = run.measured[channel][np.isfinite(run.measured[channel])]
+            if channel in ANGLES:
+                values = np.unwrap(values)
+            if values.size > 8:
+                parts.append(np.diff(values, 3))
+    if not parts:
+        return DEFAULT_READING_STD[channel]
+    spread = float(np.median(np.abs(np.concatenate(parts)))) / 0.6745 / np.sqrt(20.0)
+    return max(spread, 0.01 * DEFAULT_READING_STD[channel])

@@ -1,0 +1,85 @@
+"""numba, with a cache that stays true.
+
+numba's own cache looks at the file of the function being compiled, not at the files of the functions
+it calls: edit a callee in another module and the old machine code still runs (numerics.md, traps).
+So the cache folder here is named by a hash over every source that takes part in the kernel; any edit
+gives a new folder, and the old one is left to age.
+"""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numba
+
+KERNEL_SOURCES = (
+    "jit.py",
+    "layout.py",
+    "flow.py",
+    "parameters.py",
+    "effects.py",
+    "dynamics.py",
+    "sensors.py",
+    "random_streams.py",
+    "hover.py",
+    "fleet.py",
+    "engine/kalman.py",
+)
+
+
+def source_hash(extra: tuple[Path, ...] = ()) -> str:
+    """Twelve hex digits over the kernel's sources, numba's version and files named by the caller."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    here = Path(__file__).parent
+    for path in (*(here / name for name in KERNEL_SOURCES), *extra):
+        if path.exists():
+            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _cache_root() -> Path:
+    root = os.environ.get("COAX_CACHE_DIR")
+    if root:
+        return Path(root)
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return home / "coax" if os.access(home.parent, os.W_OK) else Path(tempfile.gettempdir()) / "coax"
+
+
+CACHE_DIR = _cache_root() / source_hash()
+
+
+@contextmanager
+def _own_cache() -> Iterator[None]:
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(CACHE_DIR)
+    try:
+        yield
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def compiled(signature: Any = None, **options: Any) -> Callable[[Callable], Any]:
+    """``numba.njit`` that caches under CACHE_DIR and releases the GIL."""
+    settings = {"cache": True, "nogil": True, "error_model": "numpy", **options}
+
+    def decorate(function: Callable) -> Any:
+        with _own_cache():
+            if signature is None:
+                return numba.njit(**settings)(function)
+            return numba.njit(signature, **settings)(function)
+
+    return decorate
+
+
+def pointer(signature: Any) -> Callable[[Callable], Any]:
+    """``numba.cfunc`` with the same cache: a compiled function that can be passed as an argument."""
+
+    def decorate(function: Callable) -> Any:
+        with _own_cache():
+            return numba.cfunc(signature, cache=True, nopython=True)(function)
+
+    return decorate

@@ -1,0 +1,59 @@
+"""The parameter vector: the base model's numbers first, the effects' after them.
+
+A vehicle becomes one vector of doubles, which is all the compiled kernel knows of it. Effects are
+appended in the order of the catalogue, see effects.py.
+"""
+
+BASE = {
+    "mass": "kg",
+    "gravity": "m/s2",
+    "air_density": "kg/m3",
+    "rotor_radius": "m",
+    "fuselage_length": "m",
+    "fuselage_width": "m",
+    "fuselage_drag_coefficient": "1",
+    "arm_upper": "m",
+    "arm_lower": "m",
+    "inertia_xx": "kg m2",
+    "inertia_yy": "kg m2",
+    "inertia_zz": "kg m2",
+    "rotor_inertia_upper": "kg m2",
+    "rotor_inertia_lower": "kg m2",
+    "flybar_inertia": "kg m2",
+    "thrust_coefficient_upper": "1",
+    "thrust_coefficient_lower": "1",
+    "torque_coefficient_upper": "1",
+    "torque_coefficient_lower": "1",
+    "flap_time_constant": "s",
+    "flybar_time_constant": "s",
+    "swash_to_flap": "1",
+    "flybar_to_rotor_lon": "1",
+    "flybar_to_rotor_lat": "1",
+    "flap_coupling_lon": "1",
+    "flap_coupling_lat": "1",
+}
+"""Name and unit of the numbers every vehicle file must have."""
+
+PAPER_SYMBOLS = {
+    "arm_upper": "d_u", "arm_lower": "d_l",
+    "inertia_xx": "I_xx", "inertia_yy": "I_yy", "inertia_zz": "I_zz",
+    "rotor_inertia_upper": "J_u", "rotor_inertia_lower": "J_l", "flybar_inertia": "J_f",
+    "thrust_coefficient_upper": "C_Tu", "thrust_coefficient_lower": "C_Tl",
+    "torque_coefficient_upper": "C_Qu", "torque_coefficient_lower": "C_Ql",
+    "flap_time_constant": "tau_fl", "flybar_time_constant": "tau_ff",
+    "swash_to_flap": "K_b", "flybar_to_rotor_lon": "K_q", "flybar_to_rotor_lat": "K_p",
+    "flap_coupling_lon": "A_beta", "flap_coupling_lat": "B_alpha",
+}  # fmt: skip
+
+(
+    MASS, GRAVITY, AIR_DENSITY, ROTOR_RADIUS,
+    FUSELAGE_LENGTH, FUSELAGE_WIDTH, FUSELAGE_DRAG,
+    ARM_U, ARM_L, INERTIA_XX, INERTIA_YY, INERTIA_ZZ,
+    ROTOR_INERTIA_U, ROTOR_INERTIA_L, FLYBAR_INERTIA,
+    C_TU, C_TL, C_QU, C_QL,
+    FLAP_TIME, FLYBAR_TIME, SWASH_TO_FLAP, FLYBAR_TO_ROTOR_LON, FLYBAR_TO_ROTOR_LAT,
+    FLAP_COUPLING_LON, FLAP_COUPLING_LAT,
+) = range(len(BASE))  # fmt: skip
+
+GUST_MEMORY = len(BASE)  # correlation time of the gust states [s]
+N_FIXED = GUST_MEMORY + 1  # after it: one switch per stage, then the effects' parameters

@@ -1,0 +1,360 @@
+"""Which effects do these flights show? Forward, backward and swap moves on the signatures.
+
+At each point the likelihood is quadratic in all parameters at once: the Gram matrix of the
+signatures, with priors on every parameter. A set of effects is scored by minimising that quadratic
+over the base parameters, the effects already in and the candidate's, the base parameters always under
+their priors, so that no effect is credited with what a better thrust coefficient would have done.
+
+The score is a log Bayes factor in nats: the gain of the objective less the Laplace (Occam) factor of
+the added parameters, whose prior is their usual size. An effect is taken when the score passes
+EVIDENCE and one of its parameters is large enough to matter in prediction (`smallest` in the
+catalogue). Everything is re-linearised after each move.
+
+An effect that is the same column as a base parameter (`replaces`) takes that parameter's place: the
+base parameter goes back to its file value. It counts when it moved by more than twice the base
+parameter's prior std (contract.md) and the move is worth EVIDENCE against the file value.
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from coax_env import effects
+from coax_env.engine.fit import Engine, Linearised, RunPass, bounded_solve, objective
+from coax_env.engine.model import FreeParameter, Noise
+from coax_env.heli_model import GUST_LEVELS, HeliModel
+
+EVIDENCE = 12.0
+"""Nats a cause must be worth, Occam factor deducted."""
+TIE = 6.0
+"""Alternatives within this many nats cannot be told apart."""
+MOST_CAUSES = 8
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """The objective to second order about `at`, over every parameter that might be free."""
+
+    names: tuple[str, ...]
+    G: np.ndarray
+    g: np.ndarray
+    at: np.ndarray
+    mean: np.ndarray
+    precision: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+    @classmethod
+    def of(
+        cls, lin: Linearised, free: Sequence[FreeParameter], values: dict[str, float]
+    ) -> "Quadratic":
+        """The quadratic of a linearisation, summed over its runs."""
+        return cls(
+            lin.names,
+            lin.information.sum(0),
+            lin.slope.sum(0),
+            np.array([values[f.name] for f in free]),
+            np.array([f.value for f in free]),
+            np.array([1.0 / f.std**2 for f in free]),
+            np.array([f.lower for f in free]),
+            np.array([f.upper for f in free]),
+        )
+
+    def index(self, names: Collection[str]) -> np.ndarray:
+        """Places of parameters."""
+        return np.array([self.names.index(n) for n in names], dtype=int)
+
+    def best(
+        self, free: Collection[str], pinned: dict[str, float] | None = None
+    ) -> tuple[float, np.ndarray]:
+        """Least change of the objective with `free` loose and `pinned` moved to given values.
+
+        Returns the change [nats] and the move of every parameter.
+        """
+        move = np.zeros(len(self.names))
+        pinned = pinned or {}
+        fixed = self.index(pinned.keys())
+        if fixed.size:
+            move[fixed] = np.array(list(pinned.values())) - self.at[fixed]
+        loose = self.index(free)
+        if loose.size:
+            A = self.G[np.ix_(loose, loose)] + np.diag(self.precision[loose])
+            b = -(
+                self.g[loose]
+                + self.G[loose] @ move
+                + self.precision[loose] * (self.at - self.mean)[loose]
+            )
+            move[loose] = bounded_solve(
+                A, b, (self.lower - self.at)[loose], (self.upper - self.at)[loose]
+            )
+        away = self.at - self.mean
+        change = (
+            0.5 * move @ self.G @ move
+            + self.g @ move
+            + 0.5 * float(self.precision @ ((away + move) ** 2 - away**2))
+        )
+        return float(change), move
+
+    def occam(self, added: Collection[str], free: Collection[str]) -> float:
+        """Laplace factor of `added` beside `free`: half log det (posterior over prior precision)."""
+        c = self.index(added)
+        f = self.index(free)
+        schur = self.G[np.ix_(c, c)] + np.diag(self.precision[c])
+        if f.size:
+            A = self.G[np.ix_(f, f)] + np.diag(self.precision[f])
+            schur = schur - self.G[np.ix_(c, f)] @ np.linalg.solve(A, self.G[np.ix_(f, c)])
+        scaled = schur / np.sqrt(np.outer(self.precision[c], self.precision[c]))
+        return 0.5 * float(np.linalg.slogdet(scaled)[1])
+
+
+@dataclass
+class State:
+    """Where the search stands: effects in, values of all parameters, noise levels."""
+
+    active: list[str]
+    values: dict[str, float]
+    noise: Noise
+    objective: float = np.inf
+
+
+@dataclass
+class Search:
+    """The structure search over one set of records.
+
+    Attributes:
+        history: (effect, score) of every move, in order.
+    """
+
+    engine: Engine
+    model: HeliModel
+    candidates: tuple[str, ...]
+    unknown_reading: Sequence[Sequence[str]] = ()
+    progress: Progress | None = None
+    history: list[tuple[str, float]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.base = self.model.base_parameters()
+        self.by_effect = {e: self.model.effect_parameters(e) for e in self.candidates}
+        self.all = self.base + [f for group in self.by_effect.values() for f in group]
+
+    def say(self, text: str) -> None:
+        """Tell whoever watches."""
+        if self.progress:
+            self.progress(text)
+
+    # --- which parameters are loose -----------------------------------------------------------------
+
+    def free_names(self, active: Collection[str]) -> list[str]:
+        """Base parameters that no active effect replaces, and the active effects' own."""
+        replaced = {b for e in active for b in effects.CATALOGUE[e].replaces}
+        names = [f.name for f in self.base if f.name not in replaced]
+        return names + [f.name for e in active for f in self.by_effect[e]]
+
+    def candidate_names(self, effect: str) -> list[str]:
+        """An effect's parameters that act as soon as it does (no shapes)."""
+        shapes = {p.name for p in effects.CATALOGUE[effect].parameters if p.shape}
+        return [f.name for f in self.by_effect[effect] if f.name.split(".")[1] not in shapes]
+
+    def free(self, active: Collection[str]) -> list[FreeParameter]:
+        """The loose parameters themselves."""
+        names = set(self.free_names(active))
+        return [f for f in self.all if f.name in names]
+
+    def pinned(self, effect: str) -> dict[str, float]:
+        """Values that the base parameters replaced by an effect go back to."""
+        return {b: self.model.bare_values[b] for b in effects.CATALOGUE[effect].replaces}
+
+    def off(self, effect: str) -> dict[str, float]:
+        """Off-values of an effect."""
+        return {f.name: f.value for f in self.by_effect[effect]}
+
+    # --- moves --------------------------------------------------------------------------------------
+
+    def begin(self, noise: Noise) -> State:
+        """The bare model with its own noise levels."""
+        values = dict(self.model.bare_values)
+        for f in self.all:
+            values.setdefault(f.name, f.value)
+        noise = self.engine.fit_noise(values, noise, GUST_LEVELS, self.unknown_reading)
+        return State([], values, noise)
+
+    def linearise(self, state: State, everything: bool = True) -> tuple[list[RunPass], Quadratic]:
+        """The quadratic at a state, over all parameters or the loose ones."""
+        free = self.all if everything else self.free(state.active)
+        passes, lin = self.engine.linearise(state.values, state.noise, free)
+        state.objective = objective(passes, self.free(state.active), state.values)
+        return passes, Quadratic.of(lin, free, state.values)
+
+    def advance(self, state: State, quadratic: Quadratic, pinned: dict[str, float]) -> float:
+        """Take the Newton step of the active set, halved until the objective falls. Gain, nats."""
+        free = self.free(state.active)
+        _, move = quadratic.best([f.name for f in free], pinned)
+        before = objective(self.engine.filter(state.values, state.noise), free, state.values)
+        for damping in (1.0, 0.5, 0.25, 0.1):
+            trial = dict(state.values)
+            for name, change in zip(quadratic.names, move, strict=True):
+                trial[name] += change if name in pinned else damping * change
+            reached = objective(self.engine.filter(trial, state.noise), free, trial)
+            if reached < before:
+                state.values, state.objective = trial, reached
+                return before - reached
+        return 0.0
+
+    def settle(self, state: State, steps: int = 4, tolerance: float = 0.5) -> State:
+        """Fit the active set by Gauss-Newton, linearising the loose parameters only."""
+        for _ in range(steps):
+            _, quadratic = self.linearise(state, everything=False)
+            promised, _ = quadratic.best(quadratic.names)
+            if -promised < tolerance or self.advance(state, quadratic, {}) < tolerance:
+                break
+        return state
+
+    def refit_noise(self, state: State) -> State:
+        """Noise levels again, from where they stand."""
+        noise = self.engine.fit_noise(
+            state.values, state.noise, GUST_LEVELS, self.unknown_reading, iterations=6
+        )
+        return replace(state, noise=noise)
+
+    # --- scores -------------------------------------------------------------------------------------
+
+    def score(self, quadratic: Quadratic, active: list[str], effect: str) -> tuple[float, float, bool]:
+        """Log Bayes factor of adding an effect, its evidence for the rule, and whether it is large.
+
+        The second number is what EVIDENCE is compared with: for an effect that replaces base
+        parameters, against those held at their file values.
+        """
+        entry = effects.CATALOGUE[effect]
+        now, _ = quadratic.best(self.free_names(active))
+        pinned = self.pinned(effect)
+        rest = [n for n in self.free_names(active) if n not in pinned]
+        own = self.candidate_names(effect)
+        then, move = quadratic.best(rest + own, pinned)
+        occam = quadratic.occam(own, rest)
+        gain = now - then
+        evidence = gain
+        if pinned:
+            held, _ = quadratic.best(rest, pinned)
+            evidence = held - then
+        reached = dict(zip(quadratic.names, quadratic.at + move, strict=True))
+        return gain - (0.0 if pinned else occam), evidence - occam, self.is_large(entry.name, reached)
+
+    def is_large(self, effect: str, values: dict[str, float]) -> bool:
+        """Whether an effect at these values matters in prediction."""
+        entry = effects.CATALOGUE[effect]
+        sizes = [
+            abs(values[full] - p.off) / p.smallest
+            for full, p in zip(entry.names(), entry.parameters, strict=True)
+            if p.smallest > 0.0
+        ]
+        for base in entry.replaces:
+            old = self.model.vehicle.parameters[base]
+            relative = abs(values[entry.names()[0]])
+            relative /= 1.0 if entry.parameters[0].unit == "1" else old.value
+            if relative < 2.0 * old.std / old.value:
+                return False
+        return max(sizes) >= 1.0
+
+    def loss_without(self, quadratic: Quadratic, active: list[str], effect: str) -> float:
+        """Nats lost, Occam factor returned, when an effect leaves and the rest refits."""
+        free = self.free_names(active)
+        now, _ = quadratic.best(free)
+        rest = [n for n in free if not n.startswith(effect + ".")]
+        pinned = self.off(effect) | self.pinned(effect)
+        then, _ = quadratic.best(rest, pinned)
+        own = [n for n in self.candidate_names(effect)]
+        return then - now - quadratic.occam(own, rest)
+
+    def swap(
+        self, quadratic: Quadratic, active: list[str], old: str, new: str
+    ) -> tuple[float, np.ndarray]:
+        """Change of the objective [nats, Occam factors in] when one effect stands for another."""
+        free = self.free_names(active)
+        now, _ = quadratic.best(free)
+        others = [e for e in active if e != old]
+        rest = [n for n in self.free_names(others) if n not in self.pinned(new)]
+        pinned = self.off(old) | self.pinned(new)
+        then, move = quadratic.best(rest + self.candidate_names(new), pinned)
+        occam_new = 0.0 if self.pinned(new) else quadratic.occam(self.candidate_names(new), rest)
+        occam_old = 0.0 if self.pinned(old) else quadratic.occam(self.candidate_names(old), rest)
+        return then + occam_new - now - occam_old, move
+
+    # --- the search ---------------------------------------------------------------------------------
+
+    def run(self, state: State) -> tuple[State, Quadratic]:
+        """Forward, backward and swap until nothing moves; the final state and its quadratic."""
+        banned: set[str] = set()
+        state = self.settle(state)
+        state = self.refit_noise(state)
+        for _ in range(4 * MOST_CAUSES):
+            _, quadratic = self.linearise(state)
+            promised, _ = quadratic.best(self.free_names(state.active))
+            if -promised > 2.0 and self.advance(state, quadratic, {}) > 1.0:
+                continue
+            dropped = self._drop(state, quadratic)
+            if dropped:
+                banned.add(dropped)
+                state = self.refit_noise(self.settle(state))
+                continue
+            if self._swap(state, quadratic):
+                state = self.refit_noise(self.settle(state))
+                continue
+            added = self._add(state, quadratic, banned)
+            if not added:
+                return state, quadratic
+            state = self.refit_noise(self.settle(state))
+        return state, quadratic
+
+    def _drop(self, state: State, quadratic: Quadratic) -> str | None:
+        for effect in state.active:
+            loss = self.loss_without(quadratic, state.active, effect)
+            if loss < EVIDENCE or not self.is_large(effect, state.values):
+                self.history.append((f"- {effect}", loss))
+                self.say(f"dropped {effect}: worth {loss:.1f} nats")
+                state.active = [e for e in state.active if e != effect]
+                state.values |= self.off(effect)
+                return effect
+        return None
+
+    def _swap(self, state: State, quadratic: Quadratic) -> bool:
+        for old in list(state.active):
+            for new in self.candidates:
+                if new in state.active:
+                    continue
+                change, move = self.swap(quadratic, state.active, old, new)
+                if change > -TIE:
+                    continue
+                active = [new if e == old else e for e in state.active]
+                values = dict(zip(quadratic.names, quadratic.at + move, strict=True))
+                trial = State(active, state.values | values, state.noise)
+                if not self.is_large(new, trial.values):
+                    continue
+                trial = self.settle(trial)
+                if trial.objective < state.objective - TIE:
+                    self.history.append((f"{old} -> {new}", state.objective - trial.objective))
+                    self.say(f"{new} explains it better than {old}")
+                    state.active, state.values = trial.active, trial.values
+                    state.objective = trial.objective
+                    return True
+        return False
+
+    def _add(self, state: State, quadratic: Quadratic, banned: set[str]) -> str | None:
+        if len(state.active) >= MOST_CAUSES:
+            return None
+        ranked = []
+        for effect in self.candidates:
+            if effect in state.active or effect in banned:
+                continue
+            score, evidence, large = self.score(quadratic, state.active, effect)
+            if large and evidence > EVIDENCE and score > 0.0:
+                ranked.append((score, effect))
+        if not ranked:
+            return None
+        score, effect = max(ranked)
+        self.history.append((f"+ {effect}", score))
+        self.say(f"added {effect}: {score:.1f} nats")
+        state.active = [*state.active, effect]
+        self.advance(state, quadratic, self.pinned(effect))
+        return effect

@@ -1,0 +1,48 @@
+"""What every script here shares: the common arguments, the exit codes, one-line errors."""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+from coax_env.errors import InputError
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that complains in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f"error: {message} (see --help)\n")
+
+
+def parser(name: str, description: str, *, seed: bool = False) -> Parser:
+    """A parser with ``--out`` (default ``runs/NAME``) and, where chance plays, ``--seed``."""
+    result = Parser(prog=f"scripts/{name}.py", description=description)
+    result.add_argument(
+        "--out", type=Path, default=Path("runs") / name, metavar="DIR",
+        help="folder for the results (default: %(default)s)",
+    )  # fmt: skip
+    if seed:
+        result.add_argument("--seed", type=int, default=0, help="of chance (default: 0)")
+    return result
+
+
+def run(main: Callable[[], None]) -> NoReturn:
+    """Call ``main`` and leave with the project's exit codes: 0, 2 bad input, 130 Ctrl-C, else 1."""
+    try:
+        main()
+    except InputError as error:
+        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except BrokenPipeError:  # whoever read our output has closed it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    sys.exit(0)
