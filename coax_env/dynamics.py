@@ -126,9 +126,7 @@ def _rates(x, p, f, dx):
     # (26)-(27)
     tau = f[F.FLAP_TIME]
     gain = f[F.SWASH_TO_FLAP]
-    f[F.ALPHA_L_DOT] = (
-        gain * f[F.DELTA_LON] - x[6] - p[P.FLAP_COUPLING_LON] * x[7]
-    ) / tau - q_
+    f[F.ALPHA_L_DOT] = (gain * f[F.DELTA_LON] - x[6] - p[P.FLAP_COUPLING_LON] * x[7]) / tau - q_
     f[F.BETA_L_DOT] = (gain * f[F.DELTA_LAT] - x[7] + p[P.FLAP_COUPLING_LAT] * x[6]) / tau - p_
 
     # (13)-(14): thrust along [-tan a, tan b, -1], normalised
@@ -144,17 +142,21 @@ def _rates(x, p, f, dx):
     radius = p[P.ROTOR_RADIUS]
     download = f[F.THRUST_U] * area / (4.0 * math.pi * radius * radius)
 
-    f[F.FORCE_X] = x_u + x_l + x[20]
-    f[F.FORCE_Y] = y_u + y_l + x[21]
-    f[F.FORCE_Z] = z_u + z_l + download + x[22]
+    gust = f[F.MASS] / p[P.GUST_MASS]
+    f[F.FORCE_X] = x_u + x_l + gust * x[20]
+    f[F.FORCE_Y] = y_u + y_l + gust * x[21]
+    f[F.FORCE_Z] = z_u + z_l + download + gust * x[22]
 
     # (35)-(37): hubs at (0, 0, -d); gyroscopic moment -omega x (0, 0, H), (23)-(25)
     momentum = (
         p[P.ROTOR_INERTIA_L] * omega_l - (p[P.ROTOR_INERTIA_U] + p[P.FLYBAR_INERTIA]) * omega_u
     )
-    f[F.MOMENT_X] = p[P.ARM_U] * y_u + p[P.ARM_L] * y_l - q_ * momentum + x[23]
-    f[F.MOMENT_Y] = -p[P.ARM_U] * x_u - p[P.ARM_L] * x_l + p_ * momentum + x[24]
-    f[F.MOMENT_Z] = f[F.TORQUE_U] - f[F.TORQUE_L] + x[25]
+    f[F.MOMENT_X] = p[P.ARM_U] * y_u + p[P.ARM_L] * y_l - q_ * momentum
+    f[F.MOMENT_Y] = -p[P.ARM_U] * x_u - p[P.ARM_L] * x_l + p_ * momentum
+    f[F.MOMENT_Z] = f[F.TORQUE_U] - f[F.TORQUE_L]
+    f[F.MOMENT_X] += x[23] * f[F.INERTIA_XX] / p[P.GUST_INERTIA_XX]
+    f[F.MOMENT_Y] += x[24] * f[F.INERTIA_YY] / p[P.GUST_INERTIA_YY]
+    f[F.MOMENT_Z] += x[25] * f[F.INERTIA_ZZ] / p[P.GUST_INERTIA_ZZ]
     if p[effects.LOAD] != 0.0:
         _load_effects(x, f, p)
 

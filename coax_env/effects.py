@@ -20,7 +20,9 @@ kernel (MOTOR_LAG_*, SERVO_LAG, discretised exactly, so that zero is a limit and
 pure delay of the command is a shift of the input (heli_model.py), of a reading its rate of change.
 
 A stage whose effects are all off is skipped by one test, so that the bare model pays nothing.
-Signs, sizes and look-alikes follow design/effects.md; "usual" is also the width of the prior.
+Signs, sizes and look-alikes follow design/effects.md; "usual" is also the width of the prior. What
+physics gives one sign only (drag, damping, stiffness, lag) is bounded at zero: a fit that wants the
+other sign is explaining something else.
 """
 
 import math
@@ -61,7 +63,9 @@ class EffectParameter:
     lower: float = -INFINITY
     upper: float = INFINITY
     shape: bool = False
-    probe: float = 0.0  # finite step for the signature where the effect has no slope at its off-value
+    probe: float = (
+        0.0  # finite step for the signature where the effect has no slope at its off-value
+    )
 
 
 @dataclass(frozen=True)
@@ -136,7 +140,7 @@ def added_mass(x, f, p, e):
 
 @effect(
     PROPERTY,
-    EffectParameter("scale", "1", usual=0.07, smallest=0.02, lower=-0.6),
+    EffectParameter("scale", "1", usual=0.07, smallest=0.02, lower=-0.3, upper=0.5),
     channels="az vd h",
     source="eqs (15)-(16)",
     replaces=("thrust_coefficient_upper",),
@@ -149,7 +153,7 @@ def thrust_scale(x, f, p, e):
 
 @effect(
     PROPERTY,
-    EffectParameter("scale", "1", usual=0.07, smallest=0.02, lower=-0.6),
+    EffectParameter("scale", "1", usual=0.07, smallest=0.02, lower=-0.3, upper=0.5),
     channels="r psi",
     source="eqs (19)-(20)",
     replaces=("torque_coefficient_lower",),
@@ -232,7 +236,7 @@ def servo_delay(x, f, p, e):
 
 @effect(
     PROPERTY,
-    EffectParameter("rate", "1/s", usual=0.002, smallest=0.0003),
+    EffectParameter("rate", "1/s", usual=0.002, smallest=0.0003, lower=0.0),
     channels="rpm_upper rpm_lower az r",
     source="falling battery voltage, to first order in time",
 )
@@ -297,7 +301,9 @@ def swash_offset(x, f, p, e):
 @effect(
     ROTOR,
     EffectParameter("gain", "1", usual=0.4, smallest=0.05, lower=0.0),
-    EffectParameter("decay", "1", usual=0.6, smallest=0.0, off=2.0, lower=0.5, upper=6.0, shape=True),
+    EffectParameter(
+        "decay", "1", usual=0.6, smallest=0.0, off=2.0, lower=0.5, upper=6.0, shape=True
+    ),
     channels="az h vd",
     source="exponential fit to Cheeseman and Bennett, ARC R&M 3021, 1955; z is the height of the CG",
 )
@@ -311,7 +317,7 @@ def ground_effect(x, f, p, e):
 
 @effect(
     ROTOR,
-    EffectParameter("coefficient", "s/m", usual=0.1, smallest=0.015),
+    EffectParameter("coefficient", "s/m", usual=0.1, smallest=0.015, lower=0.0),
     channels="az h vd",
     source="blade-element theory, climb inflow; Leishman 2006, ch. 3",
 )
@@ -324,7 +330,7 @@ def axial_damping(x, f, p, e):
 
 @effect(
     ROTOR,
-    EffectParameter("gain", "1", usual=0.27, smallest=0.06),
+    EffectParameter("gain", "1", usual=0.27, smallest=0.06, lower=0.0, upper=1.5),
     channels="az r",
     source="lower rotor in the upper one's wake; Leishman and Ananthan, AHS J. 2008",
 )
@@ -357,9 +363,9 @@ def thrust_exponent(x, f, p, e):
 
 @effect(
     LOAD,
-    EffectParameter("area_x", "m2", usual=0.02, smallest=0.003),
-    EffectParameter("area_y", "m2", usual=0.02, smallest=0.003),
-    EffectParameter("area_z", "m2", usual=0.02, smallest=0.003),
+    EffectParameter("area_x", "m2", usual=0.02, smallest=0.003, lower=0.0),
+    EffectParameter("area_y", "m2", usual=0.02, smallest=0.003, lower=0.0),
+    EffectParameter("area_z", "m2", usual=0.02, smallest=0.003, lower=0.0),
     channels="ax ay az vn ve vd",
     source="Hoerner 1965: quadratic drag, per axis",
 )
@@ -374,7 +380,7 @@ def airframe_drag(x, f, p, e):
 
 @effect(
     LOAD,
-    EffectParameter("coefficient", "N s/m per rad/s", usual=4e-4, smallest=5e-5),
+    EffectParameter("coefficient", "N s/m per rad/s", usual=4e-4, smallest=5e-5, lower=0.0),
     channels="ax ay vn ve",
     source="rotor H-force and induced drag; Martin and Salaun, ICRA 2010",
 )
@@ -387,7 +393,7 @@ def rotor_drag(x, f, p, e):
 
 @effect(
     LOAD,
-    EffectParameter("gain", "rad per m/s", usual=0.0075, smallest=0.001),
+    EffectParameter("gain", "rad per m/s", usual=0.0075, smallest=0.001, lower=0.0),
     channels="p q",
     source="longitudinal flapping with speed; Prouty 1986, ch. 3",
 )
@@ -399,7 +405,7 @@ def flap_blowback(x, f, p, e):
 
 @effect(
     LOAD,
-    EffectParameter("coefficient", "N m s", usual=0.004, smallest=0.0005),
+    EffectParameter("coefficient", "N m s", usual=0.004, smallest=0.0005, lower=0.0),
     channels="r psi",
     source="aerodynamic yaw damping, to first order",
 )
@@ -410,7 +416,7 @@ def yaw_damping(x, f, p, e):
 
 @effect(
     LOAD,
-    EffectParameter("coefficient", "N m s", usual=0.004, smallest=0.0008),
+    EffectParameter("coefficient", "N m s", usual=0.004, smallest=0.0008, lower=0.0),
     channels="p q",
     source="aerodynamic rate damping, to first order",
 )
@@ -436,8 +442,8 @@ def cg_offset(x, f, p, e):
 
 @effect(
     LOAD,
-    EffectParameter("upper", "N m/rad", usual=0.2, smallest=0.03),
-    EffectParameter("lower", "N m/rad", usual=0.2, smallest=0.03),
+    EffectParameter("upper", "N m/rad", usual=0.2, smallest=0.03, lower=0.0),
+    EffectParameter("lower", "N m/rad", usual=0.2, smallest=0.03, lower=0.0),
     channels="p q",
     source="spring at the flap hinge, Johnson 1980, ch. 5",
 )
@@ -449,7 +455,7 @@ def hub_stiffness(x, f, p, e):
 
 @effect(
     LOAD,
-    EffectParameter("gain", "1", usual=1.0, smallest=0.25),
+    EffectParameter("gain", "1", usual=1.0, smallest=0.25, lower=0.0),
     channels="r psi",
     source="angular momentum along z; the paper's (37) leaves it out",
 )
@@ -614,7 +620,9 @@ def off_vector() -> np.ndarray:
     vector = np.full(N_PARAMETERS, np.nan)
     vector[P.GUST_MEMORY] = 0.5
     for entry in CATALOGUE.values():
-        vector[entry.index : entry.index + len(entry.parameters)] = [p.off for p in entry.parameters]
+        vector[entry.index : entry.index + len(entry.parameters)] = [
+            p.off for p in entry.parameters
+        ]
     set_switches(vector)
     return vector
 
@@ -624,6 +632,8 @@ def pack(values: Mapping[str, float]) -> np.ndarray:
     vector = off_vector()
     for name, value in values.items():
         vector[parameter_index(name)] = value
+    for reference, own in P.GUST_REFERENCE.items():
+        vector[reference] = vector[own]
     set_switches(vector)
     return vector
 
@@ -666,4 +676,3 @@ def _before(function: Callable, e: int, rest: Callable) -> Callable:
         rest(x, f, p)
 
     return both
-

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from coax_env import dynamics, effects
+from coax_env import parameters as P
 from coax_env.engine.model import FreeParameter, Noise, Record
 from coax_env.flight import Flight, Run
 from coax_env.layout import (
@@ -57,13 +58,16 @@ class HeliModel:
 
     def vector(self, values: Mapping[str, float]) -> np.ndarray:
         """Parameter vector of the vehicle with some values changed, effects included."""
-        return effects.pack({**self.bare_values, **values})
+        vector = effects.pack({**self.bare_values, **values})
+        for reference, own in P.GUST_REFERENCE.items():
+            vector[reference] = self.vehicle.vector[own]
+        return vector
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """Commands and time since the run's start, (n, 5)."""
         u = np.empty((record.t.size, N_INPUTS))
         u[:, :TIME] = record.command
-        u[:, TIME] = record.t - record.t[0]
+        u[:, TIME] = record.t - record.origin
         delay = vector[_DELAY]
         if delay > 0.0:
             for column in (2, 3):
@@ -81,7 +85,7 @@ class HeliModel:
                 return otherwise, spread
             if channel in ANGLES:
                 values = np.unwrap(values[:3])
-            return float(np.median(values)), min(spread, 0.5)
+            return float(np.median(values)), 0.5 if channel in ("h", "pn", "pe") else spread
 
         x = np.zeros(N_FULL)
         spread = np.zeros(N_FULL)
@@ -118,7 +122,7 @@ class HeliModel:
     def base_parameters(self, without: Sequence[str] = ()) -> list[FreeParameter]:
         """The vehicle's own numbers under their priors, those in `without` left out."""
         return [
-            FreeParameter(name, p.value, p.std, lower=0.05 * p.value, upper=20.0 * p.value)
+            FreeParameter(name, p.value, p.std, lower=0.3 * p.value, upper=3.0 * p.value)
             for name, p in self.vehicle.parameters.items()
             if p.std > 0.0 and name not in HELD and name not in without
         ]
@@ -139,7 +143,10 @@ _DELAY = effects.parameter_index("servo_delay.time")
 def _gust_levels(noise: Noise) -> np.ndarray:
     level = noise.process
     return np.array(
-        [level["force_xy"]] * 2 + [level["force_z"]] + [level["moment_xy"]] * 2 + [level["moment_z"]]
+        [level["force_xy"]] * 2
+        + [level["force_z"]]
+        + [level["moment_xy"]] * 2
+        + [level["moment_z"]]
     )
 
 
@@ -162,11 +169,11 @@ def record_of(run: Run) -> Record:
     z = np.full((run.t.size, len(CHANNELS)), np.nan)
     for channel, values in run.measured.items():
         z[:, CHANNELS.index(channel)] = values
-    return Record(run.name, run.t, run.command, z)
+    return Record(run.name, run.t, run.command, z, origin=float(run.t[0]))
 
 
-def starting_noise(flight: Flight, vehicle: Vehicle) -> tuple[Noise, list[list[str]]]:
-    """Noise to start from, and the channels whose std must be estimated (the card gives none)."""
+def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
+    """Noise to start from: readings as the card says or the data show, gusts by guess."""
     weight = vehicle["mass"].value * vehicle["gravity"].value
     arm = vehicle["arm_upper"].value
     process = {
@@ -182,26 +189,16 @@ def starting_noise(flight: Flight, vehicle: Vehicle) -> tuple[Noise, list[list[s
         "moment_xy": 3e-4 * weight * arm,
         "moment_z": 1e-4 * weight * arm,
     }
-    reading = {}
-    unknown: list[list[str]] = []
-    groups = {
-        "rpm_upper": ["rpm_upper", "rpm_lower"], "p": ["p", "q"], "r": ["r"], "ax": ["ax", "ay"],
-        "az": ["az"], "phi": ["phi", "theta"], "psi": ["psi"], "h": ["h"], "vn": ["vn", "ve"],
-        "vd": ["vd"], "pn": ["pn", "pe"], "v": ["v"],
-    }  # fmt: skip
-    present = set(flight.channels)
-    for group in groups.values():
-        here = [c for c in group if c in present]
-        missing = [c for c in here if c not in flight.noise]
-        for channel in here:
-            reading[channel] = flight.noise.get(channel) or _white_std(flight, channel)
-        if missing:
-            unknown.append(missing)
-    return Noise(process, reading, floor), unknown
+    reading = {c: flight.noise.get(c) or _white_std(flight, c) for c in flight.channels}
+    return Noise(process, reading, floor)
 
 
 def _white_std(flight: Flight, channel: str) -> float:
-    """Std of white noise from third differences, robustly; at least a hundredth of the default."""
+    """Std to start from where the card has none: twice the scatter from sample to sample.
+
+    Third differences, robustly. A motion capture reads finer than any model flies (vibration, jitter
+    of the time stamps), so that it is at least a fortieth of an ordinary sensor's.
+    """
     parts = []
     for run in flight.runs:
         if channel in run.measured:
@@ -212,5 +209,5 @@ def _white_std(flight: Flight, channel: str) -> float:
                 parts.append(np.diff(values, 3))
     if not parts:
         return DEFAULT_READING_STD[channel]
-    spread = float(np.median(np.abs(np.concatenate(parts)))) / 0.6745 / np.sqrt(20.0)
-    return max(spread, 0.01 * DEFAULT_READING_STD[channel])
+    scatter = float(np.median(np.abs(np.concatenate(parts)))) / 0.6745 / np.sqrt(20.0)
+    return max(2.0 * scatter, 0.025 * DEFAULT_READING_STD[channel])

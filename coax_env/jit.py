@@ -46,7 +46,9 @@ def _cache_root() -> Path:
     if root:
         return Path(root)
     home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return home / "coax" if os.access(home.parent, os.W_OK) else Path(tempfile.gettempdir()) / "coax"
+    return (
+        home / "coax" if os.access(home.parent, os.W_OK) else Path(tempfile.gettempdir()) / "coax"
+    )
 
 
 CACHE_DIR = _cache_root() / source_hash()

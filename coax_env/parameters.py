@@ -55,5 +55,17 @@ PAPER_SYMBOLS = {
     FLAP_COUPLING_LON, FLAP_COUPLING_LAT,
 ) = range(len(BASE))  # fmt: skip
 
-GUST_MEMORY = len(BASE)  # correlation time of the gust states [s]
+# Gusts act on the machine as it is in the file: fitting a mass or an inertia must not change how much
+# acceleration the gusts are allowed, or the fit would hide misfit in it.
+GUST_MASS, GUST_INERTIA_XX, GUST_INERTIA_YY, GUST_INERTIA_ZZ, GUST_MEMORY = range(
+    len(BASE), len(BASE) + 5
+)
+"""Reference mass and inertias of the gust states [kg, kg m2] and their correlation time [s]."""
+GUST_REFERENCE = {
+    GUST_MASS: MASS,
+    GUST_INERTIA_XX: INERTIA_XX,
+    GUST_INERTIA_YY: INERTIA_YY,
+    GUST_INERTIA_ZZ: INERTIA_ZZ,
+}
+
 N_FIXED = GUST_MEMORY + 1  # after it: one switch per stage, then the effects' parameters

@@ -15,7 +15,8 @@ base parameter goes back to its file value. It counts when it moved by more than
 parameter's prior std (contract.md) and the move is worth EVIDENCE against the file value.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,6 +31,11 @@ EVIDENCE = 12.0
 TIE = 6.0
 """Alternatives within this many nats cannot be told apart."""
 MOST_CAUSES = 8
+PROMISE = 2.0
+"""Nats below which another Gauss-Newton step is not worth its time."""
+MOST_MOVES = 3
+MOST_FAILURES = 3
+"""Additions in a row that do not hold before the search gives up."""
 Progress = Callable[[str], None]
 
 
@@ -45,6 +51,7 @@ class Quadratic:
     precision: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+    stretches: np.ndarray
 
     @classmethod
     def of(
@@ -60,6 +67,7 @@ class Quadratic:
             np.array([1.0 / f.std**2 for f in free]),
             np.array([f.lower for f in free]),
             np.array([f.upper for f in free]),
+            lin.stretches,
         )
 
     def index(self, names: Collection[str]) -> np.ndarray:
@@ -97,6 +105,27 @@ class Quadratic:
         )
         return float(change), move
 
+    def colour(self, own: Collection[str], free: Collection[str]) -> float:
+        """How much more the slope of `own` scatters from stretch to stretch than white noise lets it.
+
+        At a fitted point the projected slopes of separate stretches are independent with covariance
+        equal to the information, where the innovations are white. What is above 1 is colour: the
+        evidence is that many times too large, the variance that many times too small (the sandwich
+        of Huber 1967, in the direction of one effect).
+        """
+        c = self.index(own)
+        f = self.index([n for n in free if n not in set(own)])
+        schur = self.G[np.ix_(c, c)]
+        scores = self.stretches[:, c]
+        if f.size:
+            A = self.G[np.ix_(f, f)] + np.diag(self.precision[f])
+            weights = np.linalg.solve(A, self.G[np.ix_(f, c)])
+            schur = schur - self.G[np.ix_(c, f)] @ weights
+            scores = scores - self.stretches[:, f] @ weights
+        scatter = scores.T @ scores
+        value = np.trace(np.linalg.lstsq(schur, scatter, rcond=None)[0]) / c.size
+        return max(1.0, float(value)) if np.isfinite(value) else 1.0
+
     def occam(self, added: Collection[str], free: Collection[str]) -> float:
         """Laplace factor of `added` beside `free`: half log det (posterior over prior precision)."""
         c = self.index(added)
@@ -130,7 +159,6 @@ class Search:
     engine: Engine
     model: HeliModel
     candidates: tuple[str, ...]
-    unknown_reading: Sequence[Sequence[str]] = ()
     progress: Progress | None = None
     history: list[tuple[str, float]] = field(default_factory=list)
 
@@ -177,50 +205,55 @@ class Search:
         values = dict(self.model.bare_values)
         for f in self.all:
             values.setdefault(f.name, f.value)
-        noise = self.engine.fit_noise(values, noise, GUST_LEVELS, self.unknown_reading)
+        noise = self.engine.fit_noise(values, noise, GUST_LEVELS)
         return State([], values, noise)
 
-    def linearise(self, state: State, everything: bool = True) -> tuple[list[RunPass], Quadratic]:
-        """The quadratic at a state, over all parameters or the loose ones."""
-        free = self.all if everything else self.free(state.active)
-        passes, lin = self.engine.linearise(state.values, state.noise, free)
+    def linearise(self, state: State) -> tuple[list[RunPass], Quadratic]:
+        """The quadratic at a state, over all parameters that might be free."""
+        passes, lin = self.engine.linearise(state.values, state.noise, self.all)
         state.objective = objective(passes, self.free(state.active), state.values)
-        return passes, Quadratic.of(lin, free, state.values)
+        return passes, Quadratic.of(lin, self.all, state.values)
 
-    def advance(self, state: State, quadratic: Quadratic, pinned: dict[str, float]) -> float:
-        """Take the Newton step of the active set, halved until the objective falls. Gain, nats."""
+    def advance(
+        self,
+        state: State,
+        passes: Sequence[RunPass],
+        quadratic: Quadratic,
+        pinned: Mapping[str, float],
+    ) -> float:
+        """Take the Newton step of the active set, halved until the cost falls. Gain, nats."""
         free = self.free(state.active)
-        _, move = quadratic.best([f.name for f in free], pinned)
-        before = objective(self.engine.filter(state.values, state.noise), free, state.values)
-        for damping in (1.0, 0.5, 0.25, 0.1):
-            trial = dict(state.values)
-            for name, change in zip(quadratic.names, move, strict=True):
-                trial[name] += change if name in pinned else damping * change
-            reached = objective(self.engine.filter(trial, state.noise), free, trial)
-            if reached < before:
-                state.values, state.objective = trial, reached
-                return before - reached
-        return 0.0
+        _, move = quadratic.best([f.name for f in free], dict(pinned))
+        moves = {n: float(m) for n, m in zip(quadratic.names, move, strict=True) if m != 0.0}
+        state.values, gained = self.engine.descend(
+            passes, free, state.values, state.noise, moves, whole=pinned
+        )
+        return gained
 
-    def settle(self, state: State, steps: int = 4, tolerance: float = 0.5) -> State:
-        """Fit the active set by Gauss-Newton, linearising the loose parameters only."""
-        for _ in range(steps):
-            _, quadratic = self.linearise(state, everything=False)
-            promised, _ = quadratic.best(quadratic.names)
-            if -promised < tolerance or self.advance(state, quadratic, {}) < tolerance:
-                break
+    def settle(
+        self,
+        state: State,
+        steps: int = 3,
+        tolerance: float = 1.0,
+        without: Collection[str] = (),
+    ) -> State:
+        """Fit the loose parameters by Gauss-Newton, those in `without` held. Changes `state`."""
+        free = [f for f in self.free(state.active) if f.name not in without]
+        estimate = self.engine.fit(free, state.values, state.noise, steps, tolerance)
+        state.values = state.values | estimate.values
+        state.objective = estimate.objective
         return state
 
     def refit_noise(self, state: State) -> State:
         """Noise levels again, from where they stand."""
-        noise = self.engine.fit_noise(
-            state.values, state.noise, GUST_LEVELS, self.unknown_reading, iterations=6
-        )
+        noise = self.engine.fit_noise(state.values, state.noise, GUST_LEVELS, iterations=4)
         return replace(state, noise=noise)
 
     # --- scores -------------------------------------------------------------------------------------
 
-    def score(self, quadratic: Quadratic, active: list[str], effect: str) -> tuple[float, float, bool]:
+    def score(
+        self, quadratic: Quadratic, active: list[str], effect: str
+    ) -> tuple[float, float, bool]:
         """Log Bayes factor of adding an effect, its evidence for the rule, and whether it is large.
 
         The second number is what EVIDENCE is compared with: for an effect that replaces base
@@ -239,7 +272,11 @@ class Search:
             held, _ = quadratic.best(rest, pinned)
             evidence = held - then
         reached = dict(zip(quadratic.names, quadratic.at + move, strict=True))
-        return gain - (0.0 if pinned else occam), evidence - occam, self.is_large(entry.name, reached)
+        return (
+            gain - (0.0 if pinned else occam),
+            evidence - occam,
+            self.is_large(entry.name, reached),
+        )
 
     def is_large(self, effect: str, values: dict[str, float]) -> bool:
         """Whether an effect at these values matters in prediction."""
@@ -258,14 +295,14 @@ class Search:
         return max(sizes) >= 1.0
 
     def loss_without(self, quadratic: Quadratic, active: list[str], effect: str) -> float:
-        """Nats lost, Occam factor returned, when an effect leaves and the rest refits."""
+        """Nats lost when an effect leaves and the rest refits, less colour and Occam factor."""
         free = self.free_names(active)
         now, _ = quadratic.best(free)
         rest = [n for n in free if not n.startswith(effect + ".")]
         pinned = self.off(effect) | self.pinned(effect)
         then, _ = quadratic.best(rest, pinned)
-        own = [n for n in self.candidate_names(effect)]
-        return then - now - quadratic.occam(own, rest)
+        own = self.candidate_names(effect)
+        return (then - now) / quadratic.colour(own, free) - quadratic.occam(own, rest)
 
     def swap(
         self, quadratic: Quadratic, active: list[str], old: str, new: str
@@ -285,25 +322,30 @@ class Search:
 
     def run(self, state: State) -> tuple[State, Quadratic]:
         """Forward, backward and swap until nothing moves; the final state and its quadratic."""
-        banned: set[str] = set()
-        state = self.settle(state)
-        state = self.refit_noise(state)
+        banned: set[str] = set()  # dropped since the last addition
+        drops: Counter[str] = Counter()
+        tried: set[tuple[str, ...]] = set()
+        moves = failures = most = 0
+        state = self.refit_noise(self.settle(state))
         for _ in range(4 * MOST_CAUSES):
-            _, quadratic = self.linearise(state)
+            passes, quadratic = self.linearise(state)
             promised, _ = quadratic.best(self.free_names(state.active))
-            if -promised > 2.0 and self.advance(state, quadratic, {}) > 1.0:
-                continue
+            if -promised > PROMISE and moves < MOST_MOVES:
+                moves += 1
+                if self.advance(state, passes, quadratic, {}) > PROMISE:
+                    continue
+            moves = 0
             dropped = self._drop(state, quadratic)
             if dropped:
+                drops[dropped] += 1
                 banned.add(dropped)
-                state = self.refit_noise(self.settle(state))
-                continue
-            if self._swap(state, quadratic):
-                state = self.refit_noise(self.settle(state))
-                continue
-            added = self._add(state, quadratic, banned)
-            if not added:
-                return state, quadratic
+                failures += 1
+            elif failures < MOST_FAILURES and self._add(state, passes, quadratic, banned):
+                if len(state.active) > most + 1:  # the one before held
+                    most, failures = len(state.active) - 1, 0
+                    banned = {e for e, count in drops.items() if count > 1}
+            elif not self._swap(state, quadratic, tried):
+                break
             state = self.refit_noise(self.settle(state))
         return state, quadratic
 
@@ -318,29 +360,32 @@ class Search:
                 return effect
         return None
 
-    def _swap(self, state: State, quadratic: Quadratic) -> bool:
-        for old in list(state.active):
+    def _swap(self, state: State, quadratic: Quadratic, tried: set[tuple[str, ...]]) -> bool:
+        """Put another effect in the place of one that is in, where that fits better."""
+        promising = []
+        for old in state.active:
             for new in self.candidates:
-                if new in state.active:
-                    continue
-                change, move = self.swap(quadratic, state.active, old, new)
-                if change > -TIE:
-                    continue
-                active = [new if e == old else e for e in state.active]
-                values = dict(zip(quadratic.names, quadratic.at + move, strict=True))
-                trial = State(active, state.values | values, state.noise)
-                if not self.is_large(new, trial.values):
-                    continue
-                trial = self.settle(trial)
-                if trial.objective < state.objective - TIE:
-                    self.history.append((f"{old} -> {new}", state.objective - trial.objective))
-                    self.say(f"{new} explains it better than {old}")
-                    state.active, state.values = trial.active, trial.values
-                    state.objective = trial.objective
-                    return True
+                active = tuple(new if e == old else e for e in state.active)
+                if new not in state.active and active not in tried:
+                    change, move = self.swap(quadratic, state.active, old, new)
+                    if change < -TIE:
+                        promising.append((change, old, new, active, move))
+        for _, old, new, active, move in sorted(promising, key=lambda c: c[0])[:3]:
+            tried.add(active)
+            values = dict(zip(quadratic.names, (quadratic.at + move).tolist(), strict=True))
+            trial = self.settle(State(list(active), state.values | values, state.noise))
+            if trial.objective < state.objective - TIE and self.is_large(new, trial.values):
+                gained = state.objective - trial.objective
+                self.history.append((f"{old} -> {new}", gained))
+                self.say(f"{new} explains it better than {old}, by {gained:.1f} nats")
+                state.active, state.values = trial.active, trial.values
+                state.objective = trial.objective
+                return True
         return False
 
-    def _add(self, state: State, quadratic: Quadratic, banned: set[str]) -> str | None:
+    def _add(
+        self, state: State, passes: Sequence[RunPass], quadratic: Quadratic, banned: set[str]
+    ) -> str | None:
         if len(state.active) >= MOST_CAUSES:
             return None
         ranked = []
@@ -356,5 +401,5 @@ class Search:
         self.history.append((f"+ {effect}", score))
         self.say(f"added {effect}: {score:.1f} nats")
         state.active = [*state.active, effect]
-        self.advance(state, quadratic, self.pinned(effect))
+        self.advance(state, passes, quadratic, self.pinned(effect))
         return effect

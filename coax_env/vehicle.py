@@ -122,7 +122,9 @@ class Vehicle:
     def in_air(self, air: Mapping[str, float]) -> "Vehicle":
         """A copy with a flight card's ``density`` and ``gravity`` instead of the file's."""
         names = {"density": "air_density", "gravity": "gravity"}
-        return self.with_values({names[k]: v for k, v in air.items()}, "flight card") if air else self
+        return (
+            self.with_values({names[k]: v for k, v in air.items()}, "flight card") if air else self
+        )
 
     def draw(self, rng: np.random.Generator) -> "Vehicle":
         """A vehicle drawn from this one's spread; positive base parameters are log-normal."""
@@ -189,7 +191,9 @@ def _vehicle_from(document: dict[str, Any], path: Path) -> Vehicle:
             raise InputError(f"{path}: parameters.{name} is not a parameter of the model")
     for name in POSITIVE:
         if base[name].value <= 0.0:
-            raise InputError(f"{path}: parameters.{name} must be positive, found {base[name].value}")
+            raise InputError(
+                f"{path}: parameters.{name} must be positive, found {base[name].value}"
+            )
     groups = {}
     raw = document.get("effects", {})
     if not isinstance(raw, dict):

@@ -3,9 +3,13 @@
 import argparse
 import os
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
+
+from tqdm import tqdm
 
 from coax_env.errors import InputError
 
@@ -30,6 +34,35 @@ def parser(name: str, description: str, *, seed: bool = False) -> Parser:
     if seed:
         result.add_argument("--seed", type=int, default=0, help="of chance (default: 0)")
     return result
+
+
+def print_columns(rows: Sequence[Sequence[str]]) -> None:
+    """Rows of words in aligned columns."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for row in rows:
+        print("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip())
+
+
+@contextmanager
+def progress(name: str) -> Iterator[Callable[[str], None]]:
+    """A spinner with the time and what is being done; one plain line a step where output is a file."""
+    if not sys.stderr.isatty():
+        yield lambda text: print(f"{name}: {text}", file=sys.stderr, flush=True)
+        return
+    with tqdm(bar_format="{desc} [{elapsed}]", desc=name) as bar:
+        stop = threading.Event()
+
+        def tick() -> None:
+            while not stop.wait(0.5):
+                bar.refresh()
+
+        thread = threading.Thread(target=tick, daemon=True)
+        thread.start()
+        try:
+            yield lambda text: bar.set_description_str(f"{name}: {text}")
+        finally:
+            stop.set()
+            thread.join()
 
 
 def run(main: Callable[[], None]) -> NoReturn:

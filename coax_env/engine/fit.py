@@ -4,7 +4,7 @@ One engine, three uses: every parameter fixed is the simulation check, base para
 identification, effects' parameters free is diagnosis.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +17,8 @@ from coax_env.engine.model import FreeParameter, Model, Noise, Record
 
 GATE = 8.0  # sigmas
 REFRESH = 4  # rows between new Jacobians
+STRETCH = 2.0  # s
+HUGE = 1e6  # whitened innovations that only a diverging mean has
 Progress = Callable[[str], None]
 
 
@@ -46,15 +48,15 @@ class Linearised:
     """Likelihood to second order about a point, per run.
 
     information: (runs, k, k) Gram matrices of the signatures. slope: (runs, k) signatures times
-    innovations. by_channel: (runs, k, m) squared signatures summed per channel; residual_by_channel:
-    (runs, k, m) their products with the innovations.
+    innovations. by_channel: (runs, k, m) squared signatures summed per channel. stretches: (s, k) the
+    slope again, by stretches of STRETCH seconds.
     """
 
     names: tuple[str, ...]
     information: np.ndarray
     slope: np.ndarray
     by_channel: np.ndarray
-    slope_by_channel: np.ndarray
+    stretches: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class Engine:
         self.model = model
         self.records = list(records)
         self.threads = threads
-        self._dt = [np.append(np.diff(r.t), 0.0) for r in self.records]
+        self.intervals = [np.append(np.diff(r.t), 0.0) for r in self.records]
 
     def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
         indices = range(len(self.records)) if which is None else which
@@ -117,14 +119,14 @@ class Engine:
             e = np.full((n, m), np.nan)
             states = np.zeros((n, nx))
             rows = n if keep else 0
-            K = np.zeros((rows, nx, m), np.float32)
+            K = np.zeros((rows, m, nx), np.float32)
             W = np.zeros((rows, m, m), np.float32)
             starts = np.empty(0, np.int64) if start_rows is None else start_rows[i]
             slots = np.full(n, -1, np.int64)
             slots[starts] = np.arange(starts.size)
             P = np.zeros((starts.size, nx, nx))
             log_likelihood, left_out = kalman.filter_pass(
-                self.model.step, self.model.measure, self._dt[i], u, record.z, self.model.wraps,
+                self.model.step, self.model.measure, self.intervals[i], u, record.z, self.model.wraps,
                 x0, P0, R, q, p, self.model.state_scale, self.model.work_size, GATE, REFRESH,
                 keep, states, e, K, W, slots, P,
             )  # fmt: skip
@@ -156,20 +158,11 @@ class Engine:
         def one(i: int) -> tuple[np.ndarray, ...]:
             run = passes[i]
             n, m = run.record.z.shape
-            x0, _ = self.model.start(run.record, noise)
-
-            def innovations(p: np.ndarray, out: np.ndarray) -> bool:
-                return kalman.mean_pass(
-                    self.model.step, self.model.measure, self._dt[i],
-                    self.model.inputs(run.record, p), run.record.z, self.model.wraps,
-                    x0, p, self.model.work_size, run.gains, run.whitening, out,
-                )  # fmt: skip
-
             e = np.zeros((n, m))
-            innovations(base, e)
+            self._frozen(i, run, noise, base, e)
             J = np.zeros((len(free), n, m))
             for k, (p, size) in enumerate(zip(moved, steps, strict=True)):
-                if innovations(p, J[k]):
+                if self._frozen(i, run, noise, p, J[k]):
                     J[k] -= e
                     J[k] /= size
                 else:
@@ -180,9 +173,58 @@ class Engine:
             return flat @ flat.T, flat @ e.ravel(), by_channel, slope_by_channel
 
         parts = list(zip(*self._each(one), strict=True))
-        return passes, Linearised(
-            tuple(f.name for f in free), *(np.array(part) for part in parts)
-        )
+        return passes, Linearised(tuple(f.name for f in free), *(np.array(part) for part in parts))
+
+    def descend(
+        self,
+        passes: Sequence[RunPass],
+        free: Sequence[FreeParameter],
+        values: Mapping[str, float],
+        noise: Noise,
+        moves: Mapping[str, float],
+        whole: Collection[str] = (),
+    ) -> tuple[dict[str, float], float]:
+        """Move along a step, halved until the cost at frozen gains falls.
+
+        Moves named in `whole` are never shortened. Returns the new values and the gain, nats (0 and
+        the old values where no shortening helped).
+        """
+        before = self.frozen_cost(passes, free, values, noise)
+        limits = {f.name: (f.lower, f.upper) for f in free}
+        for damping in (1.0, 0.5, 0.25, 0.1, 0.03):
+            trial = dict(values)
+            for name, change in moves.items():
+                lower, upper = limits.get(name, (-np.inf, np.inf))
+                part_of_it = change if name in whole else damping * change
+                trial[name] = float(np.clip(values[name] + part_of_it, lower, upper))
+            gained = before - self.frozen_cost(passes, free, trial, noise)
+            if gained > 0.0:
+                return trial, gained
+        return dict(values), 0.0
+
+    def frozen_cost(
+        self,
+        passes: Sequence[RunPass],
+        free: Sequence[FreeParameter],
+        values: Mapping[str, float],
+        noise: Noise,
+    ) -> float:
+        """Half the squared innovations at frozen gains, plus the priors' penalty, nats."""
+        p = self.model.vector(values)
+
+        def one(i: int) -> float:
+            e = np.zeros(passes[i].record.z.shape)
+            return 0.5 * float(np.sum(e**2)) if self._frozen(i, passes[i], noise, p, e) else np.inf
+
+        return sum(self._each(one)) + penalty(free, values)
+
+    def _frozen(self, i: int, run: RunPass, noise: Noise, p: np.ndarray, out: np.ndarray) -> bool:
+        x0, _ = self.model.start(run.record, noise)
+        return kalman.mean_pass(
+            self.model.step, self.model.measure, self.intervals[i],
+            self.model.inputs(run.record, p), run.record.z, self.model.wraps,
+            x0, p, self.model.work_size, run.gains, run.whitening, out,
+        )  # fmt: skip
 
     def fit(
         self,
@@ -195,12 +237,12 @@ class Engine:
     ) -> Estimate:
         """Gauss-Newton for the free parameters under their priors, damped and within bounds.
 
-        Stops when a step promises less than `tolerance` nats. A step that raises the objective is
-        halved.
+        Each step keeps the gains of its own linearisation, then filters anew (iteratively reweighted
+        least squares). Stops when a step promises less than `tolerance` nats. A step that raises the
+        cost at those gains is halved.
         """
         values = dict(values)
         passes, lin = self.linearise(values, noise, free)
-        best = objective(passes, free, values)
         converged = False
         count = 0
         for count in range(1, iterations + 1):
@@ -208,23 +250,14 @@ class Engine:
             if promised < tolerance:
                 converged = True
                 break
-            for damping in (1.0, 0.5, 0.25, 0.1):
-                trial = dict(values)
-                for f, change in zip(free, step, strict=True):
-                    trial[f.name] = float(np.clip(values[f.name] + damping * change, f.lower, f.upper))
-                reached = objective(self.filter(trial, noise), free, trial)
-                if reached < best:
-                    break
-            else:
-                break
-            gained = best - reached
-            best, values = reached, trial
+            moves = {f.name: float(change) for f, change in zip(free, step, strict=True)}
+            values, gained = self.descend(passes, free, values, noise, moves)
             if progress:
                 progress(f"fit: step {count}, gained {gained:.1f} nats")
-            passes, lin = self.linearise(values, noise, free)
-            if gained < tolerance:
-                converged = True
+            if gained <= 0.0:
                 break
+            passes, lin = self.linearise(values, noise, free)
+        best = objective(passes, free, values)
         information = lin.information.sum(0) + np.diag([1.0 / f.std**2 for f in free])
         return Estimate(
             names=tuple(f.name for f in free),
@@ -241,37 +274,35 @@ class Engine:
         values: Mapping[str, float],
         noise: Noise,
         process: Sequence[str],
-        reading: Sequence[Sequence[str]] = (),
-        seconds: float = 4.0,
+        seconds: float = 24.0,
         iterations: int = 12,
         progress: Progress | None = None,
     ) -> Noise:
-        """Noise levels of largest likelihood, on an excerpt of every run.
+        """Process-noise levels of largest likelihood, on an excerpt of every run.
 
         Args:
             process: names of the process-noise levels to fit.
-            reading: groups of channels whose common std is fitted; others keep theirs.
-            seconds: length of the excerpt from each run.
+                seconds: of flight to look at in all, an equal excerpt from the middle of every run.
         """
-        excerpt = Engine(self.model, [_excerpt(r, seconds) for r in self.records], self.threads)
+        excerpt = Engine(
+            self.model,
+            [_excerpt(r, seconds / len(self.records)) for r in self.records],
+            self.threads,
+        )
 
         def changed(logs: np.ndarray) -> Noise:
             levels = dict(noise.process)
-            stds = dict(noise.reading)
-            for name, log in zip(process, logs, strict=False):
+            for name, log in zip(process, logs, strict=True):
                 levels[name] = float(np.exp(log))
-            for group, log in zip(reading, logs[len(process) :], strict=True):
-                for channel in group:
-                    stds[channel] = noise.reading[channel] * float(np.exp(log))
-            return replace(noise, process=levels, reading=stds)
+            return replace(noise, process=levels)
 
         def cost(logs: np.ndarray) -> float:
             result = -excerpt.log_likelihood(values, changed(logs))
             return result if np.isfinite(result) else 1e12
 
-        start = np.array([np.log(noise.process[name]) for name in process] + [0.0] * len(reading))
+        start = np.array([np.log(noise.process[name]) for name in process])
         floors = [noise.floor.get(name, 1e-9) for name in process]
-        bounds = [(np.log(v), np.log(1e4 * v)) for v in floors] + [(-3.0, 4.0)] * len(reading)
+        bounds = [(np.log(v), np.log(1e4 * v)) for v in floors]
         found = minimize(
             cost, start, method="L-BFGS-B", bounds=bounds,
             options={"maxiter": iterations, "eps": 0.03, "ftol": 1e-5},
@@ -286,6 +317,11 @@ def _excerpt(record: Record, seconds: float) -> Record:
     span = record.t[-1] - record.t[0]
     first = record.t[0] + max(0.0, 0.5 * (span - seconds))
     rows = (record.t >= first) & (record.t <= first + seconds)
+    return part(record, rows)
+
+
+def part(record: Record, rows: np.ndarray) -> Record:
+    """Some rows of a record, its clock kept."""
     return replace(record, t=record.t[rows], command=record.command[rows], z=record.z[rows])
 
 
@@ -293,8 +329,12 @@ def objective(
     passes: Sequence[RunPass], free: Sequence[FreeParameter], values: Mapping[str, float]
 ) -> float:
     """Minus log-likelihood plus half the squared distance to the priors, nats."""
-    penalty = sum(((values[f.name] - f.value) / f.std) ** 2 for f in free)
-    return 0.5 * penalty - float(sum(p.log_likelihood for p in passes))
+    return penalty(free, values) - float(sum(p.log_likelihood for p in passes))
+
+
+def penalty(free: Sequence[FreeParameter], values: Mapping[str, float]) -> float:
+    """Half the squared distance to the priors, nats."""
+    return 0.5 * sum(((values[f.name] - f.value) / f.std) ** 2 for f in free)
 
 
 def newton_step(
@@ -312,9 +352,7 @@ def newton_step(
     return step, float(-(g @ step) - 0.5 * step @ A @ step)
 
 
-def bounded_solve(
-    A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.ndarray
-) -> np.ndarray:
+def bounded_solve(A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Minimise 1/2 x'A x - b'x within bounds, by an active set (A positive definite)."""
     k = b.size
     x = np.zeros(k)

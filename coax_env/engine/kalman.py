@@ -24,6 +24,8 @@ _M = float64[:, ::1]
 STEP = types.FunctionType(types.void(_A, _A, float64, _A, _A, _A))
 MEASURE = types.FunctionType(types.void(_A, _A, _A, _A, _A))
 _LOG_2PI = math.log(2.0 * math.pi)
+PATIENCE = 5
+"""A channel refused this many times running is believed: the filter is wrong, not the sensor."""
 
 
 @compiled(types.float64(float64))
@@ -47,11 +49,12 @@ def filter_pass(
     Args:
         dt: (n,) seconds from each row to the next. u: (n, nu). z: (n, m), NaN where missing.
         R: (m,) reading variances. q: (nx,) growth of state variance per second. p: parameters.
-        gate: readings further than this many sigmas from their prediction are left out.
+        gate: readings further than this many sigmas from their prediction are left out, but never
+            more than PATIENCE of a channel running; each costs what one at the gate would.
         refresh: rows between new Jacobians where dt does not change.
         keep: also store gains and whitening matrices.
         states: (n, nx) filtered states, out. e: (n, m) whitened innovations, out, NaN where missing.
-        K_all: (n, nx, m), W_all: (n, m, m), out, if `keep`.
+        K_all: (n, m, nx) gain of each reading, W_all: (n, m, m) transposed L^-1, out, if `keep`.
         slots: (n,) place in P_all where a row's filtered covariance is stored, or -1.
         P_all: (slots, nx, nx), out.
 
@@ -70,13 +73,15 @@ def filter_pass(
     h_probe = np.zeros(m)
     H = np.zeros((m, nx))
     F = np.eye(nx)
-    dt_of_F = -1.0
+    dt_of_F = -1.0  # step at which F was computed, and the one it is scaled to
+    dt_now = -1.0
     HP = np.zeros((m, nx))
     S = np.zeros((m, m))
     W = np.zeros((m, m))
     FP = np.zeros((nx, nx))
     who = np.zeros(m, dtype=np.int64)
     nu = np.zeros(m)
+    refused = np.zeros(m, dtype=np.int64)
     log_likelihood = 0.0
     left_out = 0
     for k in range(n):
@@ -112,9 +117,13 @@ def filter_pass(
                 for a in range(nx):
                     if H[i, a] != 0.0:
                         variance += HP[count, a] * H[i, a]
-                if innovation * innovation > gate * gate * variance:
+                if innovation * innovation > gate * gate * variance and refused[i] < PATIENCE:
+                    # capped, not forgotten: leaving readings out must never pay
+                    log_likelihood -= 0.5 * (gate * gate + math.log(variance) + _LOG_2PI)
+                    refused[i] += 1
                     left_out += 1
                     continue
+                refused[i] = 0
                 who[count] = i
                 nu[count] = innovation
                 S[count, count] = variance
@@ -170,9 +179,9 @@ def filter_pass(
         if keep:
             for a in range(count):
                 for b in range(a + 1):
-                    W_all[k, who[a], who[b]] = W[a, b]
+                    W_all[k, who[b], who[a]] = W[a, b]
                     for j in range(nx):
-                        K_all[k, j, who[b]] += HP[a, j] * W[a, b]
+                        K_all[k, who[b], j] += HP[a, j] * W[a, b]
         for j in range(nx):
             states[k, j] = x[j]
             if not math.isfinite(x[j]):
@@ -185,8 +194,8 @@ def filter_pass(
         if k == n - 1:
             break
         step(x, u[k], dt[k], p, work, x_next)
-        if fresh or abs(dt[k] - dt_of_F) > 0.02 * dt_of_F:
-            dt_of_F = dt[k]
+        if fresh or abs(dt[k] - dt_of_F) > 0.5 * dt_of_F:
+            dt_of_F = dt_now = dt[k]
             for j in range(nx):
                 for i in range(nx):
                     x_probe[i] = x[i]
@@ -194,6 +203,15 @@ def filter_pass(
                 step(x_probe, u[k], dt[k], p, work, x_moved)
                 for i in range(nx):
                     F[i, j] = (x_moved[i] - x_next[i]) / scale[j]
+        elif dt[k] != dt_now:
+            # same Jacobian, other step: rows of slow states follow the step to first order
+            ratio = dt[k] / dt_now
+            dt_now = dt[k]
+            for i in range(nx):
+                if F[i, i] > 0.5:
+                    for j in range(nx):
+                        own = 1.0 if i == j else 0.0
+                        F[i, j] = own + ratio * (F[i, j] - own)
         for i in range(nx):
             for j in range(nx):
                 FP[i, j] = 0.0
@@ -231,31 +249,21 @@ def mean_pass(step, measure, dt, u, z, wraps, x0, p, work_size, K_all, W_all, e)
     x_next = np.zeros(nx)
     work = np.zeros(work_size)
     h = np.zeros(m)
-    who = np.zeros(m, dtype=np.int64)
     for k in range(n):
         measure(x, u[k], p, work, h)
-        count = 0
-        for i in range(m):
-            e[k, i] = 0.0
-            if W_all[k, i, i] != 0.0:
-                h[i] = z[k, i] - h[i]
-                if wraps[i]:
-                    h[i] = wrap_angle(h[i])
-                if not math.isfinite(h[i]):
+        for a in range(m):
+            e[k, a] = 0.0
+        for b in range(m):
+            if W_all[k, b, b] != 0.0:
+                innovation = z[k, b] - h[b]
+                if wraps[b]:
+                    innovation = wrap_angle(innovation)
+                if not math.isfinite(innovation):
                     return False
-                who[count] = i
-                count += 1
-        for a in range(count):
-            i = who[a]
-            total = 0.0
-            for b in range(a + 1):
-                total += W_all[k, i, who[b]] * h[who[b]]
-            e[k, i] = total
-        for j in range(nx):
-            total = 0.0
-            for a in range(count):
-                total += K_all[k, j, who[a]] * h[who[a]]
-            x[j] += total
+                for a in range(b, m):
+                    e[k, a] += W_all[k, b, a] * innovation
+                for j in range(nx):
+                    x[j] += K_all[k, b, j] * innovation
         if k < n - 1:
             step(x, u[k], dt[k], p, work, x_next)
             for j in range(nx):
@@ -263,28 +271,34 @@ def mean_pass(step, measure, dt, u, z, wraps, x0, p, work_size, K_all, W_all, e)
     return True
 
 
-@compiled(
-    boolean(STEP, MEASURE, _A, _M, _A, _A, int64, int64, int64, _A)
-)
-def fly_open_loop(step, measure, dt, u, x, p, work_size, first, last, h):
-    """Fly from row `first` to row `last` with the recorded inputs and read there.
+@compiled(boolean(STEP, MEASURE, _A, _M, _A, _A, int64, int64, int64[::1], _A))
+def fly_open_loop(step, measure, dt, u, x, p, work_size, first, targets, out):
+    """Fly from row `first` with the recorded inputs; read each channel at its own row.
 
     Args:
-        x: (nx,) state at `first`; on return the state at `last`.
-        h: (m,) readings at `last`, out.
+        x: (nx,) state at `first`; on return the state at the last target.
+        targets: (m,) row at which each channel is read, or -1. out: (m,) readings.
 
     Returns False where the flight diverged.
     """
     work = np.zeros(work_size)
     x_next = np.zeros(x.size)
-    for k in range(first, last):
-        step(x, u[k], dt[k], p, work, x_next)
-        for j in range(x.size):
-            x[j] = x_next[j]
-            if not math.isfinite(x[j]):
-                return False
-    measure(x, u[last], p, work, h)
-    for i in range(h.size):
-        if not math.isfinite(h[i]):
-            return False
+    h = np.zeros(out.size)
+    last = targets.max()
+    for k in range(first, last + 1):
+        wanted = False
+        for i in range(out.size):
+            if targets[i] == k:
+                wanted = True
+        if wanted:
+            measure(x, u[k], p, work, h)
+            for i in range(out.size):
+                if targets[i] == k:
+                    out[i] = h[i]
+        if k < last:
+            step(x, u[k], dt[k], p, work, x_next)
+            for j in range(x.size):
+                x[j] = x_next[j]
+                if not abs(x[j]) < 1e4:
+                    return False
     return True

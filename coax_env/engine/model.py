@@ -29,12 +29,14 @@ class Record:
 
     t: (n,) seconds, increasing. command: (n, k), held from each row to the next.
     z: (n, m) readings in the order of the model's channels, NaN where there is no new sample.
+    origin: time at which the run began, also where the record is a part of it.
     """
 
     name: str
     t: np.ndarray
     command: np.ndarray
     z: np.ndarray
+    origin: float = 0.0
 
 
 @dataclass(frozen=True)

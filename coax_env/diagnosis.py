@@ -1,0 +1,428 @@
+"""Diagnosis: what the simulation gets wrong on measured flights, why, and what mending it is worth.
+
+Data flow::
+
+    flight -> runs to fit, runs held out (chosen from commands and signatures, never from residuals)
+    fit runs -> noise levels -> search (search.py) -> causes -> evidence, look-alikes
+    held-out runs -> replay with the vehicle as given, refitted, extended -> gain with its interval
+    all runs -> refit of the same structure -> extended vehicle file
+
+Everything that is said about causes and gain comes from the fit runs and the held-out runs; the
+vehicle file is refitted on all runs at the end, its structure unchanged.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coax_env import effects, next_maneuver
+from coax_env.engine.fit import Engine, RunPass, part
+from coax_env.engine.model import FreeParameter, Noise, Record
+from coax_env.engine.whiteness import Whiteness, whiteness
+from coax_env.errors import InputError
+from coax_env.flight import Flight, read_flight
+from coax_env.gain import gain_of
+from coax_env.heli_model import HeliModel, record_of, starting_noise
+from coax_env.layout import CHANNELS
+from coax_env.prediction import RunReplay, fly_again, gusts_of
+from coax_env.search import TIE, Quadratic, Search, State
+from coax_env.vehicle import Parameter, Vehicle, load_vehicle
+
+HORIZON = 1.0  # s
+FEW_RUNS = 4  # with fewer, the last third of each is held out
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Result of `diagnose`.
+
+    findings: what findings.json says (contract.md). vehicle_after: the extended model, refitted on
+    all runs. replay_before, replay_refitted, replay_after: held-out runs flown again with the vehicle
+    as given, its base parameters refitted, and extended. innovations_before, innovations_after: run ->
+    {"t": (n,), channel: (n,) whitened}, fit runs. flagged: remarks on values outside their usual range.
+    """
+
+    findings: dict[str, Any]
+    flight: Flight
+    vehicle_before: Vehicle
+    vehicle_after: Vehicle
+    replay_before: list[RunReplay]
+    replay_refitted: list[RunReplay]
+    replay_after: list[RunReplay]
+    innovations_before: dict[str, dict[str, np.ndarray]]
+    innovations_after: dict[str, dict[str, np.ndarray]]
+    whiteness: dict[str, dict[str, Whiteness]]
+    evidence_history: list[tuple[str, float]]
+    remarks: tuple[str, ...] = ()
+    noise: dict[str, float] = field(default_factory=dict)
+
+
+def diagnose(
+    flight: Flight | str | Path,
+    vehicle: Vehicle | str | Path | None = None,
+    hold_out: Sequence[str] | None = None,
+    exclude: Collection[str] = (),
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Find the causes of what a vehicle's simulation gets wrong on a flight.
+
+    Args:
+        flight: a Flight or its folder. vehicle: a Vehicle, name or path; default the card's.
+        hold_out: names of the runs to hold out; None chooses them; empty: all data fitted, no gain.
+        exclude: effects of the catalogue that must not be named.
+
+    Raises:
+        InputError: a run or effect that does not exist, or nothing left to fit.
+    """
+
+    def say(text: str) -> None:
+        if progress:
+            progress(text)
+
+    flight = flight if isinstance(flight, Flight) else read_flight(flight)
+    vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    remarks = list(flight.notes) + double_counting(flight, vehicle)
+    model = HeliModel(vehicle)
+    candidates = _candidates(exclude, vehicle)
+    noise = starting_noise(flight, vehicle)
+    records = [record_of(run) for run in flight.runs]
+    say("choosing the runs to hold out")
+    fit, held = _split(model, records, noise, hold_out, candidates)
+
+    say("estimating gusts and noise of the model as given")
+    engine = Engine(model, fit)
+    search = Search(engine, model, candidates, progress)
+    bare = search.begin(noise)
+    passes_before = engine.filter(bare.values, bare.noise)
+    say("fitting the model's own parameters")
+    refitted = search.refit_noise(search.settle(replace(bare, values=dict(bare.values))))
+    say("searching for causes")
+    state, quadratic = search.run(
+        State([], dict(refitted.values), refitted.noise, refitted.objective)
+    )
+    say("weighing the causes against their look-alikes")
+    causes = _causes(search, state, quadratic)
+    passes_after = engine.filter(state.values, state.noise)
+    white_before = whiteness(passes_before, CHANNELS)
+    white_after = whiteness(passes_after, CHANNELS)
+    unexplained = _unexplained(white_after)
+
+    replays: list[list[RunReplay]] = [[], [], []]
+    gain = None
+    if held:
+        say("flying the held-out runs")
+        engine_held = Engine(model, held)
+        replays = [
+            fly_again(engine_held, s.values, s.noise, HORIZON, floor=s is state)
+            for s in (bare, refitted, state)
+        ]
+        gain = gain_of(*replays, state.noise, HORIZON)
+        gain["held_out"] = [r.name for r in held]
+    say("refitting the extended model on everything")
+    vehicle_after = _extended(model, records, search, state, flight, vehicle)
+    ties = [(c["effect"], other) for c in causes for other in c["confusable_with"]]
+    findings = {
+        "verdict": _verdict(bool(causes), bool(unexplained)),
+        "causes": causes,
+        "gusts": gusts_of(state.noise),
+        "unexplained": unexplained,
+        "gain": gain,
+        "next_maneuver": next_maneuver.advise(ties),
+        "false_alarm_rate": None,
+    }
+    return Diagnosis(
+        findings=findings,
+        flight=flight,
+        vehicle_before=vehicle,
+        vehicle_after=vehicle_after,
+        replay_before=replays[0],
+        replay_refitted=replays[1],
+        replay_after=replays[2],
+        innovations_before=_innovations(passes_before),
+        innovations_after=_innovations(passes_after),
+        whiteness={"before": white_before, "after": white_after},
+        evidence_history=search.history,
+        remarks=tuple(remarks + _unusual(search, state)),
+        noise=dict(state.noise.reading),
+    )
+
+
+# --- what to fit on ---------------------------------------------------------------------------------
+
+
+def _candidates(exclude: Collection[str], vehicle: Vehicle) -> tuple[str, ...]:
+    for name in exclude:
+        if name not in effects.CATALOGUE:
+            known = ", ".join(effects.CATALOGUE)
+            raise InputError(f"no effect {name!r} to exclude; the catalogue has {known}")
+    return tuple(e for e in effects.CATALOGUE if e not in exclude and e not in vehicle.effects)
+
+
+def double_counting(flight: Flight, vehicle: Vehicle) -> list[str]:
+    """A warning where the vehicle was already fitted on this flight."""
+    used = set(vehicle.provenance.get("flights", ()))
+    if used & set(flight.hashes.values()):
+        return [f"{vehicle.name} was already fitted on this flight: its evidence counts twice"]
+    return []
+
+
+def _split(
+    model: HeliModel,
+    records: Sequence[Record],
+    noise: Noise,
+    hold_out: Sequence[str] | None,
+    candidates: Sequence[str],
+) -> tuple[list[Record], list[Record]]:
+    """Records to fit and records to hold out."""
+    names = [r.name for r in records]
+    if hold_out is not None:
+        for name in hold_out:
+            if name not in names:
+                raise InputError(f"no run {name!r} to hold out; the flight has {', '.join(names)}")
+        if set(hold_out) == set(names):
+            raise InputError("all runs are held out: nothing is left to fit on")
+        return (
+            [r for r in records if r.name not in hold_out],
+            [r for r in records if r.name in hold_out],
+        )
+    if len(records) < FEW_RUNS:
+        return [_third(r, False) for r in records], [_third(r, True) for r in records]
+    chosen = _fair_share(model, records, noise, candidates)
+    return (
+        [r for i, r in enumerate(records) if i not in chosen],
+        [r for i, r in enumerate(records) if i in chosen],
+    )
+
+
+def _third(record: Record, last: bool) -> Record:
+    cut = record.t[0] + (record.t[-1] - record.t[0]) * 2.0 / 3.0
+    rows = record.t >= cut if last else record.t < cut
+    return replace(part(record, rows), name=f"{record.name} (last third)" if last else record.name)
+
+
+def _fair_share(
+    model: HeliModel, records: Sequence[Record], noise: Noise, candidates: Sequence[str]
+) -> tuple[int, ...]:
+    """The quarter of the runs that holds out about a quarter of what is known of each effect.
+
+    Information is that of each effect's first parameter, about the vehicle as given and with the
+    starting noise, so that no residual has a say. An effect that would lose most of its excitation
+    counts heavily; one that the held-out runs do not show at all counts too, since its gain could
+    not be measured on them.
+    """
+    free = [model.effect_parameters(e)[0] for e in candidates]
+    values = {**model.bare_values, **{f.name: f.value for f in free}}
+    _, lin = Engine(model, records).linearise(values, noise, free)
+    information = np.einsum("rkk->rk", lin.information)
+    total = information.sum(0)
+    share = information[:, total > 0.0] / total[total > 0.0]
+    count = max(1, round(len(records) / 4))
+
+    def unfairness(chosen: tuple[int, ...]) -> float:
+        held = share[list(chosen)].sum(0)
+        return float(np.sum((held - 0.25) ** 2) + 10.0 * np.sum(np.maximum(held - 0.7, 0.0)))
+
+    return min(combinations(range(len(records)), count), key=unfairness)
+
+
+# --- causes -----------------------------------------------------------------------------------------
+
+
+def _causes(search: Search, state: State, quadratic: Quadratic) -> list[dict[str, Any]]:
+    std = standard_deviations(search, state, quadratic)
+    dt = median_step(search.engine.records)
+    causes = []
+    for effect in state.active:
+        entry = effects.CATALOGUE[effect]
+        rest = [e for e in state.active if e != effect]
+        without = State(
+            rest, state.values | search.off(effect) | search.pinned(effect), state.noise
+        )
+        without = search.refit_noise(without)
+        search.settle(without, steps=2, without=entry.replaces)
+        causes.append(
+            {
+                "effect": effect,
+                "parameters": {
+                    f.name: {
+                        "value": float(state.values[f.name]),
+                        "std": with_timing(f, std[f.name], dt),
+                        "unit": p.unit,
+                    }
+                    for f, p in zip(search.by_effect[effect], entry.parameters, strict=True)
+                },
+                "evidence": float(without.objective - state.objective),
+                "confusable_with": _look_alikes(search, state, quadratic, effect),
+                "channels": _channels(search, state, effect),
+            }
+        )
+    return sorted(causes, key=lambda c: -c["evidence"])
+
+
+def standard_deviations(search: Search, state: State, quadratic: Quadratic) -> dict[str, float]:
+    """Posterior std of every loose parameter."""
+    names = search.free_names(state.active)
+    i = quadratic.index(names)
+    information = quadratic.G[np.ix_(i, i)] + np.diag(quadratic.precision[i])
+    return dict(zip(names, np.sqrt(np.diag(np.linalg.inv(information))).tolist(), strict=True))
+
+
+def median_step(records: Sequence[Record]) -> float:
+    """Usual time between rows [s]."""
+    return float(np.median(np.concatenate([np.diff(r.t) for r in records])))
+
+
+def with_timing(parameter: FreeParameter, std: float, dt: float) -> float:
+    """Std of a lag or delay with the half sample that a log cannot show.
+
+    Within a row it is not known when the machine takes a command over (zero-order hold against the
+    simulator's or autopilot's own loop): uniform over a row, std dt/sqrt(12) (numerics.md, timing).
+    """
+    name = parameter.name
+    if name.startswith(("motor_lag.", "servo_lag.", "servo_delay.")):
+        return float(np.hypot(std, dt / np.sqrt(12.0)))
+    return float(std)
+
+
+def _look_alikes(search: Search, state: State, quadratic: Quadratic, effect: str) -> list[str]:
+    """Effects that would do as well in this one's place, by refitted likelihood."""
+    near = []
+    for other in search.candidates:
+        if other not in state.active:
+            change, move = search.swap(quadratic, state.active, effect, other)
+            if change < 5.0 * TIE:
+                near.append((change, other, move))
+    result = []
+    for _, other, move in sorted(near, key=lambda n: n[0])[:4]:
+        values = dict(zip(quadratic.names, (quadratic.at + move).tolist(), strict=True))
+        active = [other if e == effect else e for e in state.active]
+        trial = search.settle(State(active, state.values | values, state.noise), steps=3)
+        if trial.objective - state.objective < TIE:
+            result.append(other)
+    return result
+
+
+def _channels(search: Search, state: State, effect: str) -> list[str]:
+    """Channels that carry most of an effect's signature, strongest first."""
+    free = [f for f in search.free(state.active) if f.name.startswith(effect + ".")]
+    _, lin = search.engine.linearise(state.values, state.noise, free)
+    size = np.array([state.values[f.name] - f.value for f in free])
+    strength = np.einsum("k,rkm->m", size**2, lin.by_channel)
+    order = np.argsort(-strength)
+    total = strength.sum()
+    return [CHANNELS[i] for i in order if total > 0.0 and strength[i] > 0.1 * total]
+
+
+def _unusual(search: Search, state: State) -> list[str]:
+    remarks = []
+    for effect in state.active:
+        for f in search.by_effect[effect]:
+            if abs(state.values[f.name] - f.value) > 2.5 * f.std:
+                remarks.append(
+                    f"{f.name} = {state.values[f.name]:.3g} is outside its usual range"
+                    f" ({f.value:g} +- {f.std:g}): take the name with care"
+                )
+    for f in search.free(state.active):
+        if "." not in f.name:
+            sigmas = (state.values[f.name] - f.value) / f.std
+            if abs(sigmas) > 2.0:
+                remarks.append(
+                    f"base parameter {f.name} moved {sigmas:+.1f} prior sigmas,"
+                    f" from {f.value:.4g} to {state.values[f.name]:.4g}"
+                )
+    return remarks
+
+
+# --- what is left, what to do next --------------------------------------------------------------------
+
+
+def _unexplained(white: Mapping[str, Whiteness]) -> list[dict[str, Any]]:
+    return [
+        {
+            "channel": channel,
+            "depends_on": [],
+            "share": round(w.coloured_share, 3),
+            "form": "not found",
+        }
+        for channel, w in white.items()
+        if not w.white
+    ]
+
+
+def _verdict(causes: bool, unexplained: bool) -> str:
+    if causes:
+        return "partly explained" if unexplained else "explained"
+    return "unexplained" if unexplained else "consistent"
+
+
+def _innovations(passes: Sequence[RunPass]) -> dict[str, dict[str, np.ndarray]]:
+    result: dict[str, dict[str, np.ndarray]] = {}
+    for run in passes:
+        table = {"t": run.record.t}
+        for i, channel in enumerate(CHANNELS):
+            if np.isfinite(run.record.z[:, i]).any():
+                table[channel] = run.innovations[:, i]
+        result[run.record.name] = table
+    return result
+
+
+def _extended(
+    model: HeliModel,
+    records: Sequence[Record],
+    search: Search,
+    state: State,
+    flight: Flight,
+    vehicle: Vehicle,
+) -> Vehicle:
+    """The vehicle with the causes in it, refitted on all runs."""
+    engine = Engine(model, records)
+    free = search.free(state.active)
+    estimate = engine.fit(free, state.values, state.noise, iterations=3, tolerance=0.5)
+    dt = median_step(records)
+    where = flight.path.name if flight.path else "flight"
+    return fitted_vehicle(
+        vehicle,
+        free,
+        estimate.values,
+        {f.name: with_timing(f, estimate.std[f.name], dt) for f in free},
+        estimate.covariance,
+        f"diagnosed from {where}",
+        flight,
+    )
+
+
+def fitted_vehicle(
+    vehicle: Vehicle,
+    free: Sequence[FreeParameter],
+    values: Mapping[str, float],
+    std: Mapping[str, float],
+    covariance: np.ndarray,
+    source: str,
+    flight: Flight,
+) -> Vehicle:
+    """A vehicle with fitted values, their std and correlation, and what they were fitted on."""
+    changed = {}
+    for f in free:
+        group, _, own = f.name.rpartition(".")
+        if group:
+            unit = next(p.unit for p in effects.CATALOGUE[group].parameters if p.name == own)
+        else:
+            unit = vehicle[f.name].unit
+        changed[f.name] = Parameter(float(values[f.name]), float(std[f.name]), unit, source)
+    scale = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(scale, scale)
+    correlation = 0.5 * (correlation + correlation.T)
+    np.fill_diagonal(correlation, 1.0)
+    done = vehicle.with_parameters(changed)
+    flights = [*vehicle.provenance.get("flights", ()), *flight.hashes.values()]
+    return replace(
+        done,
+        correlated=tuple(f.name for f in free),
+        correlation=correlation,
+        provenance={**vehicle.provenance, "flights": flights},
+    )

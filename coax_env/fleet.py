@@ -1,0 +1,361 @@
+"""Many helicopters flown at once: the batch kernel behind both envs.
+
+A fleet is a set of arrays with one row per helicopter. One control period of a row reads::
+
+    command -> fly (dynamics.step) -> sense (dynamics.measure, sensors.py) -> judge (hover.py)
+
+Rows know nothing of each other: each has its own random stream, so a row flies the same in a fleet
+of any size. Nothing here runs Python code per row but drawing a vehicle (`randomize`).
+"""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coax_env import effects, hover
+from coax_env import parameters as P
+from coax_env.dynamics import WORK_SIZE, hover_trim, measure, step
+from coax_env.errors import InputError
+from coax_env.jit import compiled
+from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
+from coax_env.random_streams import COUNTER, stream_key, two_normals, uniform
+from coax_env.sensors import Sensor, is_new, slow_instruments, suite
+from coax_env.vehicle import SHIPPED, Vehicle, load_vehicle
+
+DT = hover.CONTROL_PERIOD
+ROTOR_RANGE = 0.15  # of the nominal hover speed
+SWASH_RANGE = 0.2  # [rad]
+Nominal = str | Path | Vehicle | tuple[Any, Any] | None
+"""What centres the action: a vehicle, or (trim, scale) as a controller stores them."""
+
+ROWS_PER_THREAD = 256  # fewer are not worth a thread
+
+# columns of the sensor table the kernel reads
+_INDEX, _NOISE, _RATE, _LOW, _HIGH, _WRAPS, _FLAG = range(7)
+_DELAY = effects.parameter_index("servo_delay.time")
+_WIND_NORTH = effects.parameter_index("wind.north")
+
+
+@compiled()
+def _advance(x, u, p, swash, at, work):
+    """Fly one control period in place; `swash` (n, 2) is a ring of past swash commands.
+
+    A pure delay of the servos is a look-up of the command that was given that long ago; where it is
+    no whole number of periods, the period is split. Leaves in `u` the command in force at the end.
+    """
+    delay = p[_DELAY]
+    slots = len(swash)
+    if delay <= 0.0 or slots == 1:
+        step(x, u, DT, p, work, x)
+        return
+    late = min(int(delay / DT + 1e-9), slots - 2)
+    rest = min(max(delay - late * DT, 0.0), DT)
+    if rest > 1e-9:
+        u[2], u[3] = swash[(at - late - 1) % slots]
+        step(x, u, rest, p, work, x)
+        u[TIME] += rest
+    u[2], u[3] = swash[(at - late) % slots]
+    if DT - rest > 1e-9:
+        step(x, u, DT - rest, p, work, x)
+
+
+@compiled()
+def _sense(x, u, p, row, sensors, stream, held, readings, work, out):
+    """New readings where they are due, into `held` (float64) and as an observation into `out`."""
+    measure(x, u, p, work, readings)
+    n = len(sensors)
+    for k in range(n, len(held)):
+        held[k] = 0.0
+    spare = 0.0
+    has_spare = False
+    for k in range(n):
+        due = is_new(row, sensors[k, _RATE])
+        if due:
+            index = int(sensors[k, _INDEX])
+            value = readings[index] if index < N_CHANNELS else x[index - N_CHANNELS]
+            if sensors[k, _NOISE] > 0.0:
+                if has_spare:
+                    noise = spare
+                else:
+                    noise, spare = two_normals(stream)
+                has_spare = not has_spare
+                value += sensors[k, _NOISE] * noise
+            if sensors[k, _WRAPS] != 0.0:
+                value -= 2.0 * math.pi * math.floor((value + math.pi) / (2.0 * math.pi))
+            if math.isfinite(value):
+                held[k] = min(max(value, sensors[k, _LOW]), sensors[k, _HIGH])
+            flag = int(sensors[k, _FLAG])
+            if flag >= 0:
+                held[flag] = 1.0
+    for k in range(len(held)):
+        out[k] = held[k]
+
+
+@compiled()
+def _blow(x, p, gust, stream):
+    """Move the gust states on by one period: exponential memory, stationary std `gust` (2,)."""
+    share = math.sqrt(1.0 - math.exp(-2.0 * DT / p[P.GUST_MEMORY]))
+    for half in range(2):
+        if gust[half] > 0.0:
+            a, b = two_normals(stream)
+            c, _ = two_normals(stream)
+            x[20 + 3 * half] += share * gust[half] * a
+            x[21 + 3 * half] += share * gust[half] * b
+            x[22 + 3 * half] += share * gust[half] * c
+
+
+@compiled()
+def _fly_rows(
+    first, last, active, actions, trim, scale, params, sensors, gust,
+    x, u, rows, streams, swash, held,
+    observations, rewards, terms, over,
+):  # fmt: skip
+    """One control period of the active rows first..last-1. See Fleet for the arrays."""
+    work = np.empty(WORK_SIZE)
+    readings = np.empty(N_CHANNELS)
+    many = len(params) > 1
+    for i in range(first, last):
+        if not active[i]:
+            for k in range(held.shape[1]):
+                observations[i, k] = held[i, k]
+            continue
+        p = params[i] if many else params[0]
+        for k in range(4):
+            a = actions[i, k]
+            actions[i, k] = a = -1.0 if a < -1.0 else (1.0 if a > 1.0 else a)  # NaN stays
+            u[i, k] = trim[k] + scale[k] * a
+        slots = swash.shape[1]
+        at = rows[i] % slots
+        swash[i, at, 0], swash[i, at, 1] = u[i, 2], u[i, 3]
+        u[i, TIME] = rows[i] * DT
+        if gust[0] > 0.0 or gust[1] > 0.0:
+            _blow(x[i], p, gust, streams[i])
+        _advance(x[i], u[i], p, swash[i], at, work)
+        rows[i] += 1
+        u[i, TIME] = rows[i] * DT
+        _sense(
+            x[i], u[i], p, rows[i], sensors, streams[i], held[i], readings, work, observations[i]
+        )
+        rewards[i] = hover.reward(x[i], actions[i], terms[i])
+        over[i] = hover.is_over(x[i])
+
+
+@compiled()
+def _restart_rows(
+    which, keep_state, trim, params, sensors, wind_speed,
+    x, u, rows, streams, swash, held, observations,
+):  # fmt: skip
+    """New flights for the rows of the mask `which`; with `keep_state` from what stands in `x`."""
+    work = np.empty(WORK_SIZE)
+    readings = np.empty(N_CHANNELS)
+    many = len(params) > 1
+    for i in range(len(which)):
+        if not which[i]:
+            continue
+        if wind_speed > 0.0:
+            angle = uniform(streams[i], -math.pi, math.pi)
+            params[i, _WIND_NORTH] += wind_speed * math.cos(angle)
+            params[i, _WIND_NORTH + 1] += wind_speed * math.sin(angle)
+        p = params[i] if many else params[0]
+        if not keep_state:
+            hover.start(streams[i], trim, x[i])
+        for k in range(4):
+            u[i, k] = trim[k]
+        u[i, TIME] = 0.0
+        rows[i] = 0
+        for k in range(swash.shape[1]):
+            swash[i, k, 0], swash[i, k, 1] = trim[2], trim[3]
+        for k in range(held.shape[1]):
+            held[i, k] = 0.0
+        _sense(x[i], u[i], p, 0, sensors, streams[i], held[i], readings, work, observations[i])
+
+
+@dataclass
+class Outcome:
+    """What one control period brought, one row per helicopter."""
+
+    observations: np.ndarray  # (n, n_obs) float32
+    rewards: np.ndarray  # (n,)
+    terms: np.ndarray  # (n, N_TERMS), weighted
+    over: np.ndarray  # (n,) bool
+
+
+class Fleet:
+    """Arrays of ``count`` helicopters and the calls that fly them.
+
+    Attributes:
+        x: full states, shape (count, 26). u: commands in force and time, (count, 5).
+        rows: control periods flown, (count,). streams: key and counter, (count, 2) uint64.
+        params: parameter vectors, (count or 1, n). held: readings held, (count, n_obs).
+        trim, scale: command = trim + scale * action, each (4,), of the nominal vehicle.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        vehicle: str | Vehicle = "lama400d",
+        nominal: Nominal = None,
+        sensors: str = "onboard",
+        wind: float | Sequence[float] | None = None,
+        gusts: tuple[float, float] | None = None,
+        randomize: str | None = None,
+        threads: int | None = None,
+    ) -> None:
+        if randomize not in (None, "posterior"):
+            raise InputError(f"randomize must be None or 'posterior', found {randomize!r}")
+        self.vehicle = load_vehicle(vehicle)
+        self.sensors = suite(sensors)
+        self.randomize = randomize
+        self.trim, self.scale = action_map(self.vehicle, nominal)
+        self.flags = slow_instruments(self.sensors)
+        self.n_observed = len(self.sensors) + len(self.flags)
+        self._table = _sensor_table(self.sensors, self.flags)
+        steady, self._wind_speed = _wind(wind)
+        self._gust = np.array(gusts if gusts is not None else (0.0, 0.0), dtype=float)
+        if self._gust.shape != (2,) or not (self._gust >= 0.0).all():
+            raise InputError("gusts must be (force std in N, moment std in N m), both >= 0")
+        self._steady = steady
+        own = randomize is not None or self._wind_speed > 0.0
+        self.flown = [self.vehicle] * count if randomize else []
+        self.params = np.tile(self._vector(self.vehicle), (count if own else 1, 1))
+        self._base = self.params.copy()
+        delayed = self.params[0, _DELAY] > 0.0 or randomize is not None
+        slots = 2 + math.ceil(0.3 / DT) if delayed and "servo_delay" in self.vehicle.effects else 1
+        self.x = np.zeros((count, N_FULL))
+        self.u = np.zeros((count, N_INPUTS))
+        self.rows = np.zeros(count, dtype=np.int64)
+        self.streams = np.zeros((count, 2), dtype=np.uint64)
+        self.swash = np.zeros((count, slots, 2))
+        self.held = np.zeros((count, self.n_observed))
+        self.count = count
+        most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        self._threads = max(1, min(threads or most or 1, count // ROWS_PER_THREAD))
+
+    def seed(self, row: int, seed: int) -> None:
+        """Give a row the stream of a seed, from its beginning."""
+        self.streams[row] = stream_key(np.uint64(seed & 0xFFFFFFFFFFFFFFFF)), 0
+
+    def restart(self, which: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
+        """Start new flights in the rows of a mask and return all observations, float32.
+
+        Args:
+            which: bool, shape (count,).
+            states: paper or full states to start from, (count, 16 or 26); random when None.
+        """
+        if self.randomize:
+            for i in np.flatnonzero(which):
+                self.flown[i] = self.vehicle.draw(np.random.default_rng(self.streams[i]))
+                self.streams[i, COUNTER] += np.uint64(1)
+                self._base[i] = self._vector(self.flown[i])
+        if len(self.params) > 1 or self.randomize or self._wind_speed > 0.0:
+            self.params[which] = self._base[which]
+        if states is not None:
+            x = np.zeros((self.count, N_FULL))
+            x[:, 16:20] = self.trim
+            x[:, : states.shape[-1]] = states
+            self.x[which] = x[which]
+        observations = self.held.astype(np.float32)
+        _restart_rows(
+            which, states is not None, self.trim, self.params, self._table, self._wind_speed,
+            self.x, self.u, self.rows, self.streams, self.swash, self.held, observations,
+        )  # fmt: skip
+        return observations
+
+    def fly(self, actions: np.ndarray, active: np.ndarray) -> Outcome:
+        """One control period. `actions` (count, 4) float64 is clipped to [-1, 1] in place."""
+        n = self.count
+        outcome = Outcome(
+            np.empty((n, self.n_observed), dtype=np.float32),
+            np.zeros(n),
+            np.zeros((n, hover.N_TERMS)),
+            np.zeros(n, dtype=np.bool_),
+        )
+
+        def rows(first: int, last: int) -> None:
+            _fly_rows(
+                first, last, active, actions, self.trim, self.scale, self.params, self._table,
+                self._gust, self.x, self.u, self.rows, self.streams, self.swash, self.held,
+                outcome.observations, outcome.rewards, outcome.terms, outcome.over,
+            )  # fmt: skip
+
+        if self._threads == 1:
+            rows(0, n)
+        else:
+            _in_threads(rows, n, self._threads)
+        return outcome
+
+    def _vector(self, vehicle: Vehicle) -> np.ndarray:
+        vector = vehicle.vector.copy()
+        vector[_WIND_NORTH : _WIND_NORTH + 2] += self._steady
+        effects.set_switches(vector)
+        if self._wind_speed > 0.0:
+            vector[effects.AIR] = 1.0
+        return vector
+
+
+def nominal_for(vehicle: Vehicle) -> Vehicle:
+    """The shipped bare vehicle of the same name, else the vehicle without its effects."""
+    shipped = SHIPPED / f"{vehicle.name}.toml"
+    return (load_vehicle(shipped) if shipped.exists() else vehicle).without_effects()
+
+
+def action_map(vehicle: Vehicle, nominal: Nominal = None) -> tuple[np.ndarray, np.ndarray]:
+    """Trim and scale, each (4,): command = trim + scale * action, about the nominal hover."""
+    if isinstance(nominal, tuple):
+        trim, scale = (np.array(part, dtype=float) for part in nominal)
+        if trim.shape != (4,) or scale.shape != (4,):
+            raise InputError("nominal as numbers must be (trim, scale) with four numbers each")
+        return trim, scale
+    source = nominal_for(vehicle) if nominal is None else load_vehicle(nominal)
+    trim = hover_trim(source, hover.HEIGHT)[1]
+    return trim, np.array([ROTOR_RANGE * trim[0], ROTOR_RANGE * trim[1], SWASH_RANGE, SWASH_RANGE])
+
+
+def _sensor_table(sensors: Sequence[Sensor], flags: Sequence[str]) -> np.ndarray:
+    return np.array(
+        [
+            [
+                s.index, s.noise, s.rate, s.low, s.high, float(s.wraps),
+                len(sensors) + flags.index(s.instrument) if s.instrument in flags else -1,
+            ]
+            for s in sensors
+        ],
+        dtype=float,
+    )  # fmt: skip
+
+
+def _wind(wind: float | Sequence[float] | None) -> tuple[np.ndarray, float]:
+    """Steady wind (north, east) [m/s], and the speed of one of random direction."""
+    try:
+        values = np.atleast_1d(np.asarray(0.0 if wind is None else wind, dtype=float))
+    except (TypeError, ValueError):
+        values = np.full(1, np.nan)
+    if values.shape not in ((1,), (2,)) or not np.isfinite(values).all():
+        raise InputError(f"wind must be None, a speed, or (north, east) in m/s, found {wind!r}")
+    if values.shape == (2,):
+        return values, 0.0
+    if values[0] < 0.0:
+        raise InputError(f"wind as a speed must not be negative, found {wind!r}")
+    return np.zeros(2), float(values[0])
+
+
+_POOLS: dict[tuple[int, int], ThreadPoolExecutor] = {}
+
+
+def _in_threads(function: Callable[[int, int], None], count: int, threads: int) -> None:
+    """Call function(first, last) on equal shares; the compiled kernel lets other threads run."""
+    key = (os.getpid(), threads)  # a forked child has no threads of its parent
+    if key not in _POOLS:
+        _POOLS[key] = ThreadPoolExecutor(threads)
+    pool = _POOLS[key]
+    edges = [count * k // threads for k in range(threads + 1)]
+    futures = [pool.submit(function, a, b) for a, b in pairwise(edges)]
+    for future in futures:
+        future.result()

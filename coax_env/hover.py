@@ -1,0 +1,160 @@
+"""The hover task: stay at 1.5 m over the start, heading north. Start, end, reward and cost.
+
+Controllers are compared by a quadratic cost: squared errors in units of LIMITS, the success
+conditions of contract.md. The reward has a term 1/(1 + |error|/scale) per error, in (0, 1]: sharp
+at the goal, and with a slope far from it, so that a policy can be learnt from nothing.
+"""
+
+import math
+
+import numpy as np
+
+from coax_env.jit import compiled
+from coax_env.layout import N_FULL
+from coax_env.random_streams import uniform
+
+HEIGHT = 1.5  # [m] of the centre of gravity above ground
+CONTROL_PERIOD = 0.01  # [s]
+
+_DEGREE = math.pi / 180.0
+
+LIMITS = {
+    "height": 0.10,  # [m]
+    "position": 2.0,  # [m] horizontal distance from the start
+    "speed": 0.25,  # [m/s]
+    "heading": 10.0 * _DEGREE,
+    "rates": 30.0 * _DEGREE,  # [rad/s], of the whole rate vector; ours
+    "effort": 0.5,  # [1], of the whole action vector; ours
+}
+"""An error of this size counts 1. The first four are the success conditions."""
+
+COST_WEIGHTS = {
+    "height": 1.0, "position": 1.0, "speed": 1.0, "heading": 1.0, "rates": 0.1, "effort": 0.1,
+}  # fmt: skip
+"""Weights of the quadratic cost, the same for every controller."""
+
+REWARD_SCALES = {
+    "height": 0.25,  # [m]
+    "position": 2.0,  # [m]
+    "speed": 1.0,  # [m/s]
+    "heading": 20.0 * _DEGREE,
+    "rates": 60.0 * _DEGREE,  # [rad/s]
+    "effort": 0.5,  # [1]
+}
+"""An error of this size halves its reward term."""
+
+REWARD_WEIGHTS = {
+    "alive": 0.1, "height": 0.2, "position": 0.1, "speed": 0.3, "heading": 0.15,
+    "rates": 0.05, "effort": 0.1,
+}  # fmt: skip
+"""Weights of the reward terms; they sum to 1, so a step's reward lies in (0, 1]."""
+
+REWARD_TERMS = tuple(REWARD_WEIGHTS)
+N_TERMS = len(REWARD_TERMS)
+CRASHED_COST = 1000.0
+"""Cost of every step that an episode ended too early to fly."""
+
+START = {
+    "tilt": 5.0 * _DEGREE, "heading": 20.0 * _DEGREE, "rate": 10.0 * _DEGREE,
+    "velocity": 0.3, "height": 0.3,
+}  # fmt: skip
+"""Half widths of the uniform start, per axis, about hover. SI."""
+
+LOWEST = 0.05  # [m] centre of gravity: the skids touch
+HIGHEST = 6.0  # [m] the sonar's range ends soon after
+FARTHEST = 25.0  # [m]
+FASTEST = 15.0  # [m/s]
+STEEPEST = 60.0 * _DEGREE
+
+_WEIGHTS = np.array(list(REWARD_WEIGHTS.values()))
+_SCALES = np.array([1.0, *REWARD_SCALES.values()])
+_LIMITS = np.array(list(LIMITS.values()))
+_COST_WEIGHTS = np.array(list(COST_WEIGHTS.values()))
+_COS_STEEPEST = math.cos(STEEPEST)
+_TILT, _HEADING = START["tilt"], START["heading"]
+_RATE, _VELOCITY, _RISE = START["rate"], START["velocity"], START["height"]
+
+
+@compiled()
+def start(stream, command, x):
+    """A random start into the full state `x` (26,): rotors and swash settled on `command` (4,)."""
+    for i in range(N_FULL):
+        x[i] = 0.0
+    for i in range(3):
+        x[i] = uniform(stream, -_VELOCITY, _VELOCITY)
+        x[3 + i] = uniform(stream, -_RATE, _RATE)
+    x[10] = uniform(stream, -_TILT, _TILT)
+    x[11] = uniform(stream, -_TILT, _TILT)
+    x[12] = uniform(stream, -_HEADING, _HEADING)
+    x[15] = -HEIGHT - uniform(stream, -_RISE, _RISE)
+    for i in range(4):
+        x[16 + i] = command[i]
+
+
+@compiled()
+def reward(x, action, terms):
+    """Sum of the weighted reward terms at a full state (26,) after an action (4,).
+
+    The weighted terms go into `terms` (N_TERMS,); all are zero where the state is not finite.
+    """
+    heading = x[12] - 2.0 * math.pi * math.floor((x[12] + math.pi) / (2.0 * math.pi))
+    squares = (
+        0.0,  # alive
+        (x[15] + HEIGHT) ** 2,
+        x[13] * x[13] + x[14] * x[14],
+        x[0] * x[0] + x[1] * x[1] + x[2] * x[2],
+        heading * heading,
+        x[3] * x[3] + x[4] * x[4] + x[5] * x[5],
+        action[0] ** 2 + action[1] ** 2 + action[2] ** 2 + action[3] ** 2,
+    )
+    total = 0.0
+    for k in range(N_TERMS):
+        terms[k] = _WEIGHTS[k] / (1.0 + math.sqrt(squares[k]) / _SCALES[k])
+        total += terms[k]
+    if not math.isfinite(total):
+        total = 0.0
+        for k in range(N_TERMS):
+            terms[k] = 0.0
+    return total
+
+
+@compiled()
+def is_over(x):
+    """Whether the flight has ended: ground, tilt, too fast, too far, too high, or not a number."""
+    inside = (
+        -x[15] > LOWEST
+        and -x[15] < HIGHEST
+        and math.cos(x[10]) * math.cos(x[11]) > _COS_STEEPEST
+        and x[13] * x[13] + x[14] * x[14] < FARTHEST * FARTHEST
+        and x[0] * x[0] + x[1] * x[1] + x[2] * x[2] < FASTEST * FASTEST
+    )
+    if not inside:  # a comparison with NaN is false
+        return True
+    for i in range(N_FULL):  # noqa: SIM110 - compiled
+        if not math.isfinite(x[i]):
+            return True
+    return False
+
+
+def cost(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Quadratic cost of every step: COST_WEIGHTS times the squared errors in units of LIMITS.
+
+    Args:
+        states: full or paper states, shape (..., >=16). actions: shape (..., 4).
+
+    Returns:
+        shape (...).
+    """
+    heading = (states[..., 12] + math.pi) % (2.0 * math.pi) - math.pi
+    squares = np.stack(
+        [
+            (states[..., 15] + HEIGHT) ** 2,
+            (states[..., 13:15] ** 2).sum(-1),
+            (states[..., 0:3] ** 2).sum(-1),
+            heading**2,
+            (states[..., 3:6] ** 2).sum(-1),
+            (np.asarray(actions) ** 2).sum(-1),
+        ],
+        axis=-1,
+    )
+    return squares @ (_COST_WEIGHTS / _LIMITS**2)

@@ -1,0 +1,20 @@
+"""Reports: results as self-contained pages, the verdict first (page.py makes the HTML)."""
+
+from coax_env.report.diagnosis import diagnosis_page, headline, lead
+from coax_env.report.identification import identification_page
+from coax_env.report.page import Section, page
+from coax_env.report.replay import replay_page
+from coax_env.report.simulation import DOUBLET_HEADER, doublet_rows, simulation_page
+
+__all__ = [
+    "DOUBLET_HEADER",
+    "Section",
+    "diagnosis_page",
+    "doublet_rows",
+    "headline",
+    "identification_page",
+    "lead",
+    "page",
+    "replay_page",
+    "simulation_page",
+]

@@ -1,0 +1,396 @@
+"""A Kalman filter for the env's noisy, multi-rate sensors, designed on the linearised vehicle.
+
+It tracks the sixteen states, what the actuators really do, a disturbing force and moment with a
+memory of a few seconds, and slow biases of gyros, roll and pitch. The disturbances stand for gusts
+and for everything in which the flown machine differs from the designed one, a trim that is off
+above all: what they explain is steered against at once. States that the suite does not show are
+left out and named in ``unobserved``.
+
+Gains are those of the periodic steady state: the sensors' rates repeat every ten rows (or fewer),
+so there is one gain per row of that cycle, and one for the first reading of a flight.
+"""
+
+import math
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.linalg import schur
+
+from coax_env import hover
+from coax_env.errors import InputError
+from coax_env.fleet import DT, Nominal, action_map
+from coax_env.layout import CHANNELS, FULL_STATES, N_COMMANDS
+from coax_env.linear import sampled
+from coax_env.sensors import BASE_RATE, Sensor, is_new, slow_instruments, suite
+from coax_env.vehicle import Vehicle
+
+DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; not the fly-bar's, from which it must be told
+FORCE_SHARE = 0.05  # std of the disturbing force, of the weight
+MOMENT_ARM = 0.002  # [m] std of the disturbing roll and pitch moment, of the weight
+TORQUE_SHARE = 0.07  # std of the disturbing yaw moment, of one rotor's torque
+BIAS_STD = {"p": 0.03, "q": 0.03, "r": 0.03, "phi": 0.02, "theta": 0.02}
+"""Readings whose bias is estimated, and its std [rad/s, rad]."""
+BIAS_MEMORY = 30.0  # [s]
+INTEGRAL_TIME = {"height": 1.5, "heading": 1.5, "position": 6.0}
+"""[s]: an error of its limit for so long counts as much as the limit itself."""
+_WINDUP = 20.0  # integrals stop at so many
+_FREE_OF_NOISE = 1e-4  # std given to exact sensors, of their unit
+_ROWS_SEEN = 500
+_FIRST_STD = {"m": 1.0, "m/s": 1.0, "rad": 0.1, "rad/s": 0.5, "N": 1.0, "N m": 0.05}
+_PROCESS_STD = {"m": 1e-5, "m/s": 1e-3, "rad": 2e-4, "rad/s": 2e-3, "N": 0.0, "N m": 0.0}
+_PAIRS = (("vn", "ve"), ("pn", "pe"), ("x", "y"))
+"""Horizontal pairs, which are turned into the heading before use: the design is for psi = 0."""
+_NAMES = (*(name for name, _ in FULL_STATES), *(f"bias_{name}" for name in BIAS_STD))
+_UNITS = dict(FULL_STATES)
+_N_FULL = len(FULL_STATES)
+_SPEED = CHANNELS.index("v")  # the unsigned one, not the state
+
+
+@dataclass(frozen=True)
+class EstimatorDesign:
+    """Plain numbers of one estimator; everything is a deviation from the design vehicle's trim.
+
+    Shapes with n states, m readings, c rows of the sensors' cycle::
+
+        x[k+1] = A x[k] + B du[k]           y[k] = y_trim + C x[k] + D du[k-1]
+    """
+
+    sensors: str
+    states: tuple[str, ...]
+    unobserved: tuple[str, ...]
+    readings: tuple[str, ...]
+    A: np.ndarray  # (n, n)
+    B: np.ndarray  # (n, 4), per command [SI]
+    C: np.ndarray  # (m, n)
+    D: np.ndarray  # (m, 4)
+    gains: np.ndarray  # (c, n, m)
+    first_gain: np.ndarray  # (n, m)
+    single_rate_gain: np.ndarray  # (n, m), of the equivalent filter with every reading at 100 Hz
+    spread: np.ndarray  # (n,), std of the estimation error in the steady state
+    reading_trim: np.ndarray  # (m,)
+    command_trim: np.ndarray  # (4,), of the design vehicle
+    action_trim: np.ndarray  # (4,), of the nominal vehicle: command = trim + scale action
+    action_scale: np.ndarray  # (4,)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a JSON file."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> "EstimatorDesign":
+        """From a JSON file; shapes are checked."""
+        values: dict[str, Any] = {f.name: content[f.name] for f in fields(cls)}
+        for name, value in values.items():
+            if name in ("states", "unobserved", "readings"):
+                values[name] = tuple(value)
+            elif name != "sensors":
+                values[name] = np.array(value, dtype=float)
+        design = cls(**values)
+        n, m, c = len(design.states), len(design.readings), len(design.gains)
+        shapes = {
+            "A": (n, n), "B": (n, 4), "C": (m, n), "D": (m, 4), "gains": (c, n, m),
+            "first_gain": (n, m), "single_rate_gain": (n, m), "spread": (n,),
+            "reading_trim": (m,), "command_trim": (4,), "action_trim": (4,), "action_scale": (4,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            found = getattr(design, name).shape
+            if found != shape:
+                raise InputError(f"estimator.{name} must have shape {shape}, found {found}")
+        return design
+
+    def index(self, name: str) -> int:
+        """Place of a state in the estimate."""
+        return self.states.index(name)
+
+    @cached_property
+    def reading_places(self) -> np.ndarray:
+        """Where the readings stand in the env's observation, (m,)."""
+        names = [s.name for s in suite(self.sensors)]
+        return np.array([names.index(r) for r in self.readings])
+
+    @cached_property
+    def flag_places(self) -> np.ndarray:
+        """Where the "new" flag of each reading stands in the observation; -1 without one, (m,)."""
+        sensors = suite(self.sensors)
+        flags = slow_instruments(sensors)
+        instrument = {s.name: s.instrument for s in sensors}
+        return np.array(
+            [
+                len(sensors) + flags.index(instrument[r]) if instrument[r] in flags else -1
+                for r in self.readings
+            ]
+        )
+
+
+def design_estimator(
+    vehicle: Vehicle, nominal: Nominal = None, sensors: str = "onboard"
+) -> EstimatorDesign:
+    """The filter for a vehicle and a sensor suite. A pure servo delay is taken as a lag."""
+    used = [s for s in suite(sensors) if s.index != _SPEED]  # |V| has no slope at hover
+    A_flown, B_flown, C_channels, D_channels, x_trim, u_trim = sampled(delay_as_lag(vehicle), DT)
+    A, B = np.eye(len(_NAMES)), np.zeros((len(_NAMES), N_COMMANDS))
+    A[:_N_FULL, :_N_FULL], B[:_N_FULL] = A_flown, B_flown
+    A[20:26, 20:26] = np.eye(6) * math.exp(-DT / DISTURBANCE_MEMORY)
+    A[_N_FULL:, _N_FULL:] *= math.exp(-DT / BIAS_MEMORY)
+    # readings of the channels, then, for the suite ``state``, the states as they are
+    C_all = np.eye(len(CHANNELS) + _N_FULL, len(_NAMES), k=-len(CHANNELS))
+    C_all[: len(CHANNELS), :_N_FULL] = C_channels
+    for k, name in enumerate(BIAS_STD):
+        C_all[CHANNELS.index(name), _N_FULL + k] = 1.0
+    D_all = np.vstack([D_channels, np.zeros((_N_FULL, N_COMMANDS))])
+    rows = [s.index for s in used]
+    y_trim = np.concatenate([_trim_readings(vehicle, x_trim, u_trim), x_trim])[rows]
+
+    first, process = _spreads(vehicle, u_trim)
+    noise = np.array([max(s.noise, _FREE_OF_NOISE) for s in used])
+    hidden = _unobserved(A, C_all[rows], first, noise)
+    keep = [i for i in range(len(_NAMES)) if _NAMES[i] not in hidden]
+    hidden = tuple(name for name in hidden if not name.startswith("bias_"))
+    A, B = A[np.ix_(keep, keep)], B[keep]
+    C, D = C_all[np.ix_(rows, keep)], D_all[rows]
+    gains, first_gain, spread = _gains(A, C, first[keep], process[keep], noise, used)
+    trim, scale = action_map(vehicle, nominal)
+    return EstimatorDesign(
+        sensors=sensors,
+        states=tuple(_NAMES[i] for i in keep),
+        unobserved=hidden,
+        readings=tuple(s.name for s in used),
+        A=A, B=B, C=C, D=D,
+        gains=gains,
+        first_gain=first_gain,
+        single_rate_gain=_single_rate_gain(A, C, process[keep], noise, used),
+        spread=spread,
+        reading_trim=y_trim,
+        command_trim=u_trim,
+        action_trim=trim,
+        action_scale=scale,
+    )  # fmt: skip
+
+
+def delay_as_lag(vehicle: Vehicle) -> Vehicle:
+    """The servo's pure delay, which has no finite state, added to its lag instead."""
+    values = vehicle.values()
+    delay = values.get("servo_delay.time", 0.0)
+    if delay <= 0.0:
+        return vehicle
+    lag = values.get("servo_lag.time", 0.0) + delay
+    return vehicle.with_effect("servo_delay", time=0.0).with_effect("servo_lag", time=lag)
+
+
+def integrated_readings(design: EstimatorDesign) -> dict[str, float]:
+    """Readings whose integral a controller should feed back, and the integral that counts 1.
+
+    Height and heading, so that no error of trim or sensor model stays in them; position, or the
+    velocity where position is not measured, whose integral then stands for the position.
+    """
+    limit = {name: hover.LIMITS[name] * time for name, time in INTEGRAL_TIME.items()}
+    place = next((pair for pair in (("pn", "pe"), ("x", "y")) if pair[0] in design.readings), ())
+    found = dict.fromkeys(place, limit["position"])
+    if not place and "vn" in design.readings:
+        found = dict.fromkeys(("vn", "ve"), hover.LIMITS["position"])
+    found |= {n: limit["height"] for n in ("h", "z") if n in design.readings}
+    return found | {n: limit["heading"] for n in ("psi",) if n in design.readings}
+
+
+class Tracker:
+    """The running filter, for one helicopter or many, and the integrals of some readings.
+
+    In every control period: `see` the observation, then tell what was done with `acted`.
+    """
+
+    def __init__(self, design: EstimatorDesign, count: int = 1) -> None:
+        self.design = design
+        self.count = count
+        names = design.readings
+        integrated = integrated_readings(design)
+        self._integrated = [names.index(name) for name in integrated]
+        self._most = _WINDUP * np.array(list(integrated.values()))
+        self._pairs = [(names.index(a), names.index(b)) for a, b in _PAIRS if a in names]
+        self._heading = names.index("psi") if "psi" in names else None
+        self._flags = np.where(design.flag_places >= 0, design.flag_places, 0)
+        self._always = design.flag_places < 0
+        self.offset = design.action_trim - design.command_trim
+        self._first = np.zeros(len(design.states))
+        for k, name in enumerate(_NAMES[16:20]):
+            if name in design.states:
+                self._first[design.index(name)] = self.offset[k]
+        self.state = np.zeros((count, len(design.states)))
+        self.integrals = np.zeros((count, len(integrated)))
+        self._readings = np.zeros((count, len(names)))
+        self._command = np.zeros((count, N_COMMANDS))
+        self._rows = np.zeros(count, dtype=np.int64)
+        self.reset(np.ones(count, dtype=bool))
+
+    def reset(self, which: np.ndarray) -> None:
+        """Forget everything in the rows of a mask: their next observation is a flight's first."""
+        self.state[which] = self._first
+        self.integrals[which] = 0.0
+        self._command[which] = self.offset
+        self._rows[which] = 0
+
+    def see(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
+        """Take in observations (count, n_obs), only in the rows of a mask where one is given.
+
+        Returns:
+            what is known, (count, n + i): the estimate and the integrals.
+        """
+        if which is None:
+            self.state, self._readings = self._corrected(
+                observations, self.state, self._command, self._rows
+            )
+        elif which.any():
+            self.state[which], self._readings[which] = self._corrected(
+                observations[which], self.state[which], self._command[which], self._rows[which]
+            )
+        return np.hstack([self.state, self.integrals])
+
+    def acted(self, actions: np.ndarray) -> None:
+        """Move on by one control period under actions (count, 4)."""
+        design = self.design
+        self._command = self.offset + design.action_scale * actions
+        self.state = self.state @ design.A.T + self._command @ design.B.T
+        self.integrals += DT * self._readings[:, self._integrated]
+        np.clip(self.integrals, -self._most, self._most, out=self.integrals)
+        self._rows += 1
+
+    def _corrected(
+        self, observations: np.ndarray, state: np.ndarray, command: np.ndarray, rows: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """State after the readings, and the readings as deviations, horizontal ones turned."""
+        design = self.design
+        y = observations[:, design.reading_places].astype(float)
+        if self._heading is not None:
+            cosine, sine = np.cos(y[:, self._heading]), np.sin(y[:, self._heading])
+            for a, b in self._pairs:
+                north, east = y[:, a].copy(), y[:, b].copy()
+                y[:, a] = cosine * north + sine * east
+                y[:, b] = cosine * east - sine * north
+        y -= design.reading_trim
+        innovation = y - state @ design.C.T - command @ design.D.T
+        if self._heading is not None:
+            y[:, self._heading] = _wrapped(y[:, self._heading])
+            innovation[:, self._heading] = _wrapped(innovation[:, self._heading])
+        innovation *= self._always | (observations[:, self._flags] > 0.5)
+        phase = rows % len(design.gains)
+        if (rows == rows[0]).all():
+            gain = design.first_gain if rows[0] == 0 else design.gains[phase[0]]
+            return state + innovation @ gain.T, y
+        state = state.copy()
+        for k, gain in enumerate(design.gains):
+            at = (phase == k) & (rows > 0)
+            state[at] += innovation[at] @ gain.T
+        at = rows == 0
+        state[at] += innovation[at] @ design.first_gain.T
+        return state, y
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def _trim_readings(vehicle: Vehicle, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    from coax_env.dynamics import readings
+
+    found = readings(x, u, vehicle)
+    return np.array([found[name] for name in CHANNELS])
+
+
+def _spreads(vehicle: Vehicle, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Std of every full state at a flight's start, and of what one period adds to it."""
+    values = vehicle.values()
+    weight = values["mass"] * values["gravity"]
+    k_Q = values["air_density"] * math.pi * values["rotor_radius"] ** 5
+    torque = values["torque_coefficient_upper"] * k_Q * command[0] ** 2
+    first = np.array([_FIRST_STD.get(_UNITS.get(n, ""), 1.0) for n in _NAMES])
+    process = np.array([_PROCESS_STD.get(_UNITS.get(n, ""), 0.0) for n in _NAMES])
+    start = hover.START
+    first[0:3] = start["velocity"] / math.sqrt(3.0)
+    first[3:6] = start["rate"] / math.sqrt(3.0)
+    first[6:10] = 0.01
+    first[10:12] = start["tilt"] / math.sqrt(3.0)
+    first[12] = start["heading"] / math.sqrt(3.0)
+    first[15] = start["height"] / math.sqrt(3.0)
+    first[13:15] = 0.01
+    first[16:20] = 1e-3
+    first[20:23] = FORCE_SHARE * weight
+    first[23:25] = MOMENT_ARM * weight
+    first[25] = TORQUE_SHARE * torque
+    process[16:18], process[18:20] = 0.2, 1e-4
+    first[26:] = list(BIAS_STD.values())
+    process[26:] = first[26:] * math.sqrt(1.0 - math.exp(-2.0 * DT / BIAS_MEMORY))
+    process[20:26] = first[20:26] * math.sqrt(1.0 - math.exp(-2.0 * DT / DISTURBANCE_MEMORY))
+    return first, process
+
+
+def _unobserved(
+    A: np.ndarray, C: np.ndarray, first: np.ndarray, noise: np.ndarray
+) -> tuple[str, ...]:
+    """States whose error the readings never show and time does not heal.
+
+    From the information matrix sum (A^k)' C' R^-1 C A^k of five seconds, with states in units of
+    their first std: its directions with next to no information that do not decay by themselves,
+    and the states that these run along.
+    """
+    A_scaled = A * first / first[:, None]
+    seen = (C * first) / noise[:, None]
+    information = np.zeros_like(A)
+    for _ in range(_ROWS_SEEN):
+        information += seen.T @ seen
+        seen = seen @ A_scaled
+    values, directions = np.linalg.eigh(information)
+    blind = directions[:, values < 1e-3]
+    within = blind.T @ A_scaled @ blind  # the blind directions map onto themselves
+    _, basis, lasts = schur(within, sort=lambda re, im=0.0: math.hypot(re, im) > 0.9995)
+    lasting = blind @ basis[:, :lasts]
+    return tuple(
+        name for name, row in zip(_NAMES, lasting, strict=True) if np.abs(row).max(initial=0) > 0.05
+    )
+
+
+def _gains(
+    A: np.ndarray,
+    C: np.ndarray,
+    first: np.ndarray,
+    process: np.ndarray,
+    noise: np.ndarray,
+    sensors: list[Sensor],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Kalman gains over the sensors' cycle, the first gain, and the steady error's std."""
+    cycle = round(BASE_RATE / math.gcd(*(round(s.rate) for s in sensors)))
+    Q, R = np.diag(process**2), np.diag(noise**2)
+    P = np.diag(first**2)
+    first_gain = _gain(P, C, R, np.ones(len(sensors), dtype=bool))
+    gains = np.zeros((cycle, *first_gain.shape))
+    rounds = round(20.0 / DT / cycle)
+    for row in range(rounds * cycle + 1):
+        new = np.array([bool(is_new(row, s.rate)) for s in sensors])
+        K = _gain(P, C, R, new)
+        gains[row % cycle] = K
+        joseph = np.eye(len(A)) - K @ C
+        P = joseph @ P @ joseph.T + K @ R @ K.T
+        spread = np.sqrt(np.diag(P))
+        P = A @ P @ A.T + Q
+    return gains, first_gain, spread
+
+
+def _gain(P: np.ndarray, C: np.ndarray, R: np.ndarray, new: np.ndarray) -> np.ndarray:
+    K = np.zeros((len(P), len(C)))
+    C_new = C[new]
+    S = C_new @ P @ C_new.T + R[np.ix_(new, new)]
+    K[:, new] = np.linalg.solve(S, C_new @ P).T
+    return K
+
+
+def _single_rate_gain(
+    A: np.ndarray, C: np.ndarray, process: np.ndarray, noise: np.ndarray, sensors: list[Sensor]
+) -> np.ndarray:
+    """The filter gain K (x += K innovation) if slow sensors were fast and as much noisier."""
+    import control
+
+    rate = np.array([s.rate for s in sensors])
+    R = np.diag(noise**2 * (BASE_RATE / rate))
+    _, P, _ = control.dlqe(A, np.eye(len(A)), C, np.diag(process**2), R)
+    return _gain(np.asarray(P), C, R, np.ones(len(C), dtype=bool))

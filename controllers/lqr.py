@@ -1,0 +1,251 @@
+"""LQG with integral action: python-control's LQR on the kernel's linearisation, and the estimator.
+
+The regulator minimises the quadratic cost by which every controller is compared (hover.LIMITS and
+COST_WEIGHTS), with integrals of the measured height, heading and position added, so that no error
+of trim or sensor model stays in them. Where position is not measured, the integral of the measured
+velocity stands for it: the machine then holds still, and its place drifts.
+"""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coax_env import hover
+from coax_env.files import write_json
+from coax_env.fleet import DT, Nominal
+from coax_env.vehicle import Vehicle, load_vehicle
+from controllers.estimator import (
+    INTEGRAL_TIME,
+    EstimatorDesign,
+    Tracker,
+    design_estimator,
+    integrated_readings,
+)
+
+FORMAT = "coax-controller"
+VERSION = 1
+INPUT_NAMES = ("rotor_upper", "rotor_lower", "swash_lon", "swash_lat")
+
+
+@dataclass
+class LQG:
+    """A designed controller: plain matrices. `act` flies one helicopter or a batch of them.
+
+    action = clip(feedforward - gain @ [estimate; integrals], -1, 1), all deviations from the design
+    vehicle's trim.
+    """
+
+    vehicle: str
+    estimator: EstimatorDesign
+    gain: np.ndarray  # (4, n + i), per state [SI], of the action
+    cost_to_go: np.ndarray  # (n + i, n + i): x'Px is the cost of all further steps
+    tracker: Tracker | None = field(default=None, init=False, repr=False, compare=False)
+    known: np.ndarray | None = field(default=None, init=False, repr=False, compare=False)
+
+    kind = "lqg"
+
+    @property
+    def sensors(self) -> str:
+        """The suite it must be given."""
+        return self.estimator.sensors
+
+    @property
+    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Trim and scale of its actions, for ``nominal=`` of the env."""
+        return self.estimator.action_trim, self.estimator.action_scale
+
+    def reset(self, count: int = 1) -> None:
+        """Forget the last flight; `count` helicopters are flown next."""
+        self.tracker = Tracker(self.estimator, count)
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Observation (n_obs,) or (count, n_obs) to action (4,) or (count, 4), float32."""
+        batch = np.atleast_2d(observation)
+        if self.tracker is None or self.tracker.count != len(batch):
+            self.tracker = Tracker(self.estimator, len(batch))
+        self.known = self.tracker.see(batch)  # estimate and integrals, kept to be looked at
+        feedforward = -self.tracker.offset / self.estimator.action_scale
+        actions = feedforward - self.known @ self.gain.T
+        actions = np.clip(actions, -1.0, 1.0).astype(np.float32)
+        self.tracker.acted(actions)
+        return actions if np.ndim(observation) == 2 else actions[0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a JSON file, weights included."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "kind": self.kind,
+            "vehicle": self.vehicle,
+            "control_period_s": DT,
+            "cost": {"weights": hover.COST_WEIGHTS, "limits": hover.LIMITS},
+            "integral_time_s": INTEGRAL_TIME,
+            "estimator": self.estimator.to_dict(),
+            "gain": self.gain.tolist(),
+            "cost_to_go": self.cost_to_go.tolist(),
+        }
+
+    def save(self, path: str | Path) -> Path:
+        """Write controller.json."""
+        return write_json(path, self.to_dict())
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> "LQG":
+        """From a JSON file."""
+        return cls(
+            vehicle=str(content["vehicle"]),
+            estimator=EstimatorDesign.from_dict(content["estimator"]),
+            gain=np.array(content["gain"], dtype=float),
+            cost_to_go=np.array(content["cost_to_go"], dtype=float),
+        )
+
+
+def design(vehicle: str | Vehicle, nominal: Nominal = None, sensors: str = "onboard") -> LQG:
+    """Design a hover controller on a vehicle.
+
+    Args:
+        vehicle: what the design is made on: shipped name, path or Vehicle.
+        nominal: whose trim centres the action, as in the env.
+        sensors: the suite it will be given.
+    """
+    import control
+
+    vehicle = load_vehicle(vehicle)
+    estimator = design_estimator(vehicle, nominal, sensors)
+    A, B, Q, R = regulator_problem(estimator)
+    gain, cost_to_go, _ = control.dlqr(A, B, Q, R)
+    return LQG(vehicle.name, estimator, np.asarray(gain), np.asarray(cost_to_go))
+
+
+def regulator_problem(
+    estimator: EstimatorDesign,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A, B, Q, R of the regulator: states and integrals, actions, `hover.cost` per period."""
+    integrated = integrated_readings(estimator)
+    n = len(estimator.states)
+    A, B = np.eye(n + len(integrated)), np.zeros((n + len(integrated), 4))
+    A[:n, :n], B[:n] = estimator.A, estimator.B * estimator.action_scale
+    Q = np.zeros_like(A)
+    for k, (name, limit) in enumerate(integrated.items()):
+        A[n + k, :n] = DT * estimator.C[estimator.readings.index(name)]
+        Q[n + k, n + k] = 1.0 / limit**2
+    errors = {
+        "height": "z", "position": "x y", "speed": "u v w", "heading": "psi", "rates": "p q r",
+    }  # fmt: skip
+    for error, names in errors.items():
+        for name in set(names.split()) & set(estimator.states):
+            at = estimator.index(name)
+            Q[at, at] += hover.COST_WEIGHTS[error] / hover.LIMITS[error] ** 2
+    R = np.eye(4) * hover.COST_WEIGHTS["effort"] / hover.LIMITS["effort"] ** 2
+    return A, B, Q, R
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Stability margins at one plant input, the other loops closed."""
+
+    input: str
+    gain_down: float  # the loop's gain may fall to this
+    gain_up: float  # and rise to this
+    phase_deg: float
+    distance: float  # least |1 + L|
+    crossover_hz: float  # where the phase margin is least
+
+
+def loop(controller: LQG) -> Any:
+    """The loop broken at the plant's four inputs, as a discrete ``control.StateSpace``.
+
+    The estimator is the single-rate equivalent of the periodic one: slow sensors taken as fast ones
+    with as much more noise.
+    """
+    import control
+
+    e = controller.estimator
+    integrated = integrated_readings(e)
+    n, m, i = len(e.states), len(e.readings), len(integrated)
+    S = np.diag(e.action_scale)
+    # plant: the states and the command in force; readings see both
+    plant = control.ss(
+        np.block([[e.A, np.zeros((n, 4))], [np.zeros((4, n)), np.zeros((4, 4))]]),
+        np.vstack([e.B @ S, S]),
+        np.hstack([e.C, e.D]),
+        np.zeros((m, 4)),
+        DT,
+    )
+    K, F = e.single_rate_gain, controller.gain
+    F_x, F_i = F[:, :n], F[:, n:]
+    M = np.zeros((i, m))
+    for k, name in enumerate(integrated):
+        M[k, e.readings.index(name)] = DT
+    # state: prediction, integrals, command in force; corrected = prediction + K (y - C x - D u)
+    corrected = np.hstack([np.eye(n) - K @ e.C, np.zeros((n, i)), -K @ e.D])
+    act = -F_x @ corrected - np.hstack([np.zeros((4, n)), F_i, np.zeros((4, 4))])
+    act_y = -F_x @ K
+    regulator = control.ss(
+        np.vstack(
+            [
+                e.A @ corrected + e.B @ S @ act,
+                np.hstack([np.zeros((i, n)), np.eye(i), np.zeros((i, 4))]),
+                S @ act,
+            ]
+        ),
+        np.vstack([e.A @ K + e.B @ S @ act_y, M, S @ act_y]),
+        -act,
+        -act_y,
+        DT,
+    )
+    return regulator * plant
+
+
+def margins(controller: LQG) -> tuple[list[Margins], float]:
+    """Classical margins of each input with the others closed, and the disk margin of all four.
+
+    The disk margin alpha allows every input at once a gain between (2 - alpha)/(2 + alpha) and its
+    inverse, or a phase of 2 atan(alpha/2) (Seiler, Packard and Gahinet, IEEE CSM 2020).
+    """
+    import control
+
+    omega = np.append(np.geomspace(1e-3, 0.99 * math.pi / DT, 1000), math.pi / DT)
+    L = np.moveaxis(loop(controller).frequency_response(omega).frdata, -1, 0)
+    found = []
+    for k, name in enumerate(INPUT_NAMES):
+        rest = [i for i in range(4) if i != k]
+        others = np.linalg.solve(np.eye(3) + L[:, rest][:, :, rest], L[:, rest, k : k + 1])
+        one = L[:, k, k] - (L[:, k : k + 1, rest] @ others)[:, 0, 0]
+        found.append(Margins(name, *_classical(control.frd(one, omega))))
+    S = np.linalg.inv(np.eye(4) + L)
+    disk = 1.0 / max(_structured(matrix - 0.5 * np.eye(4)) for matrix in S)  # (S - T)/2
+    return found, disk
+
+
+def _classical(loop: Any) -> tuple[float, float, float, float, float]:
+    """Fields of Margins but the name, from the frequency response of a loop up to Nyquist."""
+    import control
+
+    values = loop.frdata[0, 0]
+    gains, phases, _, _, crossovers, _ = control.stability_margins(loop, returnall=True)
+    gains, phases = np.asarray(gains, dtype=float), np.abs(np.asarray(phases, dtype=float))
+    if values[-1].real < 0.0:  # the last crossing of the negative axis
+        gains = np.append(gains, -1.0 / values[-1].real)
+    worst = int(np.argmin(phases)) if len(phases) else None
+    return (
+        float(gains[gains < 1.0].max(initial=0.0)),
+        float(gains[gains > 1.0].min(initial=math.inf)),
+        math.inf if worst is None else float(phases[worst]),
+        float(np.abs(1.0 + values).min()),
+        0.0 if worst is None else float(crossovers[worst]) / (2.0 * math.pi),
+    )
+
+
+def _structured(matrix: np.ndarray) -> float:
+    """Upper bound of the structured singular value for diagonal uncertainty (Osborne scaling)."""
+    scale = np.ones(len(matrix))
+    for _ in range(30):
+        M = matrix * scale[:, None] / scale
+        off = M - np.diag(np.diag(M))
+        rows, columns = np.linalg.norm(off, axis=1), np.linalg.norm(off, axis=0)
+        scale *= np.sqrt(np.maximum(columns, 1e-12) / np.maximum(rows, 1e-12))
+    return float(np.linalg.norm(matrix * scale[:, None] / scale, 2))

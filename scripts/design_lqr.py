@@ -1,0 +1,52 @@
+"""Design a hover controller (LQR with integral action, and a Kalman filter) on a vehicle."""
+
+import shlex
+import sys
+
+import command_line
+
+from coax_env.files import make_folder, write_text
+from coax_env.sensors import SUITES
+from coax_env.vehicle import load_vehicle
+from controllers import lqr
+from controllers.design_report import MARGIN_HEADER, design_page, disk_in_words, margin_rows
+from controllers.evaluation import evaluate
+
+
+def main() -> None:
+    parser = command_line.parser("design_lqr", __doc__, seed=True)
+    parser.add_argument("--vehicle", default="lama400d", help="shipped name or TOML file")
+    parser.add_argument("--nominal", help="vehicle whose trim centres the action (default: bare)")
+    parser.add_argument(
+        "--sensors", default="onboard", help=f"{', '.join(SUITES)} (default: %(default)s)"
+    )
+    options = parser.parse_args()
+
+    vehicle = load_vehicle(options.vehicle)
+    controller = lqr.design(vehicle, options.nominal, options.sensors)
+    margins, disk = lqr.margins(controller)
+    score = evaluate(controller, vehicle, episodes=50, seed=options.seed)
+    page = design_page(
+        controller, vehicle, margins, disk, score,
+        "scripts/design_lqr.py " + shlex.join(sys.argv[1:]),
+    )  # fmt: skip
+    make_folder(options.out)
+    path = controller.save(options.out / "controller.json")
+    write_text(options.out / "report.html", page)
+
+    command_line.print_columns([MARGIN_HEADER, *margin_rows(margins)])
+    gain, phase = disk_in_words(disk)
+    print(f"all inputs at once: disk margin {disk:.2f}, {gain} in gain or {phase} in phase")
+    hidden = controller.estimator.unobserved
+    print("not shown by these sensors, left out:", ", ".join(hidden) or "nothing")
+    if "theta" in hidden:
+        print("WARNING: without attitude or velocity no linear design can hold the hover")
+    print(
+        f"{score['episodes']} flights of {score['seconds']:.0f} s on this vehicle: "
+        f"{100 * score['success_rate']:.0f} % succeed, mean cost {score['mean_cost']:.3g}"
+    )
+    print(f"controller {path}, report {options.out / 'report.html'}")
+
+
+if __name__ == "__main__":
+    command_line.run(main)

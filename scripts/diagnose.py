@@ -1,0 +1,84 @@
+"""Find what a vehicle's simulation gets wrong on measured flights, name the causes, extend it."""
+
+import shlex
+import sys
+from pathlib import Path
+
+import command_line
+
+from coax_env import report
+from coax_env.diagnosis import Diagnosis, diagnose
+from coax_env.files import staged_folder, write_json, write_text
+from coax_env.vehicle import vehicle_toml
+
+
+def main() -> None:
+    parser = command_line.parser("diagnose", __doc__)
+    parser.add_argument("flight", type=Path, help="flight folder")
+    parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
+    parser.add_argument(
+        "--hold-out", metavar="RUN,RUN|none",
+        help="runs on which the gain is measured (default: a quarter, chosen by signature)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--exclude", default="", metavar="EFFECT,EFFECT", help="effects that must not be named"
+    )
+    options = parser.parse_args()
+
+    held = None
+    if options.hold_out is not None:
+        held = [] if options.hold_out == "none" else options.hold_out.split(",")
+    with command_line.progress("diagnosis") as say:
+        result = diagnose(
+            options.flight,
+            options.vehicle,
+            hold_out=held,
+            exclude=[e for e in options.exclude.split(",") if e],
+            progress=say,
+        )
+    save(result, options.out, "scripts/diagnose.py " + shlex.join(sys.argv[1:]))
+    print(summary(result))
+    print(f"findings {options.out / 'findings.json'}, extended vehicle "
+          f"{options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")  # fmt: skip
+
+
+def save(result: Diagnosis, out: Path, command: str) -> None:
+    """findings.json, vehicle.toml and report.html, all or none."""
+    page = report.diagnosis_page(result, command)
+    with staged_folder(out) as folder:
+        write_json(folder / "findings.json", result.findings)
+        write_text(folder / "vehicle.toml", vehicle_toml(result.vehicle_after))
+        write_text(folder / "report.html", page)
+
+
+def summary(result: Diagnosis) -> str:
+    """The finding in a few lines."""
+    findings = result.findings
+    lines = [f"verdict: {findings['verdict']}"]
+    for cause in findings["causes"]:
+        values = ", ".join(
+            f"{name.split('.')[1]} {p['value']:.4g} +- {p['std']:.2g} {p['unit']}"
+            for name, p in cause["parameters"].items()
+        )
+        alike = ", ".join(cause["confusable_with"])
+        lines.append(
+            f"  {cause['effect']}: {values}; {cause['evidence']:.0f} nats"
+            + (f"; these flights cannot tell it from {alike}" if alike else "")
+        )
+    for left in findings["unexplained"]:
+        lines.append(f"  unexplained: {left['channel']} ({left['form']})")
+    gain = findings["gain"]
+    if gain and gain["error_removed_percent"] is not None:
+        low, high = gain["ci95"]
+        interval = "" if low is None else f" (95 % interval {low:.0f} to {high:.0f})"
+        lines.append(
+            f"gain on {', '.join(gain['held_out'])}: {gain['error_removed_percent']:.0f} % of the "
+            f"{gain['horizon_s']:g} s prediction error removed{interval}"
+        )
+    for remark in result.remarks:
+        lines.append(f"note: {remark}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    command_line.run(main)

@@ -1,0 +1,44 @@
+"""Fit a vehicle's own numbers to a flight; the result is a vehicle file for the env."""
+
+import shlex
+import sys
+from pathlib import Path
+
+import command_line
+
+from coax_env import report
+from coax_env.files import staged_folder, write_text
+from coax_env.identification import METHODS, identify
+from coax_env.vehicle import vehicle_toml
+
+
+def main() -> None:
+    parser = command_line.parser("identify", __doc__)
+    parser.add_argument("flight", type=Path, help="flight folder")
+    parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
+    parser.add_argument("--method", choices=METHODS, default="ml", help="default: %(default)s")
+    options = parser.parse_args()
+
+    with command_line.progress("identification") as say:
+        result = identify(options.flight, options.vehicle, options.method, say)
+    page = report.identification_page(
+        result.before,
+        result.after,
+        result.fitted,
+        flight=result.flight,
+        replay_before=result.replay_before,
+        replay_after=result.replay_after,
+        remarks=result.remarks,
+        command_line="scripts/identify.py " + shlex.join(sys.argv[1:]),
+    )
+    with staged_folder(options.out) as folder:
+        write_text(folder / "vehicle.toml", vehicle_toml(result.after))
+        write_text(folder / "report.html", page)
+    for name in result.fitted:
+        old, new = result.before[name], result.after[name]
+        print(f"{name:32s} {old.value:11.5g} -> {new.value:11.5g} +- {new.std:.2g} {new.unit}")
+    print(f"vehicle {options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")
+
+
+if __name__ == "__main__":
+    command_line.run(main)

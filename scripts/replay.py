@@ -1,0 +1,40 @@
+"""Show what the simulation gets wrong on a flight: open-loop prediction error per channel."""
+
+import shlex
+import sys
+from pathlib import Path
+
+import command_line
+
+from coax_env import report
+from coax_env.errors import InputError
+from coax_env.files import staged_folder, write_json, write_text
+from coax_env.prediction import replay
+
+
+def main() -> None:
+    parser = command_line.parser("replay", __doc__)
+    parser.add_argument("flight", type=Path, help="flight folder")
+    parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
+    parser.add_argument("--horizon", type=float, default=1.0, help="seconds (default: 1.0)")
+    options = parser.parse_args()
+    if not 0.05 <= options.horizon <= 60.0:
+        raise InputError(f"--horizon must be between 0.05 and 60 s, found {options.horizon:g}")
+
+    with command_line.progress("replay") as say:
+        result = replay(options.flight, options.vehicle, options.horizon, say)
+    page = report.replay_page(result, "scripts/replay.py " + shlex.join(sys.argv[1:]))
+    with staged_folder(options.out) as folder:
+        write_json(folder / "replay.json", result.findings)
+        write_text(folder / "report.html", page)
+    for run, table in result.findings["runs"].items():
+        cells = (
+            f"{c} {'diverged' if e['rms'] is None else format(e['rms'], '.3g')} {e['unit']}"
+            for c, e in table.items()
+        )
+        print(f"{run}: {', '.join(cells)}")
+    print(f"replay {options.out / 'replay.json'}, report {options.out / 'report.html'}")
+
+
+if __name__ == "__main__":
+    command_line.run(main)

@@ -1,0 +1,61 @@
+"""Fly maneuvers in simulation: a flight folder, a report, and the paper's doublet as a table."""
+
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import command_line
+
+from coax_env import report
+from coax_env.files import make_folder, write_text
+from coax_env.flight import write_flight
+from coax_env.maneuvers import MANEUVERS
+from coax_env.sensors import SUITES, log_suite
+from coax_env.simulation import Gusts, doublet_remarks, doublet_table, fly_all, log_flight
+from coax_env.vehicle import load_vehicle, shipped_vehicles
+
+
+def main() -> None:
+    parser = command_line.parser("simulate", __doc__, seed=True)
+    parser.add_argument(
+        "--maneuver", default="lon_doublet", metavar="NAME,NAME",
+        help=f"what is flown, or all: {', '.join(MANEUVERS)} (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--vehicle", default="lama400d", help="shipped name or TOML file")
+    parser.add_argument(
+        "--sensors", default="onboard", help=f"{', '.join(SUITES)} (default: %(default)s)"
+    )
+    parser.add_argument("--no-noise", action="store_true", help="log without sensor noise")
+    parser.add_argument("--gusts", action="store_true", help="fly in light gusts")
+    options = parser.parse_args()
+
+    vehicle = load_vehicle(options.vehicle)
+    names = list(MANEUVERS) if options.maneuver == "all" else options.maneuver.split(",")
+    gusts = Gusts() if options.gusts else None
+    suite = log_suite(options.sensors)
+    tracks = fly_all(vehicle, names, seed=options.seed, gusts=gusts)
+    flight = log_flight(vehicle, tracks, suite, noise=not options.no_noise, seed=options.seed)
+    papers = names == ["lon_doublet"] and vehicle.name == "lama400d" and not vehicle.effects
+    table = doublet_table(vehicle) if papers else ()
+    remarks = doublet_remarks(vehicle) if papers else ()
+    page = report.simulation_page(
+        tracks, vehicle, table, remarks, "scripts/simulate.py " + shlex.join(sys.argv[1:])
+    )
+    if vehicle.name not in shipped_vehicles():
+        flight = replace(flight, vehicle=str(Path(options.vehicle).resolve()))
+    make_folder(options.out)
+    write_flight(flight, options.out / "flight")
+    write_text(options.out / "report.html", page)
+
+    if papers:
+        command_line.print_columns([report.DOUBLET_HEADER, *report.doublet_rows(table)])
+        for remark in remarks:
+            print("holds:" if remark.holds else "DOES NOT HOLD:", remark.statement)
+    for track in tracks:
+        print(track.maneuver.name + ":", f"{track.t[-1]:.1f} s", track.ended)
+    print(f"flight {options.out / 'flight'}, report {options.out / 'report.html'}")
+
+
+if __name__ == "__main__":
+    command_line.run(main)
