@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import effects, next_maneuver
+from coax_env import effects, next_maneuver, unlisted
 from coax_env.engine.fit import Engine, RunPass, part
 from coax_env.engine.model import FreeParameter, Noise, Record
 from coax_env.engine.whiteness import Whiteness, whiteness
 from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight
 from coax_env.gain import gain_of
-from coax_env.heli_model import HeliModel, record_of, starting_noise
+from coax_env.heli_model import HeliModel, record_of, sensor_std, starting_noise
 from coax_env.layout import CHANNELS
 from coax_env.prediction import RunReplay, fly_again, gusts_of
 from coax_env.search import TIE, Quadratic, Search, State
@@ -88,9 +88,10 @@ def diagnose(
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
     remarks = list(flight.notes) + double_counting(flight, vehicle)
     model = HeliModel(vehicle)
-    candidates = _candidates(exclude, vehicle)
+    candidates = _candidates(exclude, vehicle, flight)
     noise = starting_noise(flight, vehicle)
     records = [record_of(run) for run in flight.runs]
+    sensors = {c: sensor_std(flight, c) for c in flight.channels}
     say("choosing the runs to hold out")
     fit, held = _split(model, records, noise, hold_out, candidates)
 
@@ -110,7 +111,7 @@ def diagnose(
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
     white_after = whiteness(passes_after, CHANNELS)
-    unexplained = _unexplained(white_after)
+    unexplained = _unexplained(white_after, passes_after)
 
     replays: list[list[RunReplay]] = [[], [], []]
     gain = None
@@ -121,7 +122,7 @@ def diagnose(
             fly_again(engine_held, s.values, s.noise, HORIZON, floor=s is state)
             for s in (bare, refitted, state)
         ]
-        gain = gain_of(*replays, state.noise, HORIZON)
+        gain = gain_of(replays[0], replays[1], replays[2], sensors, HORIZON)
         gain["held_out"] = [r.name for r in held]
     say("refitting the extended model on everything")
     vehicle_after = _extended(model, records, search, state, flight, vehicle)
@@ -148,19 +149,23 @@ def diagnose(
         whiteness={"before": white_before, "after": white_after},
         evidence_history=search.history,
         remarks=tuple(remarks + _unusual(search, state)),
-        noise=dict(state.noise.reading),
+        noise=sensors,
     )
 
 
 # --- what to fit on ---------------------------------------------------------------------------------
 
 
-def _candidates(exclude: Collection[str], vehicle: Vehicle) -> tuple[str, ...]:
+def _candidates(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:
+    """Effects that may be named: not excluded, not in the vehicle yet, and with their sensor aboard."""
     for name in exclude:
         if name not in effects.CATALOGUE:
             known = ", ".join(effects.CATALOGUE)
             raise InputError(f"no effect {name!r} to exclude; the catalogue has {known}")
-    return tuple(e for e in effects.CATALOGUE if e not in exclude and e not in vehicle.effects)
+    absent = set(exclude) | set(vehicle.effects)
+    if "pn" in flight.channels:  # height then comes with the position, not from a sonar
+        absent |= {"sonar_tilt", "sonar_scale", "sonar_delay"}
+    return tuple(e for e in effects.CATALOGUE if e not in absent)
 
 
 def double_counting(flight: Flight, vehicle: Vehicle) -> list[str]:
@@ -225,7 +230,8 @@ def _fair_share(
 
     def unfairness(chosen: tuple[int, ...]) -> float:
         held = share[list(chosen)].sum(0)
-        return float(np.sum((held - 0.25) ** 2) + 10.0 * np.sum(np.maximum(held - 0.7, 0.0)))
+        lost, unseen = np.maximum(held - 0.7, 0.0), np.maximum(0.1 - held, 0.0)
+        return float(np.sum((held - 0.25) ** 2) + 10.0 * np.sum(lost + unseen))
 
     return min(combinations(range(len(records)), count), key=unfairness)
 
@@ -341,16 +347,19 @@ def _unusual(search: Search, state: State) -> list[str]:
 # --- what is left, what to do next --------------------------------------------------------------------
 
 
-def _unexplained(white: Mapping[str, Whiteness]) -> list[dict[str, Any]]:
-    return [
+def _unexplained(white: Mapping[str, Whiteness], passes: Sequence[RunPass]) -> list[dict[str, Any]]:
+    """What is left: axes with the states they follow, then channels that are just not white."""
+    coloured = [channel for channel, w in white.items() if not w.white]
+    described = unlisted.describe(passes, coloured)
+    rest = [c for c in coloured if c not in unlisted.speaks_for(described)]
+    return described + [
         {
-            "channel": channel,
+            "channel": c,
             "depends_on": [],
-            "share": round(w.coloured_share, 3),
+            "share": round(white[c].coloured_share, 3),
             "form": "not found",
         }
-        for channel, w in white.items()
-        if not w.white
+        for c in rest
     ]
 
 

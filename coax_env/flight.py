@@ -31,6 +31,10 @@ SHORTEST_RUN = 2.0
 GAP = 0.1
 """Time without a row, or without any reading, that counts as a gap [s]."""
 
+STALL = 2.2
+"""A step this many times the usual one is a gap, and one that many times shorter is catching up."""
+CATCH_UP_ROWS = 12
+
 AIR = ("density", "gravity")
 _MEASURED_ROTOR = ("rpm_upper", "rpm_lower")
 
@@ -360,6 +364,10 @@ def _make_run(
             values = np.where(outlier, np.nan, values)
             counts[f"outliers in {channel} removed"] += int(np.count_nonzero(outlier))
         measured[channel] = values
+    stalled = beside_stalls(t)
+    if stalled.any():
+        counts["rows beside a stalled clock, readings left out"] += int(np.count_nonzero(stalled))
+        measured = {c: np.where(stalled, np.nan, values) for c, values in measured.items()}
     command = _commands(log, measured, counts)
     _count_gaps(t, measured, counts)
     return Run(entry["name"], t, command, measured, entry["maneuver"], entry["note"])
@@ -402,6 +410,23 @@ def _count_gaps(t: np.ndarray, measured: Mapping[str, np.ndarray], counts: Count
     silent = int(np.count_nonzero(np.diff(t[read]) > GAP)) - rows
     if silent > 0:
         counts[f"gaps of more than {GAP:g} s without any reading"] += silent
+
+
+def beside_stalls(t: np.ndarray) -> np.ndarray:
+    """Rows (n,) whose time stamp cannot be trusted: the logger stalled and then caught up.
+
+    A stall is a gap followed by rows that come too fast: they were taken while the clock stood, so
+    that their stamps are late by up to the gap. An even gap (lost rows) is none.
+    """
+    dt = np.diff(t)
+    usual = float(np.median(dt))
+    mask = np.zeros(t.size, bool)
+    for gap in np.flatnonzero(dt > STALL * usual):
+        after = dt[gap + 1 : gap + 1 + CATCH_UP_ROWS]
+        if np.count_nonzero(after < usual / STALL) >= 1:
+            late = (t > t[gap] - 2.0 * usual) & (t < t[gap + 1] + dt[gap] + 2.0 * usual)
+            mask |= late
+    return mask
 
 
 def hold_last(values: np.ndarray) -> np.ndarray:

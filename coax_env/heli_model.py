@@ -21,6 +21,9 @@ from coax_env.layout import (
 )
 from coax_env.vehicle import Vehicle
 
+FARTHEST = 5.0
+"""Usual sizes that an effect may have at most."""
+
 GUST_LEVELS = ("force_xy", "force_z", "moment_xy", "moment_z")
 """Std of the gust states [N, N m]; x and y share one level."""
 
@@ -31,12 +34,16 @@ HELD = (
 )  # fmt: skip
 """Base parameters that are never fitted: exact, or one column with others that are."""
 
-DEFAULT_READING_STD = {
-    "rpm_upper": 2.0, "rpm_lower": 2.0, "p": 0.035, "q": 0.035, "r": 0.035,
-    "ax": 0.1, "ay": 0.1, "az": 0.1, "phi": 0.0087, "theta": 0.0087, "psi": 0.0087,
-    "h": 0.05, "vn": 0.2, "ve": 0.2, "vd": 0.2, "pn": 0.02, "pe": 0.02, "v": 0.5,
+LEAST_READING_STD = {
+    "rpm_upper": 1.0, "rpm_lower": 1.0, "p": 0.01, "q": 0.01, "r": 0.01,
+    "ax": 0.05, "ay": 0.05, "az": 0.05, "phi": 0.006, "theta": 0.006, "psi": 0.008,
+    "h": 0.005, "vn": 0.02, "ve": 0.02, "vd": 0.02, "pn": 0.004, "pe": 0.004, "v": 0.02,
 }  # fmt: skip
-"""Where neither the card nor the data say: Table V and the sensor classes of contract.md."""
+"""Where the card states no noise, readings are not believed more than this.
+
+A motion capture is far finer than any rigid-body model (vibration, jitter of the time stamps): with
+its true noise the likelihood would be spent on what no parameter can mend.
+"""
 
 
 class HeliModel:
@@ -112,7 +119,7 @@ class HeliModel:
         q[3:6] = 1e-3**2
         q[6:10] = 1e-4**2
         q[10:16] = 1e-5**2
-        q[16:18] = 1.0**2
+        q[16:18] = 0.1**2
         q[18:20] = 1e-4**2
         q[20:26] = 2.0 * _gust_levels(noise) ** 2 / noise.process["memory"]
         return q
@@ -129,10 +136,20 @@ class HeliModel:
 
     @staticmethod
     def effect_parameters(effect: str) -> list[FreeParameter]:
-        """An effect's parameters; the prior is centred on its off-value."""
+        """An effect's parameters; the prior is centred on its off-value.
+
+        Nothing is taken to be more than FARTHEST usual sizes: beyond that it is another effect.
+        """
         entry = effects.CATALOGUE[effect]
         return [
-            FreeParameter(full, p.off, p.usual, p.lower, p.upper, p.probe)
+            FreeParameter(
+                full,
+                p.off,
+                p.usual,
+                max(p.lower, p.off - FARTHEST * p.usual),
+                min(p.upper, p.off + FARTHEST * p.usual),
+                p.probe,
+            )
             for full, p in zip(entry.names(), entry.parameters, strict=True)
         ]
 
@@ -189,16 +206,20 @@ def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
         "moment_xy": 3e-4 * weight * arm,
         "moment_z": 1e-4 * weight * arm,
     }
-    reading = {c: flight.noise.get(c) or _white_std(flight, c) for c in flight.channels}
+    reading = {
+        c: flight.noise.get(c) or max(2.0 * sensor_std(flight, c), LEAST_READING_STD[c])
+        for c in flight.channels
+    }
     return Noise(process, reading, floor)
 
 
-def _white_std(flight: Flight, channel: str) -> float:
-    """Std to start from where the card has none: twice the scatter from sample to sample.
+def sensor_std(flight: Flight, channel: str) -> float:
+    """Std of a sensor: the card's, else from its scatter from sample to sample.
 
-    Third differences, robustly. A motion capture reads finer than any model flies (vibration, jitter
-    of the time stamps), so that it is at least a fortieth of an ordinary sensor's.
+    Third differences, robustly: white noise stays, motion cancels.
     """
+    if channel in flight.noise:
+        return flight.noise[channel]
     parts = []
     for run in flight.runs:
         if channel in run.measured:
@@ -208,6 +229,5 @@ def _white_std(flight: Flight, channel: str) -> float:
             if values.size > 8:
                 parts.append(np.diff(values, 3))
     if not parts:
-        return DEFAULT_READING_STD[channel]
-    scatter = float(np.median(np.abs(np.concatenate(parts)))) / 0.6745 / np.sqrt(20.0)
-    return max(2.0 * scatter, 0.025 * DEFAULT_READING_STD[channel])
+        return LEAST_READING_STD[channel]
+    return float(np.median(np.abs(np.concatenate(parts)))) / 0.6745 / float(np.sqrt(20.0))

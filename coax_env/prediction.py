@@ -17,7 +17,7 @@ from coax_env.engine import kalman
 from coax_env.engine.fit import Engine, Progress
 from coax_env.engine.model import Noise
 from coax_env.flight import Flight, read_flight
-from coax_env.heli_model import GUST_LEVELS, HeliModel, record_of, starting_noise
+from coax_env.heli_model import GUST_LEVELS, HeliModel, record_of, sensor_std, starting_noise
 from coax_env.layout import CHANNEL_UNITS, CHANNELS, N_FULL
 from coax_env.vehicle import Vehicle, load_vehicle
 
@@ -106,7 +106,9 @@ def fly_again(
             RunReplay(
                 record.name,
                 {
-                    CHANNELS[i]: _channel(CHANNELS[i], *(a[:, i] for a in (t, measured, predicted, decaying)))
+                    CHANNELS[i]: _channel(
+                        CHANNELS[i], *(a[:, i] for a in (t, measured, predicted, decaying))
+                    )
                     for i in used
                 },
                 diverged,
@@ -225,11 +227,12 @@ def replay(
     if progress:
         progress("flying again")
     runs = fly_again(engine, model.bare_values, noise, horizon)
+    sensors = {c: sensor_std(flight, c) for c in flight.channels}
     findings = {
         "horizon_s": horizon,
         "vehicle": vehicle.name,
         "gusts": gusts_of(noise),
-        "runs": {run.name: run_table(run, noise) for run in runs},
+        "runs": {run.name: run_table(run, sensors) for run in runs},
     }
     return Replay(findings, runs, noise, flight, vehicle, horizon)
 
@@ -244,8 +247,8 @@ def gusts_of(noise: Noise) -> dict[str, Any]:
     }
 
 
-def run_table(run: RunReplay, noise: Noise) -> dict[str, Any]:
-    """One run of replay.json."""
+def run_table(run: RunReplay, noise: Mapping[str, float]) -> dict[str, Any]:
+    """One run of replay.json; `noise` is the sensors' std by channel."""
     table: dict[str, Any] = {}
     for name, channel in run.channels.items():
         good = np.isfinite(channel.error)
@@ -253,7 +256,7 @@ def run_table(run: RunReplay, noise: Noise) -> dict[str, Any]:
         entry: dict[str, Any] = {
             "rms": None if lost else rms(channel.error),
             "rms_gusts_decaying": None if lost else rms(channel.error_decaying),
-            "noise_rms": noise.reading[name],
+            "noise_rms": noise[name],
             "unit": CHANNEL_UNITS[name],
         }
         if run.diverged:

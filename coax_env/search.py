@@ -15,6 +15,7 @@ base parameter goes back to its file value. It counts when it moved by more than
 parameter's prior std (contract.md) and the move is worth EVIDENCE against the file value.
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -122,8 +123,13 @@ class Quadratic:
             weights = np.linalg.solve(A, self.G[np.ix_(f, c)])
             schur = schur - self.G[np.ix_(c, f)] @ weights
             scores = scores - self.stretches[:, f] @ weights
-        scatter = scores.T @ scores
-        value = np.trace(np.linalg.lstsq(schur, scatter, rcond=None)[0]) / c.size
+        per_stretch = np.einsum(
+            "sc,sc->s", scores, np.linalg.lstsq(schur, scores.T, rcond=None)[0].T
+        )
+        kept = np.sort(per_stretch)[
+            : math.ceil(0.9 * per_stretch.size)
+        ]  # a bad second is no colour
+        value = kept.mean() * per_stretch.size / c.size
         return max(1.0, float(value)) if np.isfinite(value) else 1.0
 
     def occam(self, added: Collection[str], free: Collection[str]) -> float:
@@ -294,15 +300,21 @@ class Search:
                 return False
         return max(sizes) >= 1.0
 
-    def loss_without(self, quadratic: Quadratic, active: list[str], effect: str) -> float:
-        """Nats lost when an effect leaves and the rest refits, less colour and Occam factor."""
+    def loss_without(
+        self, quadratic: Quadratic, active: list[str], effect: str, coloured: bool
+    ) -> float:
+        """Nats lost when an effect leaves and the rest refits, Occam factor returned.
+
+        `coloured`: divided by the colour of the innovations in this effect's direction.
+        """
         free = self.free_names(active)
         now, _ = quadratic.best(free)
         rest = [n for n in free if not n.startswith(effect + ".")]
         pinned = self.off(effect) | self.pinned(effect)
         then, _ = quadratic.best(rest, pinned)
         own = self.candidate_names(effect)
-        return (then - now) / quadratic.colour(own, free) - quadratic.occam(own, rest)
+        colour = quadratic.colour(own, free) if coloured else 1.0
+        return (then - now) / colour - quadratic.occam(own, rest)
 
     def swap(
         self, quadratic: Quadratic, active: list[str], old: str, new: str
@@ -326,6 +338,7 @@ class Search:
         drops: Counter[str] = Counter()
         tried: set[tuple[str, ...]] = set()
         moves = failures = most = 0
+        complete = False
         state = self.refit_noise(self.settle(state))
         for _ in range(4 * MOST_CAUSES):
             passes, quadratic = self.linearise(state)
@@ -335,30 +348,45 @@ class Search:
                 if self.advance(state, passes, quadratic, {}) > PROMISE:
                     continue
             moves = 0
-            dropped = self._drop(state, quadratic)
+            dropped = self._drop(state, quadratic, coloured=complete)
             if dropped:
                 drops[dropped] += 1
                 banned.add(dropped)
                 failures += 1
-            elif failures < MOST_FAILURES and self._add(state, passes, quadratic, banned):
+            elif (
+                not complete
+                and failures < MOST_FAILURES
+                and self._add(state, passes, quadratic, banned)
+            ):
                 if len(state.active) > most + 1:  # the one before held
                     most, failures = len(state.active) - 1, 0
                     banned = {e for e, count in drops.items() if count > 1}
-            elif not self._swap(state, quadratic, tried):
+            elif not complete and self._swap(state, quadratic, tried):
+                pass
+            elif complete:
                 break
+            else:  # nothing more to add: what is in must also stand against coloured residuals
+                complete = True
+                continue
             state = self.refit_noise(self.settle(state))
         return state, quadratic
 
-    def _drop(self, state: State, quadratic: Quadratic) -> str | None:
-        for effect in state.active:
-            loss = self.loss_without(quadratic, state.active, effect)
-            if loss < EVIDENCE or not self.is_large(effect, state.values):
-                self.history.append((f"- {effect}", loss))
-                self.say(f"dropped {effect}: worth {loss:.1f} nats")
-                state.active = [e for e in state.active if e != effect]
-                state.values |= self.off(effect)
-                return effect
-        return None
+    def _drop(self, state: State, quadratic: Quadratic, coloured: bool) -> str | None:
+        """Take out the effect that is worth least, if that is too little or it is too small."""
+        worth = {
+            effect: self.loss_without(quadratic, state.active, effect, coloured)
+            if self.is_large(effect, state.values)
+            else -np.inf
+            for effect in state.active
+        }
+        if not worth or min(worth.values()) >= EVIDENCE:
+            return None
+        effect = min(worth, key=lambda e: worth[e])
+        self.history.append((f"- {effect}", max(worth[effect], 0.0)))
+        self.say(f"dropped {effect}: worth {worth[effect]:.1f} nats")
+        state.active = [e for e in state.active if e != effect]
+        state.values |= self.off(effect)
+        return effect
 
     def _swap(self, state: State, quadratic: Quadratic, tried: set[tuple[str, ...]]) -> bool:
         """Put another effect in the place of one that is in, where that fits better."""

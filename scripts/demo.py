@@ -36,12 +36,16 @@ def main() -> None:
     truth = json.loads((BUNDLED / "truth.json").read_text())
     print(f"   hidden in it, for comparison: {', '.join(truth['hidden'])}\n")
 
-    print("2. A hover controller designed on the bare and on the mended model (LQG, python-control),")
+    print(
+        "2. A hover controller designed on the bare and on the mended model (LQG, python-control),"
+    )
     print("   both flown in CoaxHeli-v0 on the machine as it truly is, 20 episodes of 20 s:")
     fly(result, true_vehicle(truth), options.out)
 
     if REAL.is_dir() and not options.no_real:
-        print("\n3. Real flights of a Skybotix CoaX (M. Faessler, GRASP Lab, 2011): fitted on hover and")
+        print(
+            "\n3. Real flights of a Skybotix CoaX (M. Faessler, GRASP Lab, 2011): fitted on hover and"
+        )
         print("   vertical_sine, predicted on circles, which the fit has not seen.")
         run("real", REAL, ["circles"], options.out / "real")
     print(f"\n{monotonic() - start:.0f} s in all. Open {options.out / 'report.html'} in a browser.")

@@ -162,18 +162,24 @@ class Engine:
             self._frozen(i, run, noise, base, e)
             J = np.zeros((len(free), n, m))
             for k, (p, size) in enumerate(zip(moved, steps, strict=True)):
-                if self._frozen(i, run, noise, p, J[k]):
-                    J[k] -= e
+                flew = self._frozen(i, run, noise, p, J[k])
+                J[k] -= e
+                if flew and np.abs(J[k]).max() < HUGE:
                     J[k] /= size
                 else:
                     J[k] = 0.0
             by_channel = np.einsum("knm,knm->km", J, J)
-            slope_by_channel = np.einsum("knm,nm->km", J, e)
+            slopes = np.einsum("knm,nm->nk", J, e)
+            t = run.record.t
+            edges = np.searchsorted(t, np.arange(t[0], t[-1], STRETCH))
             flat = J.reshape(len(free), -1)
-            return flat @ flat.T, flat @ e.ravel(), by_channel, slope_by_channel
+            return flat @ flat.T, slopes.sum(0), by_channel, np.add.reduceat(slopes, edges)
 
         parts = list(zip(*self._each(one), strict=True))
-        return passes, Linearised(tuple(f.name for f in free), *(np.array(part) for part in parts))
+        information, slope, by_channel = (np.array(part) for part in parts[:3])
+        return passes, Linearised(
+            tuple(f.name for f in free), information, slope, by_channel, np.concatenate(parts[3])
+        )
 
     def descend(
         self,

@@ -44,8 +44,8 @@ class Noise:
     """Spread of what the model does not say.
 
     process: named levels of the model's process noise (for the helicopter: gust force [N] and moment
-    [N m]). reading: std of each channel, in its unit. floor: the least that a process level can be, since
-    no model is exact.
+    [N m]). reading: std of each channel, in its unit. floor: the least that a process level can be,
+    since no model is exact.
     """
 
     process: Mapping[str, float]

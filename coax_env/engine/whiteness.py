@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_toeplitz
 from scipy.stats import chi2
 
 from coax_env.engine.fit import RunPass
@@ -54,9 +55,10 @@ def _judge(parts: Sequence[tuple[str, np.ndarray]]) -> Whiteness:
     worst = None
     for name, e in parts:
         n = e.size
-        rho = np.array([np.mean(e[k:] * e[:-k]) for k in range(1, LAGS + 1)]) / np.mean(e**2)
+        rho = np.array([np.sum(e[k:] * e[:-k]) for k in range(1, LAGS + 1)]) / np.sum(e**2)
         q = n * (n + 2) * np.sum(rho**2 / (n - np.arange(1, LAGS + 1)))
-        share = max(0.0, float(np.sum(rho**2)) - LAGS / n)
+        predictor = solve_toeplitz(np.append(1.0, rho[:-1]), rho)  # Yule-Walker
+        share = float(np.clip(predictor @ rho - LAGS / n, 0.0, 1.0))
         p = float(chi2.sf(q, LAGS)) * len(parts)
         spread = float(e.std())
         white = not ((p < P_VALUE and share * min(spread, 1.0) ** 2 > SHARE) or spread > SPREAD)
