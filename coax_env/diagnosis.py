@@ -11,6 +11,7 @@ Everything that is said about causes and gain comes from the fit runs and the he
 vehicle file is refitted on all runs at the end, its structure unchanged.
 """
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -26,7 +27,7 @@ from coax_env.engine.whiteness import Whiteness, whiteness
 from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight
 from coax_env.gain import gain_of
-from coax_env.heli_model import HeliModel, record_of, sensor_std, starting_noise
+from coax_env.heli_model import FARTHEST, HeliModel, record_of, sensor_std, starting_noise
 from coax_env.layout import CHANNELS
 from coax_env.prediction import RunReplay, fly_again, gusts_of
 from coax_env.search import TIE, Quadratic, Search, State
@@ -107,10 +108,10 @@ def diagnose(
         State([], dict(refitted.values), refitted.noise, refitted.objective)
     )
     say("weighing the causes against their look-alikes")
-    causes = _causes(search, state, quadratic)
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
     white_after = whiteness(passes_after, CHANNELS)
+    causes = _causes(search, state, quadratic, white_after)
     unexplained = _unexplained(white_after, passes_after)
 
     replays: list[list[RunReplay]] = [[], [], []]
@@ -125,7 +126,8 @@ def diagnose(
         gain = gain_of(replays[0], replays[1], replays[2], sensors, HORIZON)
         gain["held_out"] = [r.name for r in held]
     say("refitting the extended model on everything")
-    vehicle_after = _extended(model, records, search, state, flight, vehicle)
+    colours = {e: search.colour(quadratic, state.active, e) for e in state.active}
+    vehicle_after = _extended(model, records, search, state, flight, vehicle, colours)
     ties = [(c["effect"], other) for c in causes for other in c["confusable_with"]]
     findings = {
         "verdict": _verdict(bool(causes), bool(unexplained)),
@@ -239,7 +241,9 @@ def _fair_share(
 # --- causes -----------------------------------------------------------------------------------------
 
 
-def _causes(search: Search, state: State, quadratic: Quadratic) -> list[dict[str, Any]]:
+def _causes(
+    search: Search, state: State, quadratic: Quadratic, white: Mapping[str, Whiteness]
+) -> list[dict[str, Any]]:
     std = standard_deviations(search, state, quadratic)
     dt = median_step(search.engine.records)
     causes = []
@@ -251,20 +255,28 @@ def _causes(search: Search, state: State, quadratic: Quadratic) -> list[dict[str
         )
         without = search.refit_noise(without)
         search.settle(without, steps=2, without=entry.replaces)
+        colour = search.colour(quadratic, state.active, effect)
+        channels = _channels(search, state, effect)
         causes.append(
             {
                 "effect": effect,
                 "parameters": {
                     f.name: {
                         "value": float(state.values[f.name]),
-                        "std": with_timing(f, std[f.name], dt),
+                        "std": with_timing(f, std[f.name] * math.sqrt(colour), dt),
                         "unit": p.unit,
                     }
                     for f, p in zip(search.by_effect[effect], entry.parameters, strict=True)
                 },
-                "evidence": float(without.objective - state.objective),
-                "confusable_with": _look_alikes(search, state, quadratic, effect),
-                "channels": _channels(search, state, effect),
+                "evidence": float(without.objective - state.objective) / colour,
+                "confusable_with": _look_alikes(
+                    search,
+                    state,
+                    quadratic,
+                    effect,
+                    max([colour, *(white[c].inflation for c in channels)]),
+                ),
+                "channels": channels,
             }
         )
     return sorted(causes, key=lambda c: -c["evidence"])
@@ -295,20 +307,26 @@ def with_timing(parameter: FreeParameter, std: float, dt: float) -> float:
     return float(std)
 
 
-def _look_alikes(search: Search, state: State, quadratic: Quadratic, effect: str) -> list[str]:
-    """Effects that would do as well in this one's place, by refitted likelihood."""
+def _look_alikes(
+    search: Search, state: State, quadratic: Quadratic, effect: str, colour: float
+) -> list[str]:
+    """Effects that would do as well in this one's place, by refitted likelihood.
+
+    Coloured innovations carry less than they seem to: the tie widens by the colour.
+    """
+    tie = TIE * colour
     near = []
     for other in search.candidates:
         if other not in state.active:
             change, move = search.swap(quadratic, state.active, effect, other)
-            if change < 5.0 * TIE:
+            if change < 3.0 * tie:
                 near.append((change, other, move))
     result = []
-    for _, other, move in sorted(near, key=lambda n: n[0])[:4]:
+    for _, other, move in sorted(near, key=lambda n: n[0])[:3]:
         values = dict(zip(quadratic.names, (quadratic.at + move).tolist(), strict=True))
         active = [other if e == effect else e for e in state.active]
-        trial = search.settle(State(active, state.values | values, state.noise), steps=3)
-        if trial.objective - state.objective < TIE:
+        trial = search.settle(State(active, state.values | values, state.noise), steps=2)
+        if trial.objective - state.objective < tie:
             result.append(other)
     return result
 
@@ -328,7 +346,13 @@ def _unusual(search: Search, state: State) -> list[str]:
     remarks = []
     for effect in state.active:
         for f in search.by_effect[effect]:
-            if abs(state.values[f.name] - f.value) > 2.5 * f.std:
+            size = abs(state.values[f.name] - f.value)
+            if size > 0.99 * FARTHEST * f.std:
+                remarks.append(
+                    f"{f.name} stands at the limit of what is believed, {state.values[f.name]:.3g}:"
+                    " something else hides behind this name"
+                )
+            elif size > 2.5 * f.std:
                 remarks.append(
                     f"{f.name} = {state.values[f.name]:.3g} is outside its usual range"
                     f" ({f.value:g} +- {f.std:g}): take the name with care"
@@ -387,6 +411,7 @@ def _extended(
     state: State,
     flight: Flight,
     vehicle: Vehicle,
+    colours: Mapping[str, float],
 ) -> Vehicle:
     """The vehicle with the causes in it, refitted on all runs."""
     engine = Engine(model, records)
@@ -398,7 +423,12 @@ def _extended(
         vehicle,
         free,
         estimate.values,
-        {f.name: with_timing(f, estimate.std[f.name], dt) for f in free},
+        {
+            f.name: with_timing(
+                f, estimate.std[f.name] * math.sqrt(colours.get(f.name.partition(".")[0], 1.0)), dt
+            )
+            for f in free
+        },
         estimate.covariance,
         f"diagnosed from {where}",
         flight,

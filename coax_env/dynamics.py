@@ -31,7 +31,7 @@ from coax_env.vehicle import Vehicle, load_vehicle
 
 READING_DELAY = 1e-4  # [s] after the command of the same row
 LONGEST_STEP = 0.02  # [s] a longer row is split
-SHORTEST_LAG = 1e-9  # [s] stands for none: exp(-READING_DELAY/SHORTEST_LAG) is zero
+SHORTEST_LAG = 1e-9  # [s] below it exp(-READING_DELAY/lag) is zero: the command itself
 
 _air_effects = effects.stage_function(effects.AIR)
 _swash_effects = effects.stage_function(effects.SWASH)
@@ -74,8 +74,10 @@ def _properties(x, u, p, f):
 
 @compiled()
 def _follow(start, command, time, lag):
-    """Exact first-order response to a held command."""
-    return command + (start - command) * math.exp(-time / max(lag, SHORTEST_LAG))
+    """Exact first-order response to a held command; without a lag it is its own limit."""
+    if lag <= SHORTEST_LAG:
+        return command
+    return command + (start - command) * math.exp(-time / lag)
 
 
 @compiled()

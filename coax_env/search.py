@@ -313,8 +313,12 @@ class Search:
         pinned = self.off(effect) | self.pinned(effect)
         then, _ = quadratic.best(rest, pinned)
         own = self.candidate_names(effect)
-        colour = quadratic.colour(own, free) if coloured else 1.0
+        colour = self.colour(quadratic, active, effect) if coloured else 1.0
         return (then - now) / colour - quadratic.occam(own, rest)
+
+    def colour(self, quadratic: Quadratic, active: Collection[str], effect: str) -> float:
+        """Colour of the innovations in an active effect's direction, at least 1."""
+        return quadratic.colour(self.candidate_names(effect), self.free_names(active))
 
     def swap(
         self, quadratic: Quadratic, active: list[str], old: str, new: str

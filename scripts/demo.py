@@ -21,7 +21,7 @@ from controllers import lqr
 from controllers.evaluation import evaluate
 
 ROOT = Path(__file__).resolve().parent.parent
-BUNDLED = ROOT / "coax_env" / "flights" / "rigging"
+BUNDLED = ROOT / "coax_env" / "flights" / "windy"
 REAL = ROOT.parent / "shared" / "flights" / "skybotix_coax"
 
 
@@ -83,11 +83,13 @@ def indented(text: str) -> str:
 def true_vehicle(truth: dict) -> Vehicle:
     """The bundled flight's machine, from its truth.json."""
     values = truth["values"]
+    p, q, r = values["gyro_bias"]
     return (
         load_vehicle("lama400d")
-        .with_effect("swash_offset", lon=values["off_lon"])
-        .with_effect("swash_phase", angle=values["phase"])
-        .with_effect("servo_lag", time=values["servo_tau"])
+        .with_effect("motor_lag", upper=values["motor_tau"], lower=values["motor_tau"])
+        .with_effect("rotor_drag", coefficient=values["kdrag"])
+        .with_effect("wind", north=values["wn"], east=values["we"])
+        .with_effect("gyro_bias", x=p, y=q, z=r)
     )
 
 

@@ -34,6 +34,11 @@ class Whiteness:
     run: str
     white: bool
 
+    @property
+    def inflation(self) -> float:
+        """How many coloured innovations carry what one white one does, at most 20."""
+        return 1.0 / max(1.0 - self.coloured_share, 0.05)
+
 
 def whiteness(passes: Sequence[RunPass], channels: Sequence[str]) -> dict[str, Whiteness]:
     """Whiteness by channel, for channels with readings."""

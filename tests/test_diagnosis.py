@@ -1,0 +1,422 @@
+"""Hidden-effect tests: an independent simulator hides something in a flight, the package finds it.
+
+`injector` shares no code and, where two forms are sensible, no formula with the package, which gets
+the folder and nothing else; truth.json is read by the test alone. Then the contract of what
+`diagnose`, `replay` and `identify` return.
+"""
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import injector
+import numpy as np
+import pytest
+from shared_flights import shared_flight
+
+import coax_env
+from coax_env import diagnose, effects, identify, load_vehicle, read_flight, replay
+from coax_env.diagnosis import Diagnosis
+from coax_env.errors import InputError
+from coax_env.files import write_text
+from coax_env.flight import Flight
+from coax_env.layout import CHANNELS
+from coax_env.maneuvers import MANEUVERS
+from coax_env.vehicle import vehicle_toml
+
+ON_AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
+LAMA = load_vehicle("lama400d")
+
+
+def all_but(*names: str) -> list[str]:
+    """What to exclude so that only a few effects are left to look for (and the test is short)."""
+    return [name for name in effects.CATALOGUE if name not in names]
+
+
+def say_what_was_found(findings: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        cause["effect"]: [cause["confusable_with"], cause["parameters"]]
+        for cause in findings["causes"]
+    }
+
+
+def check_causes(
+    findings: Mapping[str, Any],
+    hidden: Collection[str],
+    values: Mapping[str, float],
+    within: float = 3.0,
+) -> None:
+    """Every hidden effect is named, or its declared look-alike; nothing else; values agree."""
+    found = say_what_was_found(findings)
+    causes = {c["effect"]: c for c in findings["causes"]}
+    for effect in hidden:
+        assert any(
+            effect == name or effect in cause["confusable_with"] for name, cause in causes.items()
+        ), f"{effect} was hidden, found: {found}"
+    for name, cause in causes.items():
+        assert name in hidden or set(cause["confusable_with"]) & set(hidden), f"false: {found}"
+    assert len(causes) == len(hidden), found
+    for full, true in values.items():
+        cause = causes.get(full.partition(".")[0])
+        if cause is not None:
+            said = cause["parameters"][full]
+            assert abs(said["value"] - true) < within * said["std"], (full, true, said)
+    assert findings["verdict"] == ("explained" if hidden else "consistent"), (
+        findings["verdict"], findings["unexplained"],
+    )  # fmt: skip
+
+
+def truth_of(folder: Path) -> tuple[list[str], dict[str, float]]:
+    truth = json.loads((folder / "truth.json").read_text())
+    return truth["hidden"], truth["comparable"]
+
+
+def find(folder: Path, **options: Any) -> Diagnosis:
+    """Diagnose a copy of the folder's flight that does not know where its truth lies."""
+    (folder / "truth.json").rename(folder.parent / "truth.json")
+    try:
+        return diagnose(folder, **options)
+    finally:
+        (folder.parent / "truth.json").rename(folder / "truth.json")
+
+
+# --- hidden effects ------------------------------------------------------------------------------
+
+
+def test_a_hidden_effect_is_found_among_all(tmp_path):
+    """The short case of every test run: rigging, the whole catalogue to choose from."""
+    folder = injector.fly(tmp_path / "flight", {"swash_offset": {}}, runs=ON_AXES[:3], seed=1)
+    result = find(folder)
+    check_causes(result.findings, *truth_of(folder))
+    check_form(result)
+    check_vehicle_flies(result, tmp_path)
+
+
+HIDDEN: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "nothing": ({}, dict(runs=(*ON_AXES, "heading_turn"), seed=2)),
+    "nothing, in gusts": ({}, dict(runs=(*ON_AXES, "heading_turn"), gusts=True, seed=3)),
+    "nothing, thin sensors": ({}, dict(runs=(*ON_AXES, "hover"), sensors="onboard", seed=12)),
+    "ground": (
+        {"ground_effect": {}},
+        dict(runs=("low_hover", "climb_descend", "lon_3211", "heave_3211"), seed=4),
+    ),
+    "motors": ({"motor_lag": {}}, dict(runs=(*ON_AXES, "heading_turn"), seed=6)),
+    "swash, in gusts": (
+        {"swash_offset": {}}, dict(runs=(*ON_AXES, "heading_turn"), gusts=True, seed=7)
+    ),
+    "drag and gyro": (
+        {"rotor_drag": {}, "gyro_bias": {}},
+        dict(runs=("lon_3211", "lat_3211", "forward_run", "side_run", "heading_turn", "yaw_3211"),
+             seed=5),
+    ),
+    "servo and yaw": (
+        {"servo_lag": {}, "yaw_damping": {}}, dict(runs=(*ON_AXES, "heading_turn"), seed=8)
+    ),
+    "wind, thin sensors": (
+        {"wind": {}, "rotor_drag": {}},
+        dict(runs=("lon_3211", "lat_3211", "forward_run", "side_run", "heading_turn", "hover"),
+             sensors="onboard", lost_echoes=True, radio_gaps=True, seed=9),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", HIDDEN)
+def test_hidden_effects_are_found(tmp_path, case):
+    hidden, options = HIDDEN[case]
+    folder = injector.fly(tmp_path / "flight", hidden, **options)
+    check_causes(find(folder).findings, *truth_of(folder))
+
+
+@pytest.mark.slow
+def test_the_gain_is_measured_where_the_effect_shows(tmp_path):
+    """Drag hidden: on runs the fit has not seen most of what can be removed is removed."""
+    runs = ("lon_3211", "lat_3211", "forward_run", "side_run", "heading_turn")
+    folder = injector.fly(tmp_path / "flight", {"rotor_drag": 6e-4}, runs=runs, seed=11)
+    gain = find(folder, hold_out=["side_run"]).findings["gain"]
+    assert gain["held_out"] == ["side_run"]
+    assert gain["error_removed_percent"] > 40.0
+    assert gain["error_removed_percent"] > gain["refitted_base_percent"] + 10.0
+    low, high = gain["ci95"]
+    assert low <= gain["error_removed_percent"] <= high
+    worst = max(gain["channels"].values(), key=lambda c: c["before"] / c["noise"])
+    assert worst["after"] < 0.7 * worst["before"]
+
+
+LABELLED: dict[str, tuple[list[str], dict[str, float]]] = {
+    "open_none": ([], {}),
+    "open_rigging": (
+        ["swash_offset", "swash_phase", "servo_lag"],
+        {"swash_offset.lon": -0.015, "swash_offset.lat": 0.0, "swash_phase.angle": 0.1},
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.needs_shared_flights
+@pytest.mark.parametrize("name", LABELLED)
+def test_labelled_flights(name):
+    hidden, values = LABELLED[name]
+    check_causes(diagnose(shared_flight(name)).findings, hidden, values)
+
+
+# --- what is handed over -------------------------------------------------------------------------
+
+
+def check_form(result: Diagnosis) -> None:
+    """findings.json as contract.md has it."""
+    findings = result.findings
+    assert json.loads(json.dumps(findings, allow_nan=False)) == findings
+    assert set(findings) == {
+        "verdict", "causes", "gusts", "unexplained", "gain", "next_maneuver", "false_alarm_rate",
+    }  # fmt: skip
+    assert findings["verdict"] in ("consistent", "explained", "partly explained", "unexplained")
+    evidence = [cause["evidence"] for cause in findings["causes"]]
+    assert evidence == sorted(evidence, reverse=True)
+    for cause in findings["causes"]:
+        assert set(cause) >= {"effect", "parameters", "evidence", "confusable_with", "channels"}
+        entry = effects.CATALOGUE[cause["effect"]]
+        assert set(cause["parameters"]) == set(entry.names())
+        for full, parameter in zip(entry.names(), entry.parameters, strict=True):
+            said = cause["parameters"][full]
+            assert said["unit"] == parameter.unit
+            assert isinstance(said["value"], float) and said["std"] > 0.0
+        assert set(cause["confusable_with"]) <= set(effects.CATALOGUE) - {cause["effect"]}
+        assert cause["channels"] and set(cause["channels"]) <= set(CHANNELS)
+    gusts = findings["gusts"]
+    assert len(gusts["force_N"]) == len(gusts["moment_Nm"]) == 3 and gusts["memory_s"] > 0.0
+    for left in findings["unexplained"]:
+        assert set(left) >= {"channel", "depends_on", "share", "form"}
+        assert left["channel"] in CHANNELS
+    if findings["gain"] is not None:
+        check_gain(findings["gain"], result.flight)
+    following = findings["next_maneuver"]
+    if following is not None:
+        assert following["maneuver"] in {*MANEUVERS, *injector.MANEUVERS} and following["why"]
+        assert set(following["separates"]) <= set(effects.CATALOGUE)
+
+
+def check_gain(gain: Mapping[str, Any], flight: Flight) -> None:
+    assert gain["horizon_s"] == 1.0
+    assert {name.removesuffix(" (last third)") for name in gain["held_out"]} <= set(
+        flight.run_names
+    )
+    compared = set(flight.channels) - {"rpm_upper", "rpm_lower", "ax", "ay", "az"}
+    assert set(gain["channels"]) == compared
+    for entry in gain["channels"].values():
+        assert set(entry) >= {"before", "before_refitted", "after", "noise", "unit", "ci95"}
+        low, high = entry["ci95"]
+        assert 0.0 < low <= entry["after"] <= high
+    for key in ("error_removed_percent", "refitted_base_percent", "noise_floor_percent"):
+        assert isinstance(gain[key], float)
+    assert len(gain["ci95"]) == 2
+
+
+def check_vehicle_flies(result: Diagnosis, folder: Path) -> None:
+    """The extended vehicle, through its file, in the env."""
+    path = write_text(folder / "vehicle.toml", vehicle_toml(result.vehicle_after))
+    vehicle = load_vehicle(path)
+    assert set(vehicle.effects) == {c["effect"] for c in result.findings["causes"]}
+    for table in vehicle.effects.values():
+        for parameter in table.values():
+            assert parameter.std > 0.0 and parameter.source.startswith("diagnosed")
+    assert set(vehicle.provenance["flights"]) == set(result.flight.hashes.values())
+    fly_in_env(path)
+
+
+def fly_in_env(path: Path) -> None:
+    env = gymnasium.make("CoaxHeli-v0", vehicle=str(path))
+    env.reset(seed=0)
+    for _ in range(5):
+        observation, reward, *_ = env.step(np.zeros(4, np.float32))
+        assert np.isfinite(observation).all() and np.isfinite(reward)
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory) -> Flight:
+    """A short flight of the bare model."""
+    folder = tmp_path_factory.mktemp("still") / "flight"
+    return read_flight(injector.fly(folder, {}, runs=ON_AXES, seed=21))
+
+
+def only(flight: Flight, *names: str) -> Flight:
+    return replace(flight, runs=tuple(flight.run(name) for name in names))
+
+
+FEW = all_but("gyro_bias", "swash_offset", "rotor_drag")
+
+
+def test_a_short_still_flight(still):
+    """Two runs: the last third of each is held out; nothing is found in them."""
+    result = diagnose(only(still, "lon_3211", "lat_3211"), exclude=FEW)
+    check_form(result)
+    check_causes(result.findings, [], {})
+    assert len(result.findings["gain"]["held_out"]) == 2
+    assert set(result.innovations_after) == {"lon_3211", "lat_3211"}
+    last = max(t["t"][-1] for t in result.innovations_after.values())
+    assert 7.0 < last < 9.0, "the fit must not see the last third"
+
+
+def test_hold_out_none_fits_everything(still):
+    result = diagnose(only(still, "lon_3211", "lat_3211"), hold_out=[], exclude=FEW)
+    check_form(result)
+    assert result.findings["gain"] is None and not result.replay_after
+    assert result.innovations_after["lon_3211"]["t"][-1] > 11.0
+
+
+def test_hold_out_as_told(still):
+    result = diagnose(still, hold_out=["lat_3211", "yaw_3211"], exclude=FEW)
+    assert set(result.findings["gain"]["held_out"]) == {"lat_3211", "yaw_3211"}
+    assert set(result.innovations_after) == {"lon_3211", "heave_3211"}
+    assert {run.name for run in result.replay_after} == {"lat_3211", "yaw_3211"}
+
+
+@pytest.mark.parametrize("what", ["other noise", "sensors that lie"])
+def test_the_choice_of_the_hold_out_does_not_look_at_residuals(still, what):
+    """Scrambled readings, same commands: same runs held out."""
+    rng = np.random.default_rng(5)
+
+    def scrambled(channel: str, values: np.ndarray, lie: float) -> np.ndarray:
+        std = still.noise[channel]
+        if what == "other noise":
+            return values + std * rng.standard_normal(values.size)
+        return values + lie * std if channel in ("p", "q", "r", "ax", "ay", "az") else values
+
+    runs = tuple(
+        replace(
+            run,
+            measured={c: scrambled(c, v, lie) for c, v in run.measured.items()},
+        )
+        for run, lie in zip(still.runs, (0.0, 3.0, -3.0, 1.5), strict=True)
+    )
+    chosen = held_out(still)
+    assert len(chosen) == 1
+    assert held_out(replace(still, runs=runs)) == chosen
+
+
+def held_out(flight: Flight) -> list[str]:
+    """The runs that `diagnose` holds out by itself."""
+    return diagnose(flight, exclude=FEW).findings["gain"]["held_out"]
+
+
+def test_an_excluded_effect_is_not_named(tmp_path):
+    folder = injector.fly(tmp_path / "flight", {"gyro_bias": {}}, runs=["lon_3211"], seed=22)
+    flight = read_flight(folder)
+    named = diagnose(flight, hold_out=[], exclude=FEW).findings
+    assert [c["effect"] for c in named["causes"]] == ["gyro_bias"]
+    assert named["verdict"] == "explained"
+    forbidden = diagnose(flight, hold_out=[], exclude=[*FEW, "gyro_bias"]).findings
+    assert "gyro_bias" not in say_what_was_found(forbidden)
+    for cause in forbidden["causes"]:
+        assert "gyro_bias" not in cause["confusable_with"]
+
+
+def test_an_effect_that_the_vehicle_has_is_no_finding(tmp_path):
+    """The extended vehicle on the same flight: consistent, and a warning of double counting."""
+    folder = injector.fly(tmp_path / "flight", {"gyro_bias": {}}, runs=["lon_3211"], seed=22)
+    first = diagnose(folder, hold_out=[], exclude=FEW)
+    again = diagnose(folder, first.vehicle_after, hold_out=[], exclude=FEW)
+    check_causes(again.findings, [], {})
+    assert any("twice" in remark for remark in again.remarks)
+    assert not any("twice" in remark for remark in first.remarks)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (dict(exclude=["gremlins"]), "gremlins"),
+        (dict(hold_out=["loop"]), "loop"),
+        (dict(hold_out=list(ON_AXES)), "nothing is left"),
+        (dict(vehicle="lama500"), "lama500"),
+    ],
+)
+def test_bad_requests_are_refused_in_one_line(still, options, words):
+    with pytest.raises(InputError, match=words) as caught:
+        diagnose(still, **options)
+    assert "\n" not in str(caught.value)
+
+
+# --- replay ----------------------------------------------------------------------------------------
+
+
+def test_the_true_model_predicts_as_well_as_the_sensors_see(still):
+    result = replay(still)
+    assert set(result.findings["runs"]) == set(ON_AXES)
+    json.dumps(result.findings, allow_nan=False)
+    gathered: dict[str, list[float]] = {}
+    for table in result.findings["runs"].values():
+        assert set(table) == set(still.channels)
+        for channel, entry in table.items():
+            assert entry["noise_rms"] == still.noise[channel] and "diverged" not in entry
+            gathered.setdefault(channel, []).append(entry["rms"] / entry["noise_rms"])
+    for channel, ratios in gathered.items():
+        assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.35, (channel, ratios)
+
+
+def test_the_horizon_is_the_callers(still):
+    """A wrong model is worse the further it looks."""
+    wrong = LAMA.with_values({"thrust_coefficient_upper": 1.03 * 0.00718})
+    flight = only(still, "heave_3211")
+    rms = [
+        replay(flight, wrong, horizon).findings["runs"]["heave_3211"]["vd"]["rms"]
+        for horizon in (0.1, 1.0, 3.0)
+    ]
+    assert rms[2] > rms[0] + 0.3 and rms[2] > rms[1]
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"inertia_xx": 5e-6}, {"inertia_yy": 5e-6, "thrust_coefficient_upper": 0.1}]
+)
+def test_a_model_that_runs_away_says_so(still, wrong):
+    findings = replay(only(still, "lon_3211", "yaw_3211"), LAMA.with_values(wrong)).findings
+    json.dumps(findings, allow_nan=False)
+    entries = [e for table in findings["runs"].values() for e in table.values()]
+    assert any(e.get("diverged") for e in entries)
+    assert all((e["rms"] is None) == bool(e.get("diverged")) for e in entries)
+
+
+def test_a_very_wrong_model_does_not_crash(still):
+    wrong = LAMA.with_values({"thrust_coefficient_upper": 8.0 * 0.00718})
+    table = replay(only(still, "lon_3211"), wrong).findings["runs"]["lon_3211"]
+    assert table["vd"]["rms"] is None or table["vd"]["rms"] > 5.0
+
+
+# --- identification --------------------------------------------------------------------------------
+
+
+def test_moved_parameters_return(still, tmp_path):
+    names = ["thrust_coefficient_upper", "torque_coefficient_lower", "swash_to_flap"]
+    moved = LAMA.with_values({name: 1.03 * LAMA[name].value for name in names})
+    result = identify(still, moved)
+    for name in names:
+        true, before, after = (v[name] for v in (LAMA, moved, result.after))
+        assert abs(after.value - true.value) < 3.0 * after.std, name
+        assert abs(after.value - true.value) < 0.8 * abs(before.value - true.value), name
+        assert after.std < before.std
+    held = [n for n in LAMA.parameters if n not in result.fitted]
+    assert {n: result.after[n].value for n in held} == {n: moved[n].value for n in held}
+    path = write_text(tmp_path / "vehicle.toml", vehicle_toml(result.after))
+    assert set(load_vehicle(path).provenance["flights"]) == set(still.hashes.values())
+    fly_in_env(path)
+
+
+def test_identification_knows_when_it_counts_twice(still):
+    flight = only(still, "lon_3211")
+    first = identify(flight)
+    again = identify(flight, first.after)
+    assert not any("twice" in remark for remark in first.remarks)
+    assert any("twice" in remark for remark in again.remarks)
+
+
+def test_methods_that_are_not_there():
+    with pytest.raises(InputError, match="guess"):
+        identify("nowhere", method="guess")
+
+
+def test_the_python_names_of_the_contract():
+    for name in ("read_flight", "simulate", "replay", "identify", "diagnose", "load_vehicle"):
+        assert callable(getattr(coax_env, name))
