@@ -315,11 +315,15 @@ def _look_alikes(
     Coloured innovations carry less than they seem to: the tie widens by the colour.
     """
     tie = TIE * colour
+    now, _ = quadratic.best(search.free_names(state.active))
+    rest = [e for e in state.active if e != effect]
+    nothing, _ = quadratic.best(search.free_names(rest), search.off(effect))
     near = []
     for other in search.candidates:
         if other not in state.active:
             change, move = search.swap(quadratic, state.active, effect, other)
-            if change < 3.0 * tie:
+            does_something = nothing - now - change > 0.5 * (nothing - now)
+            if change < 3.0 * tie and does_something:
                 near.append((change, other, move))
     result = []
     for _, other, move in sorted(near, key=lambda n: n[0])[:3]:

@@ -35,6 +35,8 @@ MOST_CAUSES = 8
 PROMISE = 2.0
 """Nats below which another Gauss-Newton step is not worth its time."""
 MOST_MOVES = 3
+MEMORIES = (0.15, 0.5, 1.5)
+"""Correlation times that gusts may have [s]."""
 MOST_FAILURES = 3
 """Additions in a row that do not hold before the search gives up."""
 Progress = Callable[[str], None]
@@ -208,7 +210,7 @@ class Search:
 
     def begin(self, noise: Noise) -> State:
         """The bare model with its own noise levels."""
-        values = dict(self.model.bare_values)
+        values = {**self.model.bare_values, "gust_memory": noise.process["memory"]}
         for f in self.all:
             values.setdefault(f.name, f.value)
         noise = self.engine.fit_noise(values, noise, GUST_LEVELS)
@@ -254,6 +256,30 @@ class Search:
         """Noise levels again, from where they stand."""
         noise = self.engine.fit_noise(state.values, state.noise, GUST_LEVELS, iterations=4)
         return replace(state, noise=noise)
+
+    def choose_memory(self, state: State) -> bool:
+        """Take the gusts' memory of largest likelihood out of MEMORIES; True where it changed."""
+        now = state.noise.process["memory"]
+        best = self.engine.log_likelihood(state.values, state.noise) + TIE
+        chosen = None
+        for memory in MEMORIES:
+            for power in (
+                0.0,
+                0.5,
+                -0.5,
+            ):  # same std, same fast part, same slow part of the spectrum
+                factor = (memory / now) ** power
+                levels = {n: state.noise.process[n] * factor for n in GUST_LEVELS}
+                noise = replace(state.noise, process={**levels, "memory": memory})
+                values = {**state.values, "gust_memory": memory}
+                reached = self.engine.log_likelihood(values, noise)
+                if memory != now and reached > best:
+                    best, chosen = reached, (values, noise)
+        if chosen is None:
+            return False
+        state.values, state.noise = chosen
+        self.say(f"gusts forget within {state.noise.process['memory']:g} s")
+        return True
 
     # --- scores -------------------------------------------------------------------------------------
 
@@ -342,7 +368,7 @@ class Search:
         drops: Counter[str] = Counter()
         tried: set[tuple[str, ...]] = set()
         moves = failures = most = 0
-        complete = False
+        complete = remembered = False
         state = self.refit_noise(self.settle(state))
         for _ in range(4 * MOST_CAUSES):
             passes, quadratic = self.linearise(state)
@@ -369,6 +395,8 @@ class Search:
                 pass
             elif complete:
                 break
+            elif not remembered and self.choose_memory(state):
+                remembered = True
             else:  # nothing more to add: what is in must also stand against coloured residuals
                 complete = True
                 continue
