@@ -91,6 +91,10 @@ def diagnose(
     model = HeliModel(vehicle)
     candidates = _candidates(exclude, vehicle, flight)
     noise = starting_noise(flight, vehicle)
+    for name in hold_out or ():
+        flight.run(name)
+    if hold_out and set(hold_out) == set(flight.run_names):
+        raise InputError("all runs are held out: nothing is left to fit on")
     records = [record_of(run) for run in flight.runs]
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     say("choosing the runs to hold out")
@@ -186,13 +190,7 @@ def _split(
     candidates: Sequence[str],
 ) -> tuple[list[Record], list[Record]]:
     """Records to fit and records to hold out."""
-    names = [r.name for r in records]
     if hold_out is not None:
-        for name in hold_out:
-            if name not in names:
-                raise InputError(f"no run {name!r} to hold out; the flight has {', '.join(names)}")
-        if set(hold_out) == set(names):
-            raise InputError("all runs are held out: nothing is left to fit on")
         return (
             [r for r in records if r.name not in hold_out],
             [r for r in records if r.name in hold_out],
@@ -275,6 +273,7 @@ def _causes(
                     quadratic,
                     effect,
                     max([colour, *(white[c].inflation for c in channels)]),
+                    float(without.objective - state.objective),
                 ),
                 "channels": channels,
             }
@@ -308,13 +307,19 @@ def with_timing(parameter: FreeParameter, std: float, dt: float) -> float:
 
 
 def _look_alikes(
-    search: Search, state: State, quadratic: Quadratic, effect: str, colour: float
+    search: Search,
+    state: State,
+    quadratic: Quadratic,
+    effect: str,
+    colour: float,
+    lost: float,
 ) -> list[str]:
     """Effects that would do as well in this one's place, by refitted likelihood.
 
-    Coloured innovations carry less than they seem to: the tie widens by the colour.
+    Coloured innovations carry less than they seem to: the tie widens by the colour, up to half of
+    what is `lost` (nats) with nothing in the effect's place.
     """
-    tie = TIE * colour
+    tie = min(TIE * colour, max(0.5 * lost, TIE))
     now, _ = quadratic.best(search.free_names(state.active))
     rest = [e for e in state.active if e != effect]
     nothing, _ = quadratic.best(search.free_names(rest), search.off(effect))

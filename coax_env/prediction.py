@@ -16,6 +16,7 @@ import numpy as np
 from coax_env.engine import kalman
 from coax_env.engine.fit import Engine, Progress
 from coax_env.engine.model import Noise
+from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight
 from coax_env.heli_model import GUST_LEVELS, HeliModel, record_of, sensor_std, starting_noise
 from coax_env.layout import CHANNEL_UNITS, CHANNELS, N_FULL
@@ -218,6 +219,12 @@ def replay(
     """
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    longest = max(run.duration for run in flight.runs)
+    if longest < WARM_UP + horizon:
+        raise InputError(
+            f"a horizon of {horizon:g} s after {WARM_UP:g} s of filtering is longer than every run"
+            f" (at most {longest:.1f} s)"
+        )
     model = HeliModel(vehicle)
     engine = Engine(model, [record_of(run) for run in flight.runs])
     noise = starting_noise(flight, vehicle)

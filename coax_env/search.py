@@ -31,7 +31,7 @@ EVIDENCE = 12.0
 """Nats a cause must be worth, Occam factor deducted."""
 TIE = 6.0
 """Alternatives within this many nats cannot be told apart."""
-MOST_CAUSES = 8
+MOST_CAUSES = 10
 PROMISE = 2.0
 """Nats below which another Gauss-Newton step is not worth its time."""
 MOST_MOVES = 3

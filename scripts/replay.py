@@ -29,8 +29,9 @@ def main() -> None:
         write_text(folder / "report.html", page)
     for run, table in result.findings["runs"].items():
         cells = (
-            f"{c} {'diverged' if e['rms'] is None else format(e['rms'], '.3g')} {e['unit']}"
+            f"{c} " + ("diverged" if e.get("diverged") else f"{e['rms']:.3g} {e['unit']}")
             for c, e in table.items()
+            if e.get("diverged") or e["rms"] is not None
         )
         print(f"{run}: {', '.join(cells)}")
     print(f"replay {options.out / 'replay.json'}, report {options.out / 'report.html'}")

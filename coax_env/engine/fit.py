@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import lsq_linear, minimize
 
 from coax_env.engine import kalman
 from coax_env.engine.model import FreeParameter, Model, Noise, Record
@@ -359,18 +360,15 @@ def newton_step(
 
 
 def bounded_solve(A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Minimise 1/2 x'A x - b'x within bounds, by an active set (A positive definite)."""
-    k = b.size
-    x = np.zeros(k)
-    fixed = np.zeros(k, bool)
-    for _ in range(k + 1):
-        loose = ~fixed
-        x[loose] = np.linalg.solve(
-            A[np.ix_(loose, loose)], b[loose] - A[np.ix_(loose, fixed)] @ x[fixed]
-        )
-        out = loose & ((x < lower - 1e-15) | (x > upper + 1e-15))
-        if not out.any():
-            break
-        x[out] = np.clip(x[out], lower[out], upper[out])
-        fixed |= out
-    return x
+    """Minimise 1/2 x'A x - b'x within bounds (A positive definite), shape (k,).
+
+    Bounded least squares on the Cholesky factor, in units of A's diagonal (Stark and Parker 1995).
+    """
+    unit = 1.0 / np.sqrt(np.diag(A))
+    factor = cholesky(A * np.outer(unit, unit))
+    target = solve_triangular(factor, b * unit, trans="T")
+    x = solve_triangular(factor, target) * unit
+    if np.any(x < lower) or np.any(x > upper):
+        bounds = (np.minimum(lower, 0.0) / unit, np.maximum(upper, 0.0) / unit)
+        x = lsq_linear(factor, target, bounds, method="bvls", tol=1e-12).x * unit
+    return np.clip(x, lower, upper)

@@ -36,8 +36,8 @@ class Whiteness:
 
     @property
     def inflation(self) -> float:
-        """How many coloured innovations carry what one white one does, at most 20."""
-        return 1.0 / max(1.0 - self.coloured_share, 0.05)
+        """How many coloured innovations carry what one white one does, at most 5."""
+        return 1.0 / max(1.0 - self.coloured_share, 0.2)
 
 
 def whiteness(passes: Sequence[RunPass], channels: Sequence[str]) -> dict[str, Whiteness]:
