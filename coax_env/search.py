@@ -411,14 +411,35 @@ class Search:
             else -np.inf
             for effect in state.active
         }
-        if not worth or min(worth.values()) >= EVIDENCE:
+        for effect in sorted(worth, key=lambda e: worth[e]):
+            if worth[effect] >= EVIDENCE:
+                return None
+            if not np.isfinite(worth[effect]) or self._holds_not(
+                state, quadratic, effect, coloured
+            ):
+                break
+        else:
             return None
-        effect = min(worth, key=lambda e: worth[e])
         self.history.append((f"- {effect}", max(worth[effect], 0.0)))
         self.say(f"dropped {effect}: worth {worth[effect]:.1f} nats")
         state.active = [e for e in state.active if e != effect]
         state.values |= self.off(effect)
         return effect
+
+    def _holds_not(self, state: State, quadratic: Quadratic, effect: str, coloured: bool) -> bool:
+        """Whether a refit without the effect confirms that it is worth too little.
+
+        The quadratic reaches from where the effect stands back to nothing, which is far for a lag.
+        """
+        rest = [e for e in state.active if e != effect]
+        without = self.settle(
+            State(rest, state.values | self.off(effect) | self.pinned(effect), state.noise),
+            without=effects.CATALOGUE[effect].replaces,
+        )
+        colour = self.colour(quadratic, state.active, effect) if coloured else 1.0
+        own = self.candidate_names(effect)
+        occam = quadratic.occam(own, self.free_names(rest))
+        return (without.objective - state.objective) / colour - occam < EVIDENCE
 
     def _swap(self, state: State, quadratic: Quadratic, tried: set[tuple[str, ...]]) -> bool:
         """Put another effect in the place of one that is in, where that fits better."""

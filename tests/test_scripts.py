@@ -144,7 +144,7 @@ SPOILT: dict[str, tuple[Callable[[dict[str, bytes]], None], tuple[str, ...]]] = 
 def check_refused(done: subprocess.CompletedProcess, folder: Path, *words: str) -> None:
     """One line that says what was found, exit code 2, nothing written."""
     assert done.returncode == 2, done.stderr
-    lines = [line for line in done.stderr.splitlines() if not line.startswith("diagnosis: ")]
+    lines = done.stderr.splitlines()
     assert len(lines) == 1, done.stderr
     assert lines[0].startswith("error: ") and len(lines[0]) < 700
     for word in words:
