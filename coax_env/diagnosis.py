@@ -30,7 +30,7 @@ from coax_env.gain import gain_of
 from coax_env.heli_model import FARTHEST, HeliModel, record_of, sensor_std, starting_noise
 from coax_env.layout import CHANNELS
 from coax_env.prediction import RunReplay, fly_again, gusts_of
-from coax_env.search import TIE, Quadratic, Search, State
+from coax_env.search import EVIDENCE, TIE, Quadratic, Search, State, together
 from coax_env.vehicle import Parameter, Vehicle, load_vehicle
 
 HORIZON = 1.0  # s
@@ -337,6 +337,9 @@ def _look_alikes(
         trial = search.settle(State(active, state.values | values, state.noise), steps=2)
         if trial.objective - state.objective < tie:
             result.append(other)
+    for twin in sorted(together(effect) & set(search.candidates) - set(result)):
+        if search.score(quadratic, state.active, twin)[1] > EVIDENCE:  # a mixture of the two
+            result.append(twin)
     return result
 
 

@@ -35,11 +35,18 @@ MOST_CAUSES = 10
 PROMISE = 2.0
 """Nats below which another Gauss-Newton step is not worth its time."""
 MOST_MOVES = 3
+TOGETHER = (frozenset({"servo_lag", "servo_delay"}),)
+"""Effects of which one at most is named: a real servo is a mixture of both (design/effects.md)."""
 MEMORIES = (0.15, 0.5, 1.5)
 """Correlation times that gusts may have [s]."""
 MOST_FAILURES = 3
 """Additions in a row that do not hold before the search gives up."""
 Progress = Callable[[str], None]
+
+
+def together(effect: str) -> set[str]:
+    """The effects that stand for the same thing as this one."""
+    return {e for group in TOGETHER if effect in group for e in group} - {effect}
 
 
 @dataclass(frozen=True)
@@ -471,7 +478,7 @@ class Search:
             return None
         ranked = []
         for effect in self.candidates:
-            if effect in state.active or effect in banned:
+            if effect in state.active or effect in banned or together(effect) & set(state.active):
                 continue
             score, evidence, large = self.score(quadratic, state.active, effect)
             if large and evidence > EVIDENCE and score > 0.0:
