@@ -89,105 +89,126 @@ def _actuate(x, u, time, f, out):
     out[19] = _follow(x[19], u[3], time, f[F.SERVO_LAG])
 
 
+def _rates_of(with_effects):
+    """`_rates` compiled with the effects' calls, or without them for a vehicle that has none.
+
+    One source, two machine codes: a call that might change the workspace costs the bare model a
+    fifth of its speed even when it is never made (scripts/benchmark.py).
+    """
+
+    def rates(x, p, f, dx):
+        """Rates of the paper's sixteen states, (26)-(44), shape (16,), into `dx`.
+
+        Needs `_properties` before it. Leaves loads and rates in the workspace `f`.
+        """
+        p_, q_, r_ = x[3], x[4], x[5]
+        sin_phi, cos_phi = math.sin(x[10]), math.cos(x[10])
+        sin_theta, cos_theta = math.sin(x[11]), math.cos(x[11])
+        sin_psi, cos_psi = math.sin(x[12]), math.cos(x[12])
+        f[F.SIN_PHI], f[F.COS_PHI] = sin_phi, cos_phi
+        f[F.SIN_THETA], f[F.COS_THETA] = sin_theta, cos_theta
+        f[F.SIN_PSI], f[F.COS_PSI] = sin_psi, cos_psi
+        f[F.HEIGHT] = -x[15]
+
+        f[F.AIR_U], f[F.AIR_V], f[F.AIR_W] = x[0], x[1], x[2]
+        if with_effects and p[effects.AIR] != 0.0:
+            _air_effects(x, f, p)
+
+        f[F.DELTA_LON], f[F.DELTA_LAT] = x[18], x[19]
+        if with_effects and p[effects.SWASH] != 0.0:
+            _swash_effects(x, f, p)
+
+        # (15)-(20); upper tilt by the fly-bar, (30)-(31)
+        omega_u, omega_l = x[16], x[17]
+        f[F.OMEGA_U], f[F.OMEGA_L] = omega_u, omega_l
+        f[F.THRUST_U] = f[F.THRUST_FACTOR_U] * omega_u * omega_u
+        f[F.THRUST_L] = f[F.THRUST_FACTOR_L] * omega_l * omega_l
+        f[F.TORQUE_U] = f[F.TORQUE_FACTOR_U] * omega_u * omega_u
+        f[F.TORQUE_L] = f[F.TORQUE_FACTOR_L] * omega_l * omega_l
+        f[F.ALPHA_U] = p[P.FLYBAR_TO_ROTOR_LON] * x[8]
+        f[F.BETA_U] = p[P.FLYBAR_TO_ROTOR_LAT] * x[9]
+        f[F.ALPHA_L], f[F.BETA_L] = x[6], x[7]
+        if with_effects and p[effects.ROTOR] != 0.0:
+            _rotor_effects(x, f, p)
+
+        # (26)-(27)
+        tau = f[F.FLAP_TIME]
+        gain = f[F.SWASH_TO_FLAP]
+        f[F.ALPHA_L_DOT] = (gain * f[F.DELTA_LON] - x[6] - p[P.FLAP_COUPLING_LON] * x[7]) / tau - q_
+        f[F.BETA_L_DOT] = (gain * f[F.DELTA_LAT] - x[7] + p[P.FLAP_COUPLING_LAT] * x[6]) / tau - p_
+
+        # (13)-(14): thrust along [-tan a, tan b, -1], normalised
+        tan_a, tan_b = math.tan(f[F.ALPHA_U]), math.tan(f[F.BETA_U])
+        along = f[F.THRUST_U] / math.sqrt(1.0 + tan_a * tan_a + tan_b * tan_b)
+        x_u, y_u, z_u = -tan_a * along, tan_b * along, -along
+        tan_a, tan_b = math.tan(f[F.ALPHA_L]), math.tan(f[F.BETA_L])
+        along = f[F.THRUST_L] / math.sqrt(1.0 + tan_a * tan_a + tan_b * tan_b)
+        x_l, y_l, z_l = -tan_a * along, tan_b * along, -along
+
+        # (21): the upper rotor's wake on the fuselage, V_i^2 = T_u / (2 rho pi R^2)
+        area = p[P.FUSELAGE_LENGTH] * p[P.FUSELAGE_WIDTH] * p[P.FUSELAGE_DRAG]
+        radius = p[P.ROTOR_RADIUS]
+        download = f[F.THRUST_U] * area / (4.0 * math.pi * radius * radius)
+
+        gust = f[F.MASS] / p[P.GUST_MASS]
+        f[F.FORCE_X] = x_u + x_l + gust * x[20]
+        f[F.FORCE_Y] = y_u + y_l + gust * x[21]
+        f[F.FORCE_Z] = z_u + z_l + download + gust * x[22]
+
+        # (35)-(37): hubs at (0, 0, -d); gyroscopic moment -omega x (0, 0, H), (23)-(25)
+        momentum = (
+            p[P.ROTOR_INERTIA_L] * omega_l - (p[P.ROTOR_INERTIA_U] + p[P.FLYBAR_INERTIA]) * omega_u
+        )
+        f[F.MOMENT_X] = p[P.ARM_U] * y_u + p[P.ARM_L] * y_l - q_ * momentum
+        f[F.MOMENT_Y] = -p[P.ARM_U] * x_u - p[P.ARM_L] * x_l + p_ * momentum
+        f[F.MOMENT_Z] = f[F.TORQUE_U] - f[F.TORQUE_L]
+        f[F.MOMENT_X] += x[23] * f[F.INERTIA_XX] / p[P.GUST_INERTIA_XX]
+        f[F.MOMENT_Y] += x[24] * f[F.INERTIA_YY] / p[P.GUST_INERTIA_YY]
+        f[F.MOMENT_Z] += x[25] * f[F.INERTIA_ZZ] / p[P.GUST_INERTIA_ZZ]
+        if with_effects and p[effects.LOAD] != 0.0:
+            _load_effects(x, f, p)
+
+        # (32)-(34)
+        g = p[P.GRAVITY]
+        u_, v_, w_ = x[0], x[1], x[2]
+        dx[0] = r_ * v_ - q_ * w_ - g * sin_theta + f[F.FORCE_X] / f[F.MASS]
+        dx[1] = p_ * w_ - r_ * u_ + g * cos_theta * sin_phi + f[F.FORCE_Y] / f[F.MASS]
+        dx[2] = q_ * u_ - p_ * v_ + g * cos_theta * cos_phi + f[F.FORCE_Z] / f[F.MASS]
+        # (35)-(37)
+        dx[3] = f[F.P_DOT] = f[F.MOMENT_X] / f[F.INERTIA_XX]
+        dx[4] = f[F.Q_DOT] = f[F.MOMENT_Y] / f[F.INERTIA_YY]
+        dx[5] = f[F.R_DOT] = f[F.MOMENT_Z] / f[F.INERTIA_ZZ]
+        # (26)-(29)
+        dx[6] = f[F.ALPHA_L_DOT]
+        dx[7] = f[F.BETA_L_DOT]
+        dx[8] = -x[8] / f[F.FLYBAR_TIME] - q_
+        dx[9] = -x[9] / f[F.FLYBAR_TIME] - p_
+        # (38)-(40)
+        turn = q_ * sin_phi + r_ * cos_phi
+        dx[10] = p_ + turn * sin_theta / cos_theta
+        dx[11] = q_ * cos_phi - r_ * sin_phi
+        dx[12] = turn / cos_theta
+        # (41)-(43)
+        forward = u_ * cos_theta + (v_ * sin_phi + w_ * cos_phi) * sin_theta
+        right = v_ * cos_phi - w_ * sin_phi
+        dx[13] = forward * cos_psi - right * sin_psi
+        dx[14] = forward * sin_psi + right * cos_psi
+        dx[15] = -u_ * sin_theta + (v_ * sin_phi + w_ * cos_phi) * cos_theta
+
+    return compiled()(rates)
+
+
+_rates_with_effects = _rates_of(True)
+_rates_bare = _rates_of(False)
+
+
 @compiled()
 def _rates(x, p, f, dx):
-    """Rates of the paper's sixteen states, (26)-(44), shape (16,), into `dx`.
-
-    Needs `_properties` before it. Leaves loads and rates in the workspace `f`.
-    """
-    p_, q_, r_ = x[3], x[4], x[5]
-    sin_phi, cos_phi = math.sin(x[10]), math.cos(x[10])
-    sin_theta, cos_theta = math.sin(x[11]), math.cos(x[11])
-    sin_psi, cos_psi = math.sin(x[12]), math.cos(x[12])
-    f[F.SIN_PHI], f[F.COS_PHI] = sin_phi, cos_phi
-    f[F.SIN_THETA], f[F.COS_THETA] = sin_theta, cos_theta
-    f[F.SIN_PSI], f[F.COS_PSI] = sin_psi, cos_psi
-    f[F.HEIGHT] = -x[15]
-
-    f[F.AIR_U], f[F.AIR_V], f[F.AIR_W] = x[0], x[1], x[2]
-    if p[effects.AIR] != 0.0:
-        _air_effects(x, f, p)
-
-    f[F.DELTA_LON], f[F.DELTA_LAT] = x[18], x[19]
-    if p[effects.SWASH] != 0.0:
-        _swash_effects(x, f, p)
-
-    # (15)-(20); upper tilt by the fly-bar, (30)-(31)
-    omega_u, omega_l = x[16], x[17]
-    f[F.OMEGA_U], f[F.OMEGA_L] = omega_u, omega_l
-    f[F.THRUST_U] = f[F.THRUST_FACTOR_U] * omega_u * omega_u
-    f[F.THRUST_L] = f[F.THRUST_FACTOR_L] * omega_l * omega_l
-    f[F.TORQUE_U] = f[F.TORQUE_FACTOR_U] * omega_u * omega_u
-    f[F.TORQUE_L] = f[F.TORQUE_FACTOR_L] * omega_l * omega_l
-    f[F.ALPHA_U] = p[P.FLYBAR_TO_ROTOR_LON] * x[8]
-    f[F.BETA_U] = p[P.FLYBAR_TO_ROTOR_LAT] * x[9]
-    f[F.ALPHA_L], f[F.BETA_L] = x[6], x[7]
-    if p[effects.ROTOR] != 0.0:
-        _rotor_effects(x, f, p)
-
-    # (26)-(27)
-    tau = f[F.FLAP_TIME]
-    gain = f[F.SWASH_TO_FLAP]
-    f[F.ALPHA_L_DOT] = (gain * f[F.DELTA_LON] - x[6] - p[P.FLAP_COUPLING_LON] * x[7]) / tau - q_
-    f[F.BETA_L_DOT] = (gain * f[F.DELTA_LAT] - x[7] + p[P.FLAP_COUPLING_LAT] * x[6]) / tau - p_
-
-    # (13)-(14): thrust along [-tan a, tan b, -1], normalised
-    tan_a, tan_b = math.tan(f[F.ALPHA_U]), math.tan(f[F.BETA_U])
-    along = f[F.THRUST_U] / math.sqrt(1.0 + tan_a * tan_a + tan_b * tan_b)
-    x_u, y_u, z_u = -tan_a * along, tan_b * along, -along
-    tan_a, tan_b = math.tan(f[F.ALPHA_L]), math.tan(f[F.BETA_L])
-    along = f[F.THRUST_L] / math.sqrt(1.0 + tan_a * tan_a + tan_b * tan_b)
-    x_l, y_l, z_l = -tan_a * along, tan_b * along, -along
-
-    # (21): the upper rotor's wake on the fuselage, V_i^2 = T_u / (2 rho pi R^2)
-    area = p[P.FUSELAGE_LENGTH] * p[P.FUSELAGE_WIDTH] * p[P.FUSELAGE_DRAG]
-    radius = p[P.ROTOR_RADIUS]
-    download = f[F.THRUST_U] * area / (4.0 * math.pi * radius * radius)
-
-    gust = f[F.MASS] / p[P.GUST_MASS]
-    f[F.FORCE_X] = x_u + x_l + gust * x[20]
-    f[F.FORCE_Y] = y_u + y_l + gust * x[21]
-    f[F.FORCE_Z] = z_u + z_l + download + gust * x[22]
-
-    # (35)-(37): hubs at (0, 0, -d); gyroscopic moment -omega x (0, 0, H), (23)-(25)
-    momentum = (
-        p[P.ROTOR_INERTIA_L] * omega_l - (p[P.ROTOR_INERTIA_U] + p[P.FLYBAR_INERTIA]) * omega_u
-    )
-    f[F.MOMENT_X] = p[P.ARM_U] * y_u + p[P.ARM_L] * y_l - q_ * momentum
-    f[F.MOMENT_Y] = -p[P.ARM_U] * x_u - p[P.ARM_L] * x_l + p_ * momentum
-    f[F.MOMENT_Z] = f[F.TORQUE_U] - f[F.TORQUE_L]
-    f[F.MOMENT_X] += x[23] * f[F.INERTIA_XX] / p[P.GUST_INERTIA_XX]
-    f[F.MOMENT_Y] += x[24] * f[F.INERTIA_YY] / p[P.GUST_INERTIA_YY]
-    f[F.MOMENT_Z] += x[25] * f[F.INERTIA_ZZ] / p[P.GUST_INERTIA_ZZ]
-    if p[effects.LOAD] != 0.0:
-        _load_effects(x, f, p)
-
-    # (32)-(34)
-    g = p[P.GRAVITY]
-    u_, v_, w_ = x[0], x[1], x[2]
-    dx[0] = r_ * v_ - q_ * w_ - g * sin_theta + f[F.FORCE_X] / f[F.MASS]
-    dx[1] = p_ * w_ - r_ * u_ + g * cos_theta * sin_phi + f[F.FORCE_Y] / f[F.MASS]
-    dx[2] = q_ * u_ - p_ * v_ + g * cos_theta * cos_phi + f[F.FORCE_Z] / f[F.MASS]
-    # (35)-(37)
-    dx[3] = f[F.P_DOT] = f[F.MOMENT_X] / f[F.INERTIA_XX]
-    dx[4] = f[F.Q_DOT] = f[F.MOMENT_Y] / f[F.INERTIA_YY]
-    dx[5] = f[F.R_DOT] = f[F.MOMENT_Z] / f[F.INERTIA_ZZ]
-    # (26)-(29)
-    dx[6] = f[F.ALPHA_L_DOT]
-    dx[7] = f[F.BETA_L_DOT]
-    dx[8] = -x[8] / f[F.FLYBAR_TIME] - q_
-    dx[9] = -x[9] / f[F.FLYBAR_TIME] - p_
-    # (38)-(40)
-    turn = q_ * sin_phi + r_ * cos_phi
-    dx[10] = p_ + turn * sin_theta / cos_theta
-    dx[11] = q_ * cos_phi - r_ * sin_phi
-    dx[12] = turn / cos_theta
-    # (41)-(43)
-    forward = u_ * cos_theta + (v_ * sin_phi + w_ * cos_phi) * sin_theta
-    right = v_ * cos_phi - w_ * sin_phi
-    dx[13] = forward * cos_psi - right * sin_psi
-    dx[14] = forward * sin_psi + right * cos_psi
-    dx[15] = -u_ * sin_theta + (v_ * sin_phi + w_ * cos_phi) * cos_theta
+    """Rates of the paper's sixteen states, (26)-(44), shape (16,), into `dx`."""
+    if p[effects.AIR] + p[effects.SWASH] + p[effects.ROTOR] + p[effects.LOAD] != 0.0:
+        _rates_with_effects(x, p, f, dx)
+    else:
+        _rates_bare(x, p, f, dx)
 
 
 @compiled()
