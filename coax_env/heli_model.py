@@ -4,7 +4,7 @@ Command delay enters here: with servo_delay the swash commands are looked up lat
 interval holds two commands, replaced by their mean over it (the step is split to second order).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -126,12 +126,12 @@ class HeliModel:
 
     # --- what may be fitted -------------------------------------------------------------------------
 
-    def base_parameters(self, without: Sequence[str] = ()) -> list[FreeParameter]:
-        """The vehicle's own numbers under their priors, those in `without` left out."""
+    def base_parameters(self) -> list[FreeParameter]:
+        """The vehicle's own numbers under their priors."""
         return [
             FreeParameter(name, p.value, p.std, lower=0.3 * p.value, upper=3.0 * p.value)
             for name, p in self.vehicle.parameters.items()
-            if p.std > 0.0 and name not in HELD and name not in without
+            if p.std > 0.0 and name not in HELD
         ]
 
     @staticmethod
