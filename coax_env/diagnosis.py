@@ -45,7 +45,7 @@ class Diagnosis:
     findings: what findings.json says (contract.md). vehicle_after: the extended model, refitted on
     all runs. replay_before, replay_refitted, replay_after: held-out runs flown again with the vehicle
     as given, its base parameters refitted, and extended. innovations_before, innovations_after: run ->
-    {"t": (n,), channel: (n,) whitened}, fit runs. remarks: data handling, and values outside their range.
+    {"t": (n,), channel: (n,) whitened}, fit runs. remarks: on data and on unusual values.
     """
 
     findings: dict[str, Any]
