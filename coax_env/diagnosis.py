@@ -52,7 +52,8 @@ class Diagnosis:
     findings: what findings.json says (contract.md). vehicle_after: the extended model, refitted on
     all runs. replay_before, replay_refitted, replay_after: held-out runs flown again with the vehicle
     as given, its base parameters refitted, and extended. innovations_before, innovations_after: run ->
-    {"t": (n,), channel: (n,) whitened}, fit runs. remarks: on data and on unusual values.
+    {"t": (n,), channel: (n,) whitened}, fit runs. remarks: on data and on unusual values. design: the
+    maneuvers that part the strongest cause from its look-alikes; None without any.
     """
 
     findings: dict[str, Any]
@@ -68,6 +69,7 @@ class Diagnosis:
     evidence_history: list[tuple[str, float]]
     remarks: tuple[str, ...] = ()
     noise: dict[str, float] = field(default_factory=dict)
+    design: next_maneuver.Design | None = None
 
 
 def diagnose(
@@ -123,7 +125,7 @@ def diagnose(
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
     white_after = whiteness(passes_after, CHANNELS)
-    causes = _causes(search, state, quadratic, weights, white_after)
+    causes, ties = _causes(search, state, quadratic, weights, white_after)
     unexplained = _unexplained(white_after, passes_after)
 
     replays: list[list[RunReplay]] = [[], [], []]
@@ -139,14 +141,14 @@ def diagnose(
         gain["held_out"] = [r.name for r in held]
     say("refitting the extended model on everything")
     vehicle_after = _extended(model, records, search, state, flight, vehicle, weights)
-    ties = [(c["effect"], other) for c in causes for other in c["confusable_with"]]
+    design = _design(search, state, quadratic, ties, flight, say)
     findings = {
         "verdict": _verdict(bool(causes), bool(unexplained)),
         "causes": causes,
         "gusts": gusts_of(state.noise),
         "unexplained": unexplained,
         "gain": gain,
-        "next_maneuver": next_maneuver.advise(ties),
+        "next_maneuver": next_maneuver.advise(design, EVIDENCE),
         "false_alarm_rate": None,
     }
     return Diagnosis(
@@ -163,6 +165,7 @@ def diagnose(
         evidence_history=search.history,
         remarks=tuple(remarks + _shaken(search, state) + _unusual(search, state)),
         noise=sensors,
+        design=design,
     )
 
 
@@ -252,14 +255,24 @@ def _causes(
     quadratic: Quadratic,
     weights: Mapping[str, Weight],
     white: Mapping[str, Whiteness],
-) -> list[dict[str, Any]]:
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, State]]]:
+    """Entries of findings.json, strongest first, and the refits with each one's look-alikes."""
     std = standard_deviations(search, state, quadratic)
     dt = median_step(search.engine.records)
-    causes = []
+    causes: list[dict[str, Any]] = []
+    ties: dict[str, dict[str, State]] = {}
     for effect in state.active:
         entry = effects.CATALOGUE[effect]
         weight = weights[effect]
         channels = _channels(search, state, effect)
+        ties[effect] = _look_alikes(
+            search,
+            state,
+            quadratic,
+            effect,
+            max([weight.colour, *(white[c].inflation for c in channels)]),
+            weight.lost,
+        )
         causes.append(
             {
                 "effect": effect,
@@ -272,18 +285,12 @@ def _causes(
                     for f, p in zip(search.by_effect[effect], entry.parameters, strict=True)
                 },
                 "evidence": weight.evidence,
-                "confusable_with": _look_alikes(
-                    search,
-                    state,
-                    quadratic,
-                    effect,
-                    max([weight.colour, *(white[c].inflation for c in channels)]),
-                    weight.lost,
-                ),
+                "confusable_with": list(ties[effect]),
                 "channels": channels,
             }
         )
-    return sorted(causes, key=lambda c: -c["evidence"])
+    causes.sort(key=lambda c: -c["evidence"])
+    return causes, {c["effect"]: ties[c["effect"]] for c in causes}
 
 
 def standard_deviations(search: Search, state: State, quadratic: Quadratic) -> dict[str, float]:
@@ -318,8 +325,8 @@ def _look_alikes(
     effect: str,
     colour: float,
     lost: float,
-) -> list[str]:
-    """Effects that would do as well in this one's place, by refitted likelihood.
+) -> dict[str, State]:
+    """Effects that would do as well in this one's place, by refitted likelihood, and those refits.
 
     Coloured innovations carry less than they seem to: the tie widens by the colour, up to half of
     what is `lost` (nats) with nothing in the effect's place.
@@ -335,17 +342,50 @@ def _look_alikes(
             does_something = nothing - now - change > 0.5 * (nothing - now)
             if change < 3.0 * tie and does_something:
                 near.append((change, other, move))
-    result = []
-    for _, other, move in sorted(near, key=lambda n: n[0])[:3]:
+
+    def in_its_place(other: str, move: np.ndarray) -> State:
         values = dict(zip(quadratic.names, (quadratic.at + move).tolist(), strict=True))
         active = [other if e == effect else e for e in state.active]
-        trial = search.settle(State(active, state.values | values, state.noise), steps=2)
+        return search.settle(State(active, state.values | values, state.noise), steps=2)
+
+    result = {}
+    for _, other, move in sorted(near, key=lambda n: n[0])[:3]:
+        trial = in_its_place(other, move)
         if trial.objective - state.objective < tie:
-            result.append(other)
+            result[other] = trial
     for twin in sorted(together(effect) & set(search.candidates) - set(result)):
         if search.score(quadratic, state.active, twin)[1] > EVIDENCE:  # a mixture of the two
-            result.append(twin)
+            _, move = search.swap(quadratic, state.active, effect, twin)
+            result[twin] = in_its_place(twin, move)
     return result
+
+
+def _design(
+    search: Search,
+    state: State,
+    quadratic: Quadratic,
+    ties: Mapping[str, Mapping[str, State]],
+    flight: Flight,
+    say: Progress,
+) -> next_maneuver.Design | None:
+    """The maneuvers that part the strongest tied cause from its look-alikes.
+
+    What the flights told of the alternatives' numbers is taken from the final quadratic.
+    """
+    tied = next((effect for effect, others in ties.items() if others), None)
+    if tied is None:
+        return None
+    say("designing the next maneuver")
+    alternatives = []
+    for name, refit in {tied: state, **ties[tied]}.items():
+        free = search.free(refit.active)
+        i = quadratic.index([f.name for f in free])
+        alternatives.append(
+            next_maneuver.Alternative.of(
+                name, search.model.vehicle, free, refit.values, quadratic.G[np.ix_(i, i)]
+            )
+        )
+    return next_maneuver.design(alternatives, state.noise, next_maneuver.logged_rates(flight))
 
 
 def _channels(search: Search, state: State, effect: str) -> list[str]:
