@@ -120,13 +120,15 @@ def diagnose(
     state, quadratic = search.run(
         State([], dict(refitted.values), refitted.noise, refitted.objective)
     )
+    state, quadratic, terms = unlisted.explain(search, state, quadratic)
     say("weighing the causes against their look-alikes")
     state, quadratic, weights = search.prune(state, quadratic)
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
     white_after = whiteness(passes_after, CHANNELS)
     causes, ties = _causes(search, state, quadratic, weights, white_after)
-    unexplained = _unexplained(white_after, passes_after)
+    described = unlisted.entries(search, state, quadratic, passes_after, terms)
+    unexplained = described + _unexplained(white_after, unlisted.speaks_for(described))
 
     replays: list[list[RunReplay]] = [[], [], []]
     gain = None
@@ -140,7 +142,9 @@ def diagnose(
         gain = gain_of(replays[0], replays[1], replays[2], sensors, HORIZON)
         gain["held_out"] = [r.name for r in held]
     say("refitting the extended model on everything")
-    vehicle_after = _extended(model, records, search, state, flight, vehicle, weights)
+    colours = {effect: weight.colour for effect, weight in weights.items()}
+    colours |= unlisted.colours(search, state, quadratic, terms)
+    vehicle_after = _extended(model, records, search, state, flight, vehicle, colours)
     design = _design(search, state, quadratic, ties, flight, say)
     findings = {
         "verdict": _verdict(bool(causes), bool(unexplained)),
@@ -439,12 +443,12 @@ def _unusual(search: Search, state: State) -> list[str]:
 # --- what is left, what to do next --------------------------------------------------------------------
 
 
-def _unexplained(white: Mapping[str, Whiteness], passes: Sequence[RunPass]) -> list[dict[str, Any]]:
-    """What is left: axes with the states they follow, then channels that are just not white."""
-    coloured = [channel for channel, w in white.items() if not w.white]
-    described = unlisted.describe(passes, coloured)
-    rest = [c for c in coloured if c not in unlisted.speaks_for(described)]
-    return described + [
+def _unexplained(
+    white: Mapping[str, Whiteness], described: Collection[str]
+) -> list[dict[str, Any]]:
+    """Channels that are just not white, beside those that unlisted terms describe."""
+    rest = [c for c, w in white.items() if not w.white and c not in described]
+    return [
         {
             "channel": c,
             "depends_on": [],
@@ -479,7 +483,7 @@ def _extended(
     state: State,
     flight: Flight,
     vehicle: Vehicle,
-    weights: Mapping[str, Weight],
+    colours: Mapping[str, float],
 ) -> Vehicle:
     """The vehicle with the causes in it, refitted on all runs."""
     engine = Engine(model, records)
@@ -519,7 +523,7 @@ def fitted_vehicle(
     for f in free:
         group, _, own = f.name.rpartition(".")
         if group:
-            unit = next(p.unit for p in effects.CATALOGUE[group].parameters if p.name == own)
+            unit = next(p.unit for p in effects.GROUPS[group].parameters if p.name == own)
         else:
             unit = vehicle[f.name].unit
         changed[f.name] = Parameter(float(values[f.name]), float(std[f.name]), unit, source)
