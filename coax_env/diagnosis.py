@@ -493,10 +493,8 @@ def _extended(
     where = flight.path.name if flight.path else "flight"
 
     def std(f: FreeParameter) -> float:
-        weight = weights.get(f.name.partition(".")[0])
-        return with_timing(
-            f, estimate.std[f.name] * math.sqrt(weight.colour if weight else 1.0), dt
-        )
+        colour = colours.get(f.name.partition(".")[0], 1.0)
+        return with_timing(f, estimate.std[f.name] * math.sqrt(colour), dt)
 
     return fitted_vehicle(
         vehicle,

@@ -14,6 +14,7 @@ A term is a description with a value in prediction, not a cause.
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,7 @@ SETTLING = 1.0  # s at the start of each run that are not screened
 Candidate = tuple[str, tuple[Term, ...]]
 """Axis, and one term or the sine and cosine of one angle."""
 SINGLES = tuple((term,) for term in TERMS)
-PAIRS = tuple((a, b) for a, b in zip(TERMS, TERMS[1:], strict=False) if a.kin and a.kin == b.kin)
+PAIRS = tuple((a, b) for a, b in pairwise(TERMS) if a.kin and a.kin == b.kin)
 
 
 @compiled()
