@@ -43,9 +43,7 @@ from coax_env.jit import compiled
 from coax_env.layout import CHANNELS
 
 STAGES = ("PROPERTY", "AIR", "SWASH", "ROTOR", "LOAD", "UNLISTED", "SENSOR")
-PROPERTY, AIR, SWASH, ROTOR, LOAD, UNLISTED, SENSOR = (
-    P.N_FIXED + i for i in range(len(STAGES))
-)
+PROPERTY, AIR, SWASH, ROTOR, LOAD, UNLISTED, SENSOR = (P.N_FIXED + i for i in range(len(STAGES)))
 """Where each stage's switch stands in the parameter vector."""
 
 INFINITY = math.inf
@@ -89,7 +87,7 @@ class Effect:
     channels: tuple[str, ...]
     source: str
     summary: str
-    function: Callable
+    function: Any  # compiled
     replaces: tuple[str, ...] = ()
     input_shift: bool = False
     line: bool = False
@@ -688,6 +686,7 @@ for _group, (_unit, _) in generic_terms.AXES.items():
 
 # --- what the kernel and the vehicle files read -----------------------------------------------------
 
+
 def parameter_index(name: str) -> int:
     """Place of ``"mass"`` or ``"ground_effect.gain"`` in the parameter vector."""
     group, _, own = name.rpartition(".")
@@ -735,8 +734,7 @@ def completed(effect_name: str, table: Mapping[str, Any], make: Callable) -> dic
         names = [p.name for p in entry.parameters if p.name in table and table[p.name].value != 0.0]
         return {name: table[name] for name in names}
     return {
-        p.name: table.get(p.name) or make(p.off, 0.0, p.unit, "off-value")
-        for p in entry.parameters
+        p.name: table.get(p.name) or make(p.off, 0.0, p.unit, "off-value") for p in entry.parameters
     }
 
 

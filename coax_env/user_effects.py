@@ -76,4 +76,6 @@ def _check(path: Path, name: str) -> None:
         effects.GROUPS[name].function.compile((_A, _A, _A, int64))
     except NumbaError as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        raise InputError(f"{path}: effect {name!r} does not compile: {' '.join(lines[:2])}") from error
+        raise InputError(
+            f"{path}: effect {name!r} does not compile: {' '.join(lines[:2])}"
+        ) from error
