@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import effects, next_maneuver, unlisted
+from coax_env import effects, next_maneuver, unlisted, vibration
 from coax_env.engine.fit import Engine, RunPass, part
 from coax_env.engine.model import FreeParameter, Noise, Record
 from coax_env.engine.whiteness import Whiteness, whiteness
@@ -99,13 +99,17 @@ def diagnose(
     remarks = list(flight.notes) + double_counting(flight, vehicle)
     model = HeliModel(vehicle)
     candidates = _candidates(exclude, vehicle, flight)
-    noise = starting_noise(flight, vehicle)
     for name in hold_out or ():
         flight.run(name)
     if hold_out and set(hold_out) == set(flight.run_names):
         raise InputError("all runs are held out: nothing is left to fit on")
-    records = [record_of(run) for run in flight.runs]
-    sensors = {c: sensor_std(flight, c) for c in flight.channels}
+    line = vibration.find(flight) if "vibration" not in exclude else None
+    calm = vibration.taken_out(flight, line) if line else flight
+    if line:
+        remarks.append(_taken_out(line))
+    noise = starting_noise(calm, vibration.without(vehicle) if line else vehicle)
+    records = [record_of(run) for run in calm.runs]
+    sensors = {c: sensor_std(calm, c) for c in flight.channels}
     say("choosing the runs to hold out")
     fit, held = _split(model, records, noise, hold_out, candidates)
 
@@ -127,6 +131,8 @@ def diagnose(
     white_before = whiteness(passes_before, CHANNELS)
     white_after = whiteness(passes_after, CHANNELS)
     causes, ties = _causes(search, state, quadratic, weights, white_after)
+    if line and "vibration" not in vehicle.effects:
+        causes = sorted([*causes, _vibration(line)], key=lambda c: -c["evidence"])
     described = unlisted.entries(search, state, quadratic, passes_after, terms)
     unexplained = described + _unexplained(white_after, unlisted.speaks_for(described))
 
@@ -146,6 +152,10 @@ def diagnose(
     colours |= unlisted.colours(search, state, quadratic, terms)
     vehicle_after = _extended(model, records, search, state, flight, vehicle, colours)
     design = _design(search, state, quadratic, ties, flight, say)
+    if line and "vibration" not in vehicle.effects:
+        vehicle_after = vehicle_after.with_parameters(
+            {"vibration.amplitude": Parameter(line.amplitude, line.std, "m/s2", _diagnosed(flight))}
+        )
     findings = {
         "verdict": _verdict(bool(causes), bool(unexplained)),
         "causes": causes,
@@ -185,7 +195,7 @@ def _candidates(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> t
     absent = set(exclude) | set(vehicle.effects)
     if "pn" in flight.channels:  # height then comes with the position, not from a sonar
         absent |= {"sonar_tilt", "sonar_scale", "sonar_delay"}
-    return tuple(e for e in effects.CATALOGUE if e not in absent)
+    return tuple(e for e, entry in effects.CATALOGUE.items() if e not in absent and not entry.line)
 
 
 def double_counting(flight: Flight, vehicle: Vehicle) -> list[str]:
@@ -229,12 +239,12 @@ def _fair_share(
 ) -> tuple[int, ...]:
     """The quarter of the runs that holds out about a quarter of what is known of each effect.
 
-    Information is that of each effect's first parameter, about the vehicle as given and with the
-    starting noise, so that no residual has a say. An effect that would lose most of its excitation
-    counts heavily; one that the held-out runs do not show at all counts too, since its gain could
-    not be measured on them.
+    Information is that of each effect's first parameter, and of a moment that follows the heading,
+    about the vehicle as given and with the starting noise, so that no residual has a say. An effect
+    that would lose most of its excitation counts heavily; one that the held-out runs do not show at
+    all counts too, since its gain could not be measured on them.
     """
-    free = [model.effect_parameters(e)[0] for e in candidates]
+    free = [model.effect_parameters(e)[0] for e in candidates] + unlisted.excitations()
     values = {**model.bare_values, **{f.name: f.value for f in free}}
     _, lin = Engine(model, records).linearise(values, noise, free)
     information = np.einsum("rkk->rk", lin.information)
@@ -295,6 +305,25 @@ def _causes(
         )
     causes.sort(key=lambda c: -c["evidence"])
     return causes, {c["effect"]: ties[c["effect"]] for c in causes}
+
+
+def _vibration(line: vibration.Line) -> dict[str, Any]:
+    """The cause that is found by its line and not by a signature."""
+    value = {"value": line.amplitude, "std": line.std, "unit": "m/s2"}
+    return {
+        "effect": "vibration",
+        "parameters": {"vibration.amplitude": value},
+        "evidence": line.evidence,
+        "confusable_with": [],
+        "channels": list(line.channels),
+    }
+
+
+def _taken_out(line: vibration.Line) -> str:
+    return (
+        f"the accelerometers shake at the {line.rotor} rotor's speed by {line.amplitude:.2g} m/s2:"
+        " that line was taken out of their readings before anything else was looked for"
+    )
 
 
 def standard_deviations(search: Search, state: State, quadratic: Quadratic) -> dict[str, float]:
@@ -490,7 +519,6 @@ def _extended(
     free = search.free(state.active)
     estimate = engine.fit(free, state.values, state.noise, iterations=3, tolerance=0.5)
     dt = median_step(records)
-    where = flight.path.name if flight.path else "flight"
 
     def std(f: FreeParameter) -> float:
         colour = colours.get(f.name.partition(".")[0], 1.0)
@@ -502,9 +530,14 @@ def _extended(
         estimate.values,
         {f.name: std(f) for f in free},
         estimate.covariance,
-        f"diagnosed from {where}",
+        _diagnosed(flight),
         flight,
     )
+
+
+def _diagnosed(flight: Flight) -> str:
+    """Source of a number in the extended vehicle's file."""
+    return f"diagnosed from {flight.path.name if flight.path else 'flight'}"
 
 
 def fitted_vehicle(

@@ -87,7 +87,7 @@ class Effect:
     channels: tuple[str, ...]
     source: str
     summary: str
-    function: Callable
+    function: Any  # compiled
     replaces: tuple[str, ...] = ()
     input_shift: bool = False
     line: bool = False

@@ -11,8 +11,11 @@ servo lag the plate jumps and has none.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
+
+import numpy as np
 
 from coax_env import flow as F
 from coax_env import parameters as P
@@ -101,7 +104,7 @@ _COMMAND = _HEADING + 2 * HARMONICS
 
 
 @compiled()
-def hover_speeds(p):
+def hover_speeds(p: np.ndarray) -> tuple[float, float]:
     """Rotor speeds [rad/s] at which the bare model hovers, its download on the fuselage left out."""
     weight = p[P.MASS] * p[P.GRAVITY]
     k_T = p[P.AIR_DENSITY] * math.pi * p[P.ROTOR_RADIUS] ** 4
@@ -111,7 +114,7 @@ def hover_speeds(p):
 
 
 @compiled()
-def term_value(i, x, f, p):
+def term_value(i: int, x: np.ndarray, f: np.ndarray, p: np.ndarray) -> float:
     """Value of the term TERMS[i] at a full state and the kernel's workspace."""
     if i < _SQUARES:
         return x[i]
@@ -137,8 +140,8 @@ def term_value(i, x, f, p):
     return f[F.OMEGA_U_DOT] if which == 4 else f[F.OMEGA_L_DOT]
 
 
-def _axis(target, summary):
-    def add(x, f, p, e):
+def _axis(target: int, summary: str) -> Callable:
+    def add(x: np.ndarray, f: np.ndarray, p: np.ndarray, e: int) -> None:
         total = 0.0
         for i in range(_N_TERMS):
             if p[e + i] != 0.0:

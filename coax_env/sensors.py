@@ -127,7 +127,7 @@ _ACCELEROMETER = CHANNELS.index("ax")
 
 
 @compiled()
-def shake(readings, azimuth, amplitude):
+def shake(readings: np.ndarray, azimuth: float, amplitude: float) -> None:
     """Add to a row of readings (18,), in place, what the upper rotor at an azimuth [rad] shakes.
 
     An unbalance turns with the rotor: a line at rotor speed on every axis (effect `vibration`). An
