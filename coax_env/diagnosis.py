@@ -46,6 +46,7 @@ class Diagnosis:
     all runs. replay_before, replay_refitted, replay_after: held-out runs flown again with the vehicle
     as given, its base parameters refitted, and extended. innovations_before, innovations_after: run ->
     {"t": (n,), channel: (n,) whitened}, fit runs. remarks: on data and on unusual values.
+    strongest: candidate of most evidence, named or not (search.py).
     """
 
     findings: dict[str, Any]
@@ -61,6 +62,7 @@ class Diagnosis:
     evidence_history: list[tuple[str, float]]
     remarks: tuple[str, ...] = ()
     noise: dict[str, float] = field(default_factory=dict)
+    strongest: tuple[float, str] = (-math.inf, "")
 
 
 def diagnose(
@@ -154,6 +156,7 @@ def diagnose(
         innovations_after=_innovations(passes_after),
         whiteness={"before": white_before, "after": white_after},
         evidence_history=search.history,
+        strongest=search.strongest,
         remarks=tuple(remarks + _unusual(search, state)),
         noise=sensors,
     )
