@@ -27,10 +27,17 @@ from coax_env.engine.whiteness import Whiteness, whiteness
 from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight
 from coax_env.gain import gain_of
-from coax_env.heli_model import FARTHEST, HeliModel, record_of, sensor_std, starting_noise
+from coax_env.heli_model import (
+    BUFFET_LEVELS,
+    FARTHEST,
+    HeliModel,
+    record_of,
+    sensor_std,
+    starting_noise,
+)
 from coax_env.layout import CHANNELS
 from coax_env.prediction import RunReplay, fly_again, gusts_of
-from coax_env.search import EVIDENCE, TIE, Quadratic, Search, State, together
+from coax_env.search import EVIDENCE, TIE, Quadratic, Search, State, Weight, together
 from coax_env.vehicle import Parameter, Vehicle, load_vehicle
 
 HORIZON = 1.0  # s
@@ -114,10 +121,11 @@ def diagnose(
         State([], dict(refitted.values), refitted.noise, refitted.objective)
     )
     say("weighing the causes against their look-alikes")
+    state, quadratic, weights = search.prune(state, quadratic)
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
     white_after = whiteness(passes_after, CHANNELS)
-    causes = _causes(search, state, quadratic, white_after)
+    causes = _causes(search, state, quadratic, weights, white_after)
     unexplained = _unexplained(white_after, passes_after)
 
     replays: list[list[RunReplay]] = [[], [], []]
@@ -132,8 +140,7 @@ def diagnose(
         gain = gain_of(replays[0], replays[1], replays[2], sensors, HORIZON)
         gain["held_out"] = [r.name for r in held]
     say("refitting the extended model on everything")
-    colours = {e: search.colour(quadratic, state.active, e) for e in state.active}
-    vehicle_after = _extended(model, records, search, state, flight, vehicle, colours)
+    vehicle_after = _extended(model, records, search, state, flight, vehicle, weights)
     ties = [(c["effect"], other) for c in causes for other in c["confusable_with"]]
     findings = {
         "verdict": _verdict(bool(causes), bool(unexplained)),
@@ -157,7 +164,7 @@ def diagnose(
         whiteness={"before": white_before, "after": white_after},
         evidence_history=search.history,
         strongest=search.strongest,
-        remarks=tuple(remarks + _unusual(search, state)),
+        remarks=tuple(remarks + _shaken(search, state) + _unusual(search, state)),
         noise=sensors,
     )
 
@@ -243,20 +250,18 @@ def _fair_share(
 
 
 def _causes(
-    search: Search, state: State, quadratic: Quadratic, white: Mapping[str, Whiteness]
+    search: Search,
+    state: State,
+    quadratic: Quadratic,
+    weights: Mapping[str, Weight],
+    white: Mapping[str, Whiteness],
 ) -> list[dict[str, Any]]:
     std = standard_deviations(search, state, quadratic)
     dt = median_step(search.engine.records)
     causes = []
     for effect in state.active:
         entry = effects.CATALOGUE[effect]
-        rest = [e for e in state.active if e != effect]
-        without = State(
-            rest, state.values | search.off(effect) | search.pinned(effect), state.noise
-        )
-        without = search.refit_noise(without)
-        search.settle(without, steps=2, without=entry.replaces)
-        colour = search.colour(quadratic, state.active, effect)
+        weight = weights[effect]
         channels = _channels(search, state, effect)
         causes.append(
             {
@@ -264,19 +269,19 @@ def _causes(
                 "parameters": {
                     f.name: {
                         "value": float(state.values[f.name]),
-                        "std": with_timing(f, std[f.name] * math.sqrt(colour), dt),
+                        "std": with_timing(f, std[f.name] * math.sqrt(weight.colour), dt),
                         "unit": p.unit,
                     }
                     for f, p in zip(search.by_effect[effect], entry.parameters, strict=True)
                 },
-                "evidence": float(without.objective - state.objective) / colour,
+                "evidence": weight.evidence,
                 "confusable_with": _look_alikes(
                     search,
                     state,
                     quadratic,
                     effect,
-                    max([colour, *(white[c].inflation for c in channels)]),
-                    float(without.objective - state.objective),
+                    max([weight.colour, *(white[c].inflation for c in channels)]),
+                    weight.lost,
                 ),
                 "channels": channels,
             }
@@ -357,6 +362,17 @@ def _channels(search: Search, state: State, effect: str) -> list[str]:
     return [CHANNELS[i] for i in order if total > 0.0 and strength[i] > 0.1 * total]
 
 
+def _shaken(search: Search, state: State) -> list[str]:
+    """What shakes the machine too fast to be a gust, in words; nothing where there is no sign of it."""
+    if BUFFET_LEVELS[0] not in search.levels:
+        return []
+    xy, z, moment_xy, moment_z = (state.noise.process[level] for level in BUFFET_LEVELS)
+    return [
+        "shaken by white noise beside the gusts, x and y, z:"
+        f" force {xy:.2g}, {z:.2g} N s^1/2, moment {moment_xy:.2g}, {moment_z:.2g} N m s^1/2"
+    ]
+
+
 def _unusual(search: Search, state: State) -> list[str]:
     remarks = []
     for effect in state.active:
@@ -426,7 +442,7 @@ def _extended(
     state: State,
     flight: Flight,
     vehicle: Vehicle,
-    colours: Mapping[str, float],
+    weights: Mapping[str, Weight],
 ) -> Vehicle:
     """The vehicle with the causes in it, refitted on all runs."""
     engine = Engine(model, records)
@@ -434,16 +450,18 @@ def _extended(
     estimate = engine.fit(free, state.values, state.noise, iterations=3, tolerance=0.5)
     dt = median_step(records)
     where = flight.path.name if flight.path else "flight"
+
+    def std(f: FreeParameter) -> float:
+        weight = weights.get(f.name.partition(".")[0])
+        return with_timing(
+            f, estimate.std[f.name] * math.sqrt(weight.colour if weight else 1.0), dt
+        )
+
     return fitted_vehicle(
         vehicle,
         free,
         estimate.values,
-        {
-            f.name: with_timing(
-                f, estimate.std[f.name] * math.sqrt(colours.get(f.name.partition(".")[0], 1.0)), dt
-            )
-            for f in free
-        },
+        {f.name: std(f) for f in free},
         estimate.covariance,
         f"diagnosed from {where}",
         flight,

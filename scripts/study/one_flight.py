@@ -142,7 +142,7 @@ def expected_evidence(
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     model = HeliModel(vehicle)
     noise = starting_noise(flight, vehicle)
-    levels = GUSTS if planned.gusts else {**noise.floor, "memory": GUSTS["memory"]}
+    levels = {**noise.process, **(GUSTS if planned.gusts else noise.floor)}
     noise = replace(noise, process=levels)
     engine = Engine(model, _records(flight, held, within=False))
     search = Search(engine, model, tuple(listed))
