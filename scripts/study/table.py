@@ -34,7 +34,7 @@ class Figure:
     def as_json(self) -> dict[str, Any]:
         """For summary.json."""
         low, high = (None, None)
-        if self.value is None:
+        if self.value is None and self.count:
             low, high = (100.0 * x for x in judge.wilson(int(self.good), self.count))
         return {
             "figure": self.name, "bar": self.bar, "percent": self.percent, "good": self.good,
@@ -45,9 +45,9 @@ class Figure:
     @property
     def percent(self) -> float | None:
         """The measured figure."""
-        if self.value is not None:
-            return self.value
-        return 100.0 * self.good / self.count if self.count else None
+        if not self.count:
+            return None
+        return 100.0 * self.good / self.count if self.value is None else self.value
 
 
 def all_figures(rows: Sequence[Row], method: str = OWN) -> list[Figure]:
@@ -156,11 +156,11 @@ def _gain(rows: Sequence[Row]) -> Figure:
         own = (row["gain"] or {}).get("error_removed_percent")
         if truth is not None and own is not None and truth >= LEAST_GAIN:
             pairs.append((own, truth))
-    value = 100.0 * sum(p[0] for p in pairs) / sum(p[1] for p in pairs) if pairs else None
+    value = 100.0 * sum(p[0] for p in pairs) / sum(p[1] for p in pairs) if pairs else 0.0
     reached = sum(own >= 0.9 * truth for own, truth in pairs)
     return Figure(
         "held-out error removed, share of the truth's", ">= 90 %", reached, len(pairs),
-        value if value is not None else float("nan"),
+        value,
         f"{reached} of {len(pairs)} flights reach 90 % themselves",
     )  # fmt: skip
 
