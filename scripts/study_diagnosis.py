@@ -19,6 +19,7 @@ from coax_env.files import make_folder, write_json, write_text
 from coax_env.report.page import Section, figure, page
 
 QUICK = {"clean": 8, "effects": 16}
+PORTION = 4  # flights per worker between two savings on Ray
 
 
 def main() -> None:
@@ -86,12 +87,16 @@ def each(
     require("joblib", "study")
     from joblib import Parallel, delayed, parallel_config
 
-    jobs = options.jobs if options.jobs > 0 else os.cpu_count() or 1
-    if options.backend == "ray":
-        start_ray(jobs)
+    ray = options.backend == "ray"
+    jobs = start_ray(options.jobs) if ray else options.jobs
+    work = [delayed(labelled)(flight, alone) for flight in flights]
     with parallel_config(backend=options.backend, n_jobs=jobs):
-        work = (delayed(labelled)(flight, alone) for flight in flights)
-        yield from Parallel(return_as="generator_unordered", batch_size=1)(work)
+        if not ray:
+            yield from Parallel(return_as="generator_unordered", batch_size=1)(work)
+            return
+        portion = PORTION * jobs  # Ray's backend hands a whole call's results over together
+        for first in range(0, len(work), portion):
+            yield from Parallel(batch_size=1)(work[first : first + portion])
 
 
 def labelled(flight: PlannedFlight, alone: bool) -> tuple[PlannedFlight, dict[str, Any]]:
@@ -99,15 +104,23 @@ def labelled(flight: PlannedFlight, alone: bool) -> tuple[PlannedFlight, dict[st
     return flight, fly_and_diagnose(flight, alone)
 
 
-def start_ray(jobs: int) -> None:
-    """Join the cluster of RAY_ADDRESS, or start one here."""
+def start_ray(jobs: int) -> int:
+    """Join the cluster of RAY_ADDRESS, or start one here; the number of its workers.
+
+    Every machine of a cluster needs this checkout at the same place.
+    """
     require("ray", "study")
     import ray
     from ray.util.joblib import register_ray
 
-    local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": jobs}
-    ray.init(include_dashboard=False, logging_level="ERROR", **local)
+    local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": jobs if jobs > 0 else None}
+    modules = {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    ray.init(
+        include_dashboard=False, logging_level="ERROR", ignore_reinit_error=True,
+        runtime_env={"env_vars": modules}, **local,
+    )  # fmt: skip
     register_ray()
+    return jobs if jobs > 0 else int(ray.cluster_resources()["CPU"])
 
 
 def write_results(out: Path, rows: list[dict[str, Any]], command: str) -> None:

@@ -3,6 +3,7 @@
 No flight is diagnosed here but one, marked slow; what is asked is whether the counting is right.
 """
 
+import argparse
 import csv
 import json
 import math
@@ -438,3 +439,20 @@ def test_one_flight_from_plan_to_table(tmp_path: Path, monkeypatch: pytest.Monke
         "| exact cause, one effect | >= 95 % | 100.0 % | 1/1 |"
         in (tmp_path / "table.md").read_text()
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["loky", "ray"])
+def test_two_workers_do_what_one_does(backend: str) -> None:
+    """joblib's processes and a local Ray of two workers: every flight comes back, once."""
+    if backend == "ray":
+        pytest.importorskip("ray")
+    flights = [
+        PlannedFlight("still", i, {}, False, "full", 5, ("lon_3211",)) for i in range(3)
+    ]  # fmt: skip
+    options = argparse.Namespace(jobs=2, backend=backend, no_baselines=True)
+    rows = {flight.name: row for flight, row in study_diagnosis.each(flights, options)}
+    assert set(rows) == {f.name for f in flights}
+    for row in rows.values():
+        assert "error" not in row, row["error"]
+        assert row["methods"]["coax"] == rows["still-0000"]["methods"]["coax"], "the same seed"
