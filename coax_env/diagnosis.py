@@ -54,6 +54,7 @@ class Diagnosis:
     as given, its base parameters refitted, and extended. innovations_before, innovations_after: run ->
     {"t": (n,), channel: (n,) whitened}, fit runs. remarks: on data and on unusual values. design: the
     maneuvers that part the strongest cause from its look-alikes; None without any.
+    strongest: candidate of most evidence, named or not (search.py).
     """
 
     findings: dict[str, Any]
@@ -70,6 +71,7 @@ class Diagnosis:
     remarks: tuple[str, ...] = ()
     noise: dict[str, float] = field(default_factory=dict)
     design: next_maneuver.Design | None = None
+    strongest: tuple[float, str] = (-math.inf, "")
 
 
 def diagnose(
@@ -177,6 +179,7 @@ def diagnose(
         innovations_after=_innovations(passes_after),
         whiteness={"before": white_before, "after": white_after},
         evidence_history=search.history,
+        strongest=search.strongest,
         remarks=tuple(remarks + _shaken(search, state) + _unusual(search, state)),
         noise=sensors,
         design=design,

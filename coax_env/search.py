@@ -183,6 +183,8 @@ class Search:
     Attributes:
         history: (effect, score) of every move, in order.
         levels: the noise levels that are fitted.
+        strongest: evidence [nats] and name of the candidate that came nearest to being added, or
+            was; the threshold is calibrated on it (scripts/study_diagnosis.py --calibrate).
     """
 
     engine: Engine
@@ -191,6 +193,7 @@ class Search:
     progress: Progress | None = None
     history: list[tuple[str, float]] = field(default_factory=list)
     levels: tuple[str, ...] = GUST_LEVELS
+    strongest: tuple[float, str] = (-math.inf, "")
 
     def __post_init__(self) -> None:
         self.base = self.model.base_parameters()
@@ -531,8 +534,10 @@ class Search:
             if effect in state.active or effect in banned or together(effect) & set(state.active):
                 continue
             score, evidence, large = self.score(quadratic, state.active, effect)
-            if large and evidence > EVIDENCE and score > 0.0:
-                ranked.append((score, effect))
+            if large and score > 0.0:
+                self.strongest = max(self.strongest, (evidence, effect))
+                if evidence > EVIDENCE:
+                    ranked.append((score, effect))
         if not ranked:
             return None
         score, effect = max(ranked)
