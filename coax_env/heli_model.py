@@ -132,11 +132,11 @@ class HeliModel:
         level = noise.process
         p = self.vehicle
         mass = p["mass"].value
-        q[0:2] += (level["buffet_xy"] / mass) ** 2
-        q[2] += (level["buffet_z"] / mass) ** 2
-        q[3] += (level["buffet_moment_xy"] / p["inertia_xx"].value) ** 2
-        q[4] += (level["buffet_moment_xy"] / p["inertia_yy"].value) ** 2
-        q[5] += (level["buffet_moment_z"] / p["inertia_zz"].value) ** 2
+        q[0:2] += (level.get("buffet_xy", 0.0) / mass) ** 2
+        q[2] += (level.get("buffet_z", 0.0) / mass) ** 2
+        q[3] += (level.get("buffet_moment_xy", 0.0) / p["inertia_xx"].value) ** 2
+        q[4] += (level.get("buffet_moment_xy", 0.0) / p["inertia_yy"].value) ** 2
+        q[5] += (level.get("buffet_moment_z", 0.0) / p["inertia_zz"].value) ** 2
         q[20:26] = 2.0 * _gust_levels(noise) ** 2 / noise.process["memory"]
         return q
 

@@ -51,7 +51,7 @@ HIDDEN_SHARE = 0.3
 SCREENED = 10  # candidates of an axis that are looked at by their signatures
 MOST_TERMS = 4  # taken in all
 MOST_FAILURES = 3  # that do not hold before the search gives up
-SHARE = 0.15
+SHARE = 0.4
 """Share of an axis' estimated disturbance that a term must follow: less is told apart from nothing.
 
 On real flights everything is a little coloured, and some term is always worth a few nats.
