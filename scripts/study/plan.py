@@ -142,7 +142,9 @@ def _gusty(kind: str, number: int) -> bool:
     """
     if kind in ("still", "gusty"):
         return kind == "gusty"
-    return (number + number // (2 * len(ALONE))) % 2 == 1
+    if kind == "one":
+        return (number + number // (2 * len(ALONE))) % 2 == 1
+    return (number // 2) % 2 == 1
 
 
 def _hidden(kind: str, number: int, rng: np.random.Generator) -> list[str]:
