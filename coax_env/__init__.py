@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from coax_env.linear import linearize
     from coax_env.prediction import replay
     from coax_env.simulation import simulate
+    from coax_env.user_effects import load_effect
     from coax_env.vehicle import Vehicle, load_vehicle
 
 __version__ = "0.1.0"
@@ -30,6 +31,7 @@ __version__ = "0.1.0"
 _HOME = {
     "Vehicle": "vehicle",
     "load_vehicle": "vehicle",
+    "load_effect": "user_effects",
     "derivative": "dynamics",
     "hover_trim": "dynamics",
     "linearize": "linear",
@@ -49,6 +51,7 @@ __all__ = [
     "hover_trim",
     "identify",
     "linearize",
+    "load_effect",
     "load_vehicle",
     "read_flight",
     "replay",

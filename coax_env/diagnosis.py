@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import effects, next_maneuver, unlisted
+from coax_env import effects, next_maneuver, unlisted, vibration
 from coax_env.engine.fit import Engine, RunPass, part
 from coax_env.engine.model import FreeParameter, Noise, Record
 from coax_env.engine.whiteness import Whiteness, whiteness
@@ -52,7 +52,8 @@ class Diagnosis:
     findings: what findings.json says (contract.md). vehicle_after: the extended model, refitted on
     all runs. replay_before, replay_refitted, replay_after: held-out runs flown again with the vehicle
     as given, its base parameters refitted, and extended. innovations_before, innovations_after: run ->
-    {"t": (n,), channel: (n,) whitened}, fit runs. remarks: on data and on unusual values.
+    {"t": (n,), channel: (n,) whitened}, fit runs. remarks: on data and on unusual values. design: the
+    maneuvers that part the strongest cause from its look-alikes; None without any.
     strongest: candidate of most evidence, named or not (search.py).
     """
 
@@ -69,6 +70,7 @@ class Diagnosis:
     evidence_history: list[tuple[str, float]]
     remarks: tuple[str, ...] = ()
     noise: dict[str, float] = field(default_factory=dict)
+    design: next_maneuver.Design | None = None
     strongest: tuple[float, str] = (-math.inf, "")
 
 
@@ -99,13 +101,17 @@ def diagnose(
     remarks = list(flight.notes) + double_counting(flight, vehicle)
     model = HeliModel(vehicle)
     candidates = _candidates(exclude, vehicle, flight)
-    noise = starting_noise(flight, vehicle)
     for name in hold_out or ():
         flight.run(name)
     if hold_out and set(hold_out) == set(flight.run_names):
         raise InputError("all runs are held out: nothing is left to fit on")
-    records = [record_of(run) for run in flight.runs]
-    sensors = {c: sensor_std(flight, c) for c in flight.channels}
+    line = vibration.find(flight) if "vibration" not in exclude else None
+    calm = vibration.taken_out(flight, line) if line else flight
+    if line:
+        remarks.append(_taken_out(line))
+    noise = starting_noise(calm, vibration.without(vehicle) if line else vehicle)
+    records = [record_of(run) for run in calm.runs]
+    sensors = {c: sensor_std(calm, c) for c in flight.channels}
     say("choosing the runs to hold out")
     fit, held = _split(model, records, noise, hold_out, candidates)
 
@@ -120,13 +126,17 @@ def diagnose(
     state, quadratic = search.run(
         State([], dict(refitted.values), refitted.noise, refitted.objective)
     )
+    state, quadratic, terms = unlisted.explain(search, state, quadratic)
     say("weighing the causes against their look-alikes")
     state, quadratic, weights = search.prune(state, quadratic)
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
     white_after = whiteness(passes_after, CHANNELS)
-    causes = _causes(search, state, quadratic, weights, white_after)
-    unexplained = _unexplained(white_after, passes_after)
+    causes, ties = _causes(search, state, quadratic, weights, white_after)
+    if line and "vibration" not in vehicle.effects:
+        causes = sorted([*causes, _vibration(line)], key=lambda c: -c["evidence"])
+    described = unlisted.entries(search, state, quadratic, passes_after, terms)
+    unexplained = described + _unexplained(white_after, unlisted.speaks_for(described))
 
     replays: list[list[RunReplay]] = [[], [], []]
     gain = None
@@ -140,15 +150,21 @@ def diagnose(
         gain = gain_of(replays[0], replays[1], replays[2], sensors, HORIZON)
         gain["held_out"] = [r.name for r in held]
     say("refitting the extended model on everything")
-    vehicle_after = _extended(model, records, search, state, flight, vehicle, weights)
-    ties = [(c["effect"], other) for c in causes for other in c["confusable_with"]]
+    colours = {effect: weight.colour for effect, weight in weights.items()}
+    colours |= unlisted.colours(search, state, quadratic, terms)
+    vehicle_after = _extended(model, records, search, state, flight, vehicle, colours)
+    design = _design(search, state, quadratic, ties, flight, say)
+    if line and "vibration" not in vehicle.effects:
+        vehicle_after = vehicle_after.with_parameters(
+            {"vibration.amplitude": Parameter(line.amplitude, line.std, "m/s2", _diagnosed(flight))}
+        )
     findings = {
         "verdict": _verdict(bool(causes), bool(unexplained)),
         "causes": causes,
         "gusts": gusts_of(state.noise),
         "unexplained": unexplained,
         "gain": gain,
-        "next_maneuver": next_maneuver.advise(ties),
+        "next_maneuver": next_maneuver.advise(design, EVIDENCE),
         "false_alarm_rate": None,
     }
     return Diagnosis(
@@ -166,6 +182,7 @@ def diagnose(
         strongest=search.strongest,
         remarks=tuple(remarks + _shaken(search, state) + _unusual(search, state)),
         noise=sensors,
+        design=design,
     )
 
 
@@ -181,7 +198,7 @@ def _candidates(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> t
     absent = set(exclude) | set(vehicle.effects)
     if "pn" in flight.channels:  # height then comes with the position, not from a sonar
         absent |= {"sonar_tilt", "sonar_scale", "sonar_delay"}
-    return tuple(e for e in effects.CATALOGUE if e not in absent)
+    return tuple(e for e, entry in effects.CATALOGUE.items() if e not in absent and not entry.line)
 
 
 def double_counting(flight: Flight, vehicle: Vehicle) -> list[str]:
@@ -225,12 +242,12 @@ def _fair_share(
 ) -> tuple[int, ...]:
     """The quarter of the runs that holds out about a quarter of what is known of each effect.
 
-    Information is that of each effect's first parameter, about the vehicle as given and with the
-    starting noise, so that no residual has a say. An effect that would lose most of its excitation
-    counts heavily; one that the held-out runs do not show at all counts too, since its gain could
-    not be measured on them.
+    Information is that of each effect's first parameter, and of a moment that follows the heading,
+    about the vehicle as given and with the starting noise, so that no residual has a say. An effect
+    that would lose most of its excitation counts heavily; one that the held-out runs do not show at
+    all counts too, since its gain could not be measured on them.
     """
-    free = [model.effect_parameters(e)[0] for e in candidates]
+    free = [model.effect_parameters(e)[0] for e in candidates] + unlisted.excitations()
     values = {**model.bare_values, **{f.name: f.value for f in free}}
     _, lin = Engine(model, records).linearise(values, noise, free)
     information = np.einsum("rkk->rk", lin.information)
@@ -255,14 +272,24 @@ def _causes(
     quadratic: Quadratic,
     weights: Mapping[str, Weight],
     white: Mapping[str, Whiteness],
-) -> list[dict[str, Any]]:
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, State]]]:
+    """Entries of findings.json, strongest first, and the refits with each one's look-alikes."""
     std = standard_deviations(search, state, quadratic)
     dt = median_step(search.engine.records)
-    causes = []
+    causes: list[dict[str, Any]] = []
+    ties: dict[str, dict[str, State]] = {}
     for effect in state.active:
         entry = effects.CATALOGUE[effect]
         weight = weights[effect]
         channels = _channels(search, state, effect)
+        ties[effect] = _look_alikes(
+            search,
+            state,
+            quadratic,
+            effect,
+            max([weight.colour, *(white[c].inflation for c in channels)]),
+            weight.lost,
+        )
         causes.append(
             {
                 "effect": effect,
@@ -275,18 +302,31 @@ def _causes(
                     for f, p in zip(search.by_effect[effect], entry.parameters, strict=True)
                 },
                 "evidence": weight.evidence,
-                "confusable_with": _look_alikes(
-                    search,
-                    state,
-                    quadratic,
-                    effect,
-                    max([weight.colour, *(white[c].inflation for c in channels)]),
-                    weight.lost,
-                ),
+                "confusable_with": list(ties[effect]),
                 "channels": channels,
             }
         )
-    return sorted(causes, key=lambda c: -c["evidence"])
+    causes.sort(key=lambda c: -c["evidence"])
+    return causes, {c["effect"]: ties[c["effect"]] for c in causes}
+
+
+def _vibration(line: vibration.Line) -> dict[str, Any]:
+    """The cause that is found by its line and not by a signature."""
+    value = {"value": line.amplitude, "std": line.std, "unit": "m/s2"}
+    return {
+        "effect": "vibration",
+        "parameters": {"vibration.amplitude": value},
+        "evidence": line.evidence,
+        "confusable_with": [],
+        "channels": list(line.channels),
+    }
+
+
+def _taken_out(line: vibration.Line) -> str:
+    return (
+        f"the accelerometers shake at the {line.rotor} rotor's speed by {line.amplitude:.2g} m/s2:"
+        " that line was taken out of their readings before anything else was looked for"
+    )
 
 
 def standard_deviations(search: Search, state: State, quadratic: Quadratic) -> dict[str, float]:
@@ -321,8 +361,8 @@ def _look_alikes(
     effect: str,
     colour: float,
     lost: float,
-) -> list[str]:
-    """Effects that would do as well in this one's place, by refitted likelihood.
+) -> dict[str, State]:
+    """Effects that would do as well in this one's place, by refitted likelihood, and those refits.
 
     Coloured innovations carry less than they seem to: the tie widens by the colour, up to half of
     what is `lost` (nats) with nothing in the effect's place.
@@ -338,17 +378,50 @@ def _look_alikes(
             does_something = nothing - now - change > 0.5 * (nothing - now)
             if change < 3.0 * tie and does_something:
                 near.append((change, other, move))
-    result = []
-    for _, other, move in sorted(near, key=lambda n: n[0])[:3]:
+
+    def in_its_place(other: str, move: np.ndarray) -> State:
         values = dict(zip(quadratic.names, (quadratic.at + move).tolist(), strict=True))
         active = [other if e == effect else e for e in state.active]
-        trial = search.settle(State(active, state.values | values, state.noise), steps=2)
+        return search.settle(State(active, state.values | values, state.noise), steps=2)
+
+    result = {}
+    for _, other, move in sorted(near, key=lambda n: n[0])[:3]:
+        trial = in_its_place(other, move)
         if trial.objective - state.objective < tie:
-            result.append(other)
+            result[other] = trial
     for twin in sorted(together(effect) & set(search.candidates) - set(result)):
         if search.score(quadratic, state.active, twin)[1] > EVIDENCE:  # a mixture of the two
-            result.append(twin)
+            _, move = search.swap(quadratic, state.active, effect, twin)
+            result[twin] = in_its_place(twin, move)
     return result
+
+
+def _design(
+    search: Search,
+    state: State,
+    quadratic: Quadratic,
+    ties: Mapping[str, Mapping[str, State]],
+    flight: Flight,
+    say: Progress,
+) -> next_maneuver.Design | None:
+    """The maneuvers that part the strongest tied cause from its look-alikes.
+
+    What the flights told of the alternatives' numbers is taken from the final quadratic.
+    """
+    tied = next((effect for effect, others in ties.items() if others), None)
+    if tied is None:
+        return None
+    say("designing the next maneuver")
+    alternatives = []
+    for name, refit in {tied: state, **ties[tied]}.items():
+        free = search.free(refit.active)
+        i = quadratic.index([f.name for f in free])
+        alternatives.append(
+            next_maneuver.Alternative.of(
+                name, search.model.vehicle, free, refit.values, quadratic.G[np.ix_(i, i)]
+            )
+        )
+    return next_maneuver.design(alternatives, state.noise, next_maneuver.logged_rates(flight))
 
 
 def _channels(search: Search, state: State, effect: str) -> list[str]:
@@ -402,12 +475,12 @@ def _unusual(search: Search, state: State) -> list[str]:
 # --- what is left, what to do next --------------------------------------------------------------------
 
 
-def _unexplained(white: Mapping[str, Whiteness], passes: Sequence[RunPass]) -> list[dict[str, Any]]:
-    """What is left: axes with the states they follow, then channels that are just not white."""
-    coloured = [channel for channel, w in white.items() if not w.white]
-    described = unlisted.describe(passes, coloured)
-    rest = [c for c in coloured if c not in unlisted.speaks_for(described)]
-    return described + [
+def _unexplained(
+    white: Mapping[str, Whiteness], described: Collection[str]
+) -> list[dict[str, Any]]:
+    """Channels that are just not white, beside those that unlisted terms describe."""
+    rest = [c for c, w in white.items() if not w.white and c not in described]
+    return [
         {
             "channel": c,
             "depends_on": [],
@@ -442,20 +515,17 @@ def _extended(
     state: State,
     flight: Flight,
     vehicle: Vehicle,
-    weights: Mapping[str, Weight],
+    colours: Mapping[str, float],
 ) -> Vehicle:
     """The vehicle with the causes in it, refitted on all runs."""
     engine = Engine(model, records)
     free = search.free(state.active)
     estimate = engine.fit(free, state.values, state.noise, iterations=3, tolerance=0.5)
     dt = median_step(records)
-    where = flight.path.name if flight.path else "flight"
 
     def std(f: FreeParameter) -> float:
-        weight = weights.get(f.name.partition(".")[0])
-        return with_timing(
-            f, estimate.std[f.name] * math.sqrt(weight.colour if weight else 1.0), dt
-        )
+        colour = colours.get(f.name.partition(".")[0], 1.0)
+        return with_timing(f, estimate.std[f.name] * math.sqrt(colour), dt)
 
     return fitted_vehicle(
         vehicle,
@@ -463,9 +533,14 @@ def _extended(
         estimate.values,
         {f.name: std(f) for f in free},
         estimate.covariance,
-        f"diagnosed from {where}",
+        _diagnosed(flight),
         flight,
     )
+
+
+def _diagnosed(flight: Flight) -> str:
+    """Source of a number in the extended vehicle's file."""
+    return f"diagnosed from {flight.path.name if flight.path else 'flight'}"
 
 
 def fitted_vehicle(
@@ -482,7 +557,7 @@ def fitted_vehicle(
     for f in free:
         group, _, own = f.name.rpartition(".")
         if group:
-            unit = next(p.unit for p in effects.CATALOGUE[group].parameters if p.name == own)
+            unit = next(p.unit for p in effects.GROUPS[group].parameters if p.name == own)
         else:
             unit = vehicle[f.name].unit
         changed[f.name] = Parameter(float(values[f.name]), float(std[f.name]), unit, source)

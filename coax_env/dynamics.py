@@ -37,6 +37,7 @@ _air_effects = effects.stage_function(effects.AIR)
 _swash_effects = effects.stage_function(effects.SWASH)
 _rotor_effects = effects.stage_function(effects.ROTOR)
 _load_effects = effects.stage_function(effects.LOAD)
+_unlisted_terms = effects.stage_function(effects.UNLISTED)
 _sensor_effects = effects.stage_function(effects.SENSOR)
 _property_effects = effects.stage_function(effects.PROPERTY)
 
@@ -167,6 +168,8 @@ def _rates_of(with_effects):
         f[F.MOMENT_Z] += x[25] * f[F.INERTIA_ZZ] / p[P.GUST_INERTIA_ZZ]
         if with_effects and p[effects.LOAD] != 0.0:
             _load_effects(x, f, p)
+        if with_effects and p[effects.UNLISTED] != 0.0:
+            _unlisted_terms(x, f, p)
 
         # (32)-(34)
         g = p[P.GRAVITY]
@@ -205,7 +208,8 @@ _rates_bare = _rates_of(False)
 @compiled()
 def _rates(x, p, f, dx):
     """Rates of the paper's sixteen states, (26)-(44), shape (16,), into `dx`."""
-    if p[effects.AIR] + p[effects.SWASH] + p[effects.ROTOR] + p[effects.LOAD] != 0.0:
+    flown = p[effects.AIR] + p[effects.SWASH] + p[effects.ROTOR] + p[effects.LOAD]
+    if flown + p[effects.UNLISTED] != 0.0:
         _rates_with_effects(x, p, f, dx)
     else:
         _rates_bare(x, p, f, dx)

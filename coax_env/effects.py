@@ -13,6 +13,7 @@ in place. It runs at its *stage* of the kernel (dynamics.py):
 - ``SWASH``: the swash plate's tilt;
 - ``ROTOR``: thrust and torque of the two rotors;
 - ``LOAD``: forces, moments and flap rates;
+- ``UNLISTED``: the generic terms of what no effect here explains (generic_terms.py);
 - ``SENSOR``: readings.
 
 An effect with a memory of its own uses one: first-order lags of rotors and servos are states of the
@@ -26,20 +27,23 @@ other sign is explaining something else.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numba import njit
 
 from coax_env import flow as F
+from coax_env import generic_terms
 from coax_env import parameters as P
+from coax_env.errors import InputError
 from coax_env.jit import compiled
 from coax_env.layout import CHANNELS
 
-STAGES = ("PROPERTY", "AIR", "SWASH", "ROTOR", "LOAD", "SENSOR")
-PROPERTY, AIR, SWASH, ROTOR, LOAD, SENSOR = (P.N_FIXED + i for i in range(len(STAGES)))
+STAGES = ("PROPERTY", "AIR", "SWASH", "ROTOR", "LOAD", "UNLISTED", "SENSOR")
+PROPERTY, AIR, SWASH, ROTOR, LOAD, UNLISTED, SENSOR = (P.N_FIXED + i for i in range(len(STAGES)))
 """Where each stage's switch stands in the parameter vector."""
 
 INFINITY = math.inf
@@ -70,7 +74,12 @@ class EffectParameter:
 
 @dataclass(frozen=True)
 class Effect:
-    """One entry of the catalogue. ``replaces`` names base parameters that are the same column."""
+    """One group of parameters with the function that acts on them.
+
+    ``replaces`` names base parameters that are the same column. ``input_shift``: acts on the input,
+    not in the kernel. ``line``: found by its line in the spectrum (vibration.py), not by a signature.
+    ``generic``: unlisted terms, of which a vehicle file holds those that are not zero.
+    """
 
     name: str
     stage: int
@@ -78,9 +87,11 @@ class Effect:
     channels: tuple[str, ...]
     source: str
     summary: str
-    function: Callable
+    function: Any  # compiled
     replaces: tuple[str, ...] = ()
     input_shift: bool = False
+    line: bool = False
+    generic: bool = False
     index: int = -1
 
     def names(self) -> tuple[str, ...]:
@@ -89,6 +100,9 @@ class Effect:
 
 
 CATALOGUE: dict[str, Effect] = {}
+"""The effects that have a name: what can be found, excluded and listed as a cause."""
+GROUPS: dict[str, Effect] = {}
+"""Those and the generic groups: everything that a vehicle file and the kernel know."""
 _FIRST = P.N_FIXED + len(STAGES)
 
 
@@ -99,14 +113,26 @@ def effect(
     source: str,
     replaces: tuple[str, ...] = (),
     input_shift: bool = False,
+    line: bool = False,
+    generic: bool = False,
+    name: str = "",
 ) -> Callable[[Callable], Callable]:
-    """Enter a function into the catalogue under its own name; its docstring is the summary."""
+    """Enter a function into the catalogue under its own (or this) name; its docstring says what it is.
+
+    Raises:
+        InputError: the name is taken, or a channel does not exist.
+    """
 
     def enter(function: Callable) -> Callable:
-        taken = sum(len(e.parameters) for e in CATALOGUE.values())
+        own = name or function.__name__
+        if own in GROUPS:
+            raise InputError(f"the catalogue of effects has {own!r} already")
+        for channel in channels.split():
+            if channel not in CHANNELS:
+                raise InputError(f"effect {own!r}: no channel {channel!r}")
         function_compiled = compiled()(function)
         entry = Effect(
-            name=function.__name__,
+            name=own,
             stage=stage,
             parameters=parameters,
             channels=tuple(channels.split()),
@@ -115,12 +141,40 @@ def effect(
             function=function_compiled,
             replaces=replaces,
             input_shift=input_shift,
-            index=_FIRST + taken,
+            line=line,
+            generic=generic,
+            index=n_parameters(),
         )
-        CATALOGUE[entry.name] = entry
+        GROUPS[own] = entry
+        if not generic:
+            CATALOGUE[own] = entry
+        _offs.cache_clear()
         return function_compiled
 
     return enter
+
+
+def forget(names: Collection[str]) -> None:
+    """Take the latest entries out again (a user's file that turned out faulty)."""
+    for name in names:
+        GROUPS.pop(name)
+        CATALOGUE.pop(name, None)
+    _offs.cache_clear()
+
+
+def n_parameters() -> int:
+    """Length of the parameter vector."""
+    return _FIRST + sum(len(e.parameters) for e in GROUPS.values())
+
+
+@cache
+def _offs() -> tuple[np.ndarray, np.ndarray]:
+    """Off-values of all effects' parameters, and the switch each one throws (-1: a shape), (k,)."""
+    every = [(p, e.stage) for e in GROUPS.values() for p in e.parameters]
+    return (
+        np.array([p.off for p, _ in every]),
+        np.array([-1 if p.shape else stage for p, stage in every]),
+    )
 
 
 # --- properties -----------------------------------------------------------------------------------
@@ -349,13 +403,10 @@ def wake_interference(x, f, p, e):
 )
 def thrust_exponent(x, f, p, e):
     """Thrust goes as speed to the power 2 + excess, unchanged at the bare model's hover speed."""
-    weight = p[P.MASS] * p[P.GRAVITY]
-    k_T = p[P.AIR_DENSITY] * math.pi * p[P.ROTOR_RADIUS] ** 4
-    speed_ratio2 = p[P.C_QU] / p[P.C_QL]  # (omega_l / omega_u)^2 where torques balance
-    hover_u2 = weight / (k_T * (p[P.C_TU] + p[P.C_TL] * speed_ratio2))
+    hover_u, hover_l = generic_terms.hover_speeds(p)
     if f[F.OMEGA_U] > 0.0 and f[F.OMEGA_L] > 0.0:
-        f[F.THRUST_U] *= (f[F.OMEGA_U] ** 2 / hover_u2) ** (0.5 * p[e])
-        f[F.THRUST_L] *= (f[F.OMEGA_L] ** 2 / (hover_u2 * speed_ratio2)) ** (0.5 * p[e])
+        f[F.THRUST_U] *= (f[F.OMEGA_U] / hover_u) ** p[e]
+        f[F.THRUST_L] *= (f[F.OMEGA_L] / hover_l) ** p[e]
 
 
 # --- forces, moments, flap rates ------------------------------------------------------------------
@@ -601,9 +652,39 @@ def sonar_delay(x, f, p, e):
     f[_HEIGHT] += p[e] * f[_SINK]
 
 
-# --- what the kernel and the vehicle files read -----------------------------------------------------
+@effect(
+    SENSOR,
+    EffectParameter("amplitude", "m/s2", usual=0.5, smallest=0.1, lower=0.0),
+    channels="ax ay az",
+    source="a rotor out of balance; a line at its speed and the aliases that sampling makes of it",
+    line=True,
+)
+def vibration(x, f, p, e):
+    """The accelerometers shake at rotor speed: readings + amplitude sin(azimuth) (vibration.py)."""
 
-N_PARAMETERS = _FIRST + sum(len(e.parameters) for e in CATALOGUE.values())
+
+# --- what no list explains --------------------------------------------------------------------------
+
+for _group, (_unit, _) in generic_terms.AXES.items():
+    effect(
+        UNLISTED,
+        *(
+            EffectParameter(
+                term.key,
+                generic_terms.unit_of(_group, term),
+                usual=generic_terms.USUAL[_unit] / term.usual,
+                smallest=0.1 * generic_terms.USUAL[_unit] / term.usual,
+            )
+            for term in generic_terms.TERMS
+        ),
+        channels="",
+        source="low-order terms, Morelli and Klein 2016, ch. 5",
+        generic=True,
+        name=_group,
+    )(generic_terms.AXIS_FUNCTIONS[_group])
+
+
+# --- what the kernel and the vehicle files read -----------------------------------------------------
 
 
 def parameter_index(name: str) -> int:
@@ -611,18 +692,15 @@ def parameter_index(name: str) -> int:
     group, _, own = name.rpartition(".")
     if not group:
         return P.GUST_MEMORY if name == "gust_memory" else list(P.BASE).index(name)
-    entry = CATALOGUE[group]
+    entry = GROUPS[group]
     return entry.index + [p.name for p in entry.parameters].index(own)
 
 
 def off_vector() -> np.ndarray:
     """Parameter vector with every effect off and the base parameters NaN."""
-    vector = np.full(N_PARAMETERS, np.nan)
+    vector = np.full(n_parameters(), np.nan)
     vector[P.GUST_MEMORY] = 0.5
-    for entry in CATALOGUE.values():
-        vector[entry.index : entry.index + len(entry.parameters)] = [
-            p.off for p in entry.parameters
-        ]
+    vector[_FIRST:] = _offs()[0]
     set_switches(vector)
     return vector
 
@@ -641,23 +719,28 @@ def pack(values: Mapping[str, float]) -> np.ndarray:
 def set_switches(vector: np.ndarray) -> None:
     """Switch on, in place, the stages that have an effect away from its off-value."""
     vector[P.N_FIXED : _FIRST] = 0.0
-    for entry in CATALOGUE.values():
-        for offset, parameter in enumerate(entry.parameters):
-            if not parameter.shape and vector[entry.index + offset] != parameter.off:
-                vector[entry.stage] = 1.0
+    off, switch = _offs()
+    thrown = switch[(vector[_FIRST:] != off) & (switch >= 0)]
+    vector[thrown] = 1.0
 
 
 def completed(effect_name: str, table: Mapping[str, Any], make: Callable) -> dict[str, Any]:
-    """An effect's parameters in catalogue order, absent ones at their off-value."""
+    """An effect's parameters in catalogue order, absent ones at their off-value.
+
+    Of a generic group only what is not zero.
+    """
+    entry = GROUPS[effect_name]
+    if entry.generic:
+        names = [p.name for p in entry.parameters if p.name in table and table[p.name].value != 0.0]
+        return {name: table[name] for name in names}
     return {
-        p.name: table.get(p.name) or make(p.off, 0.0, p.unit, "off-value")
-        for p in CATALOGUE[effect_name].parameters
+        p.name: table.get(p.name) or make(p.off, 0.0, p.unit, "off-value") for p in entry.parameters
     }
 
 
 def stage_function(stage: int) -> Callable:
     """One compiled function that runs all effects of a stage in the catalogue's order."""
-    entries = [e for e in CATALOGUE.values() if e.stage == stage]
+    entries = [e for e in GROUPS.values() if e.stage == stage]
 
     @njit(error_model="numpy")
     def nothing(x, f, p):

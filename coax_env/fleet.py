@@ -26,7 +26,7 @@ from coax_env.errors import InputError
 from coax_env.jit import compiled
 from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
 from coax_env.random_streams import COUNTER, stream_key, two_normals, uniform
-from coax_env.sensors import Sensor, is_new, slow_instruments, suite
+from coax_env.sensors import Sensor, is_new, shake, slow_instruments, suite
 from coax_env.vehicle import SHIPPED, Vehicle, load_vehicle
 
 DT = hover.CONTROL_PERIOD
@@ -40,6 +40,7 @@ ROWS_PER_THREAD = 256  # fewer are not worth a thread
 # columns of the sensor table the kernel reads
 _INDEX, _NOISE, _RATE, _LOW, _HIGH, _WRAPS, _FLAG = range(7)
 _DELAY = effects.parameter_index("servo_delay.time")
+_VIBRATION = effects.parameter_index("vibration.amplitude")
 _WIND_NORTH = effects.parameter_index("wind.north")
 
 
@@ -67,9 +68,11 @@ def _advance(x, u, p, swash, at, work):
 
 
 @compiled()
-def _sense(x, u, p, row, sensors, stream, held, readings, work, out):
+def _sense(x, u, p, row, azimuth, sensors, stream, held, readings, work, out):
     """New readings where they are due, into `held` (float64) and as an observation into `out`."""
     measure(x, u, p, work, readings)
+    if p[_VIBRATION] != 0.0:
+        shake(readings, azimuth, p[_VIBRATION])
     n = len(sensors)
     for k in range(n, len(held)):
         held[k] = 0.0
@@ -114,7 +117,7 @@ def _blow(x, p, gust, stream):
 @compiled()
 def _fly_rows(
     first, last, active, actions, trim, scale, params, sensors, gust,
-    x, u, rows, streams, swash, held,
+    x, u, rows, azimuth, streams, swash, held,
     observations, rewards, terms, over,
 ):  # fmt: skip
     """One control period of the active rows first..last-1. See Fleet for the arrays."""
@@ -139,10 +142,12 @@ def _fly_rows(
             _blow(x[i], p, gust, streams[i])
         _advance(x[i], u[i], p, swash[i], at, work)
         rows[i] += 1
+        azimuth[i] = (azimuth[i] + DT * x[i, 16]) % (2.0 * math.pi)
         u[i, TIME] = rows[i] * DT
         _sense(
-            x[i], u[i], p, rows[i], sensors, streams[i], held[i], readings, work, observations[i]
-        )
+            x[i], u[i], p, rows[i], azimuth[i], sensors, streams[i], held[i], readings, work,
+            observations[i],
+        )  # fmt: skip
         rewards[i] = hover.reward(x[i], actions[i], terms[i])
         over[i] = hover.is_over(x[i])
 
@@ -150,7 +155,7 @@ def _fly_rows(
 @compiled()
 def _restart_rows(
     which, keep_state, trim, params, sensors, wind_speed,
-    x, u, rows, streams, swash, held, observations,
+    x, u, rows, azimuth, streams, swash, held, observations,
 ):  # fmt: skip
     """New flights for the rows of the mask `which`; with `keep_state` from what stands in `x`."""
     work = np.empty(WORK_SIZE)
@@ -170,11 +175,15 @@ def _restart_rows(
             u[i, k] = trim[k]
         u[i, TIME] = 0.0
         rows[i] = 0
+        azimuth[i] = 0.0
         for k in range(swash.shape[1]):
             swash[i, k, 0], swash[i, k, 1] = trim[2], trim[3]
         for k in range(held.shape[1]):
             held[i, k] = 0.0
-        _sense(x[i], u[i], p, 0, sensors, streams[i], held[i], readings, work, observations[i])
+        _sense(
+            x[i], u[i], p, 0, azimuth[i], sensors, streams[i], held[i], readings, work,
+            observations[i],
+        )  # fmt: skip
 
 
 @dataclass
@@ -192,7 +201,8 @@ class Fleet:
 
     Attributes:
         x: full states, shape (count, 26). u: commands in force and time, (count, 5).
-        rows: control periods flown, (count,). streams: key and counter, (count, 2) uint64.
+        rows: control periods flown, (count,). azimuth: of the upper rotor, (count,) rad.
+        streams: key and counter, (count, 2) uint64.
         params: parameter vectors, (count or 1, n). held: readings held, (count, n_obs).
         trim, scale: command = trim + scale * action, each (4,), of the nominal vehicle.
     """
@@ -231,6 +241,7 @@ class Fleet:
         self.x = np.zeros((count, N_FULL))
         self.u = np.zeros((count, N_INPUTS))
         self.rows = np.zeros(count, dtype=np.int64)
+        self.azimuth = np.zeros(count)
         self.streams = np.zeros((count, 2), dtype=np.uint64)
         self.swash = np.zeros((count, slots, 2))
         self.held = np.zeros((count, self.n_observed))
@@ -264,7 +275,8 @@ class Fleet:
         observations = self.held.astype(np.float32)
         _restart_rows(
             which, states is not None, self.trim, self.params, self._table, self._wind_speed,
-            self.x, self.u, self.rows, self.streams, self.swash, self.held, observations,
+            self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.held,
+            observations,
         )  # fmt: skip
         return observations
 
@@ -281,8 +293,8 @@ class Fleet:
         def rows(first: int, last: int) -> None:
             _fly_rows(
                 first, last, active, actions, self.trim, self.scale, self.params, self._table,
-                self._gust, self.x, self.u, self.rows, self.streams, self.swash, self.held,
-                outcome.observations, outcome.rewards, outcome.terms, outcome.over,
+                self._gust, self.x, self.u, self.rows, self.azimuth, self.streams, self.swash,
+                self.held, outcome.observations, outcome.rewards, outcome.terms, outcome.over,
             )  # fmt: skip
 
         if self._threads == 1:

@@ -206,7 +206,10 @@ def record_of(run: Run) -> Record:
 
 
 def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
-    """Noise to start from: readings as the card says or the data show, gusts by guess."""
+    """Noise to start from: readings as the card says or the data show, gusts by guess.
+
+    A vehicle's vibration is noise to the filter, on top of what the card says: its phase is not known.
+    """
     weight = vehicle["mass"].value * vehicle["gravity"].value
     arm = vehicle["arm_upper"].value
     process = {
@@ -225,8 +228,11 @@ def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
     for gust, buffet in zip(GUST_LEVELS, BUFFET_LEVELS, strict=True):
         floor[buffet] = 0.1 * floor[gust]
         process[buffet] = 0.1 * floor[gust]
+    shake = vehicle.values().get("vibration.amplitude", 0.0) / np.sqrt(2.0)
     reading = {
-        c: flight.noise.get(c) or max(2.0 * sensor_std(flight, c), LEAST_READING_STD[c])
+        c: float(np.hypot(flight.noise[c], shake if c in ("ax", "ay", "az") else 0.0))
+        if c in flight.noise
+        else max(2.0 * sensor_std(flight, c), LEAST_READING_STD[c])
         for c in flight.channels
     }
     return Noise(process, reading, floor)

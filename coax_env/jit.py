@@ -21,6 +21,7 @@ KERNEL_SOURCES = (
     "layout.py",
     "flow.py",
     "parameters.py",
+    "generic_terms.py",
     "effects.py",
     "dynamics.py",
     "sensors.py",
@@ -52,6 +53,14 @@ def _cache_root() -> Path:
 
 
 CACHE_DIR = _cache_root() / source_hash()
+_included: list[Path] = []
+
+
+def include(path: Path) -> None:
+    """Let a user's file take part in the kernel: what is compiled from now on has its own cache."""
+    global CACHE_DIR
+    _included.append(path)
+    CACHE_DIR = _cache_root() / source_hash(tuple(_included))
 
 
 @contextmanager

@@ -195,6 +195,7 @@ _CONSEQUENCES: dict[str, Callable[[Values, Values], str]] = {
     ),
     "sonar_delay": lambda e, v: f"the height reading is {_ms(e['time'])} late",
     "sonar_scale": lambda e, v: f"the height reads {percent(e['scale'])}",
+    "vibration": lambda e, v: f"the accelerometers shake by ±{number(e['amplitude'])} m/s²",
 }
 """Effect -> what its values mean, from its own values and the vehicle's."""
 

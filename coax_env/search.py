@@ -205,6 +205,16 @@ class Search:
         if self.progress:
             self.progress(text)
 
+    def loosen(self, parameters: Sequence[FreeParameter]) -> None:
+        """Fit these from now on, as the base parameters are (unlisted.py)."""
+        self.base = [*self.base, *parameters]
+        self.all = [*self.all, *parameters]
+
+    def tighten(self, names: Collection[str]) -> None:
+        """Stop fitting these."""
+        self.base = [f for f in self.base if f.name not in names]
+        self.all = [f for f in self.all if f.name not in names]
+
     # --- which parameters are loose -----------------------------------------------------------------
 
     def free_names(self, active: Collection[str]) -> list[str]:

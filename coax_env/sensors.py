@@ -123,6 +123,21 @@ def slow_instruments(sensors: tuple[Sensor, ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(s.instrument for s in sensors if s.rate < BASE_RATE))
 
 
+_ACCELEROMETER = CHANNELS.index("ax")
+
+
+@compiled()
+def shake(readings: np.ndarray, azimuth: float, amplitude: float) -> None:
+    """Add to a row of readings (18,), in place, what the upper rotor at an azimuth [rad] shakes.
+
+    An unbalance turns with the rotor: a line at rotor speed on every axis (effect `vibration`). An
+    amplitude [m/s2] of zero changes nothing.
+    """
+    readings[_ACCELEROMETER] += amplitude * math.sin(azimuth)
+    readings[_ACCELEROMETER + 1] += amplitude * math.cos(azimuth)
+    readings[_ACCELEROMETER + 2] += amplitude * math.sin(azimuth)
+
+
 @compiled()
 def is_new(row: int, rate: float) -> bool:
     """Whether a sensor of `rate` [Hz] has a new sample in a row of the 100 Hz loop; row 0 always.

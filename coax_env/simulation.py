@@ -24,7 +24,7 @@ from coax_env.layout import (
 )
 from coax_env.maneuvers import Maneuver, maneuver
 from coax_env.pilot import CORNER, Pilot, rounded
-from coax_env.sensors import Sensor, log_readings, log_suite
+from coax_env.sensors import Sensor, log_readings, log_suite, shake
 from coax_env.vehicle import Vehicle, load_vehicle
 
 STEP = 0.01  # [s] the paper's
@@ -115,6 +115,7 @@ def fly(
     work = np.zeros(dynamics.WORK_SIZE)
     states, commands = np.empty((len(t), N_FULL)), np.empty((len(t), 4))
     readings = np.empty((len(t), N_CHANNELS))
+    vibration, azimuth = values[effects.parameter_index("vibration.amplitude")], 0.0
     rows, ended = len(t), ""
     for k, time in enumerate(t):
         command = plan_command[k].copy()
@@ -124,6 +125,7 @@ def fly(
         commands[k] = command
         pieces = delay.pieces(command)
         dynamics.measure(x, dynamics.kernel_input(pieces[0][1], time), values, work, readings[k])
+        shake(readings[k], azimuth, vibration)
         states[k] = x
         ended = _why_it_ends(x)
         if ended:
@@ -133,6 +135,7 @@ def fly(
         for seconds, held in pieces:
             dynamics.step(x, dynamics.kernel_input(held, begin), seconds, values, work, x)
             begin += seconds
+        azimuth += dt * x[16]
         if gusting:
             x[20:26] += level * math.sqrt(1.0 - keep * keep) * rng.standard_normal(6)
     if rows and t[rows - 1] < SHORTEST_RUN:

@@ -72,7 +72,7 @@ class Vehicle:
 
     @cached_property
     def vector(self) -> np.ndarray:
-        """The kernel's parameter vector, shape (effects.N_PARAMETERS,)."""
+        """The kernel's parameter vector, shape (effects.n_parameters(),)."""
         return effects.pack(self.values())
 
     def with_values(self, values: Mapping[str, float], source: str | None = None) -> "Vehicle":
@@ -101,7 +101,7 @@ class Vehicle:
 
     def with_effect(self, effect: str, **values: float) -> "Vehicle":
         """A copy with an effect of the catalogue switched on, for instance ``gain=0.3``."""
-        known = effects.CATALOGUE[effect].parameters
+        known = effects.GROUPS[effect].parameters
         unknown = set(values) - {p.name for p in known}
         if unknown:
             raise KeyError(f"effect {effect!r} has no parameter {sorted(unknown)[0]!r}")
@@ -199,10 +199,10 @@ def _vehicle_from(document: dict[str, Any], path: Path) -> Vehicle:
     if not isinstance(raw, dict):
         raise InputError(f"{path}: [effects] must hold one table per effect")
     for effect, content in raw.items():
-        if effect not in effects.CATALOGUE:
+        if effect not in effects.GROUPS:
             raise InputError(f"{path}: effects.{effect} is not in the catalogue of effects")
         table = _table(content, path, f"effects.{effect}")
-        known = {p.name: p for p in effects.CATALOGUE[effect].parameters}
+        known = {p.name: p for p in effects.GROUPS[effect].parameters}
         for name, parameter in table.items():
             if name not in known:
                 raise InputError(f"{path}: effects.{effect}.{name} is not a parameter of it")

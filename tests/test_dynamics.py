@@ -727,7 +727,7 @@ def test_sonar_effects(seed):
 TESTED_APART = {
     "wind", "motor_lag", "servo_lag", "servo_delay", "battery_sag", "spin_up_reaction",
     "imu_lever_arm", "imu_tilt", "accel_scale", "accel_bias", "gyro_bias", "attitude_bias",
-    "sonar_tilt", "sonar_scale", "sonar_delay",
+    "sonar_tilt", "sonar_scale", "sonar_delay", "vibration",
 }  # fmt: skip
 
 
