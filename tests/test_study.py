@@ -52,10 +52,12 @@ def test_a_full_study_has_every_effect_with_both_sensor_sets() -> None:
     flights = plan.plan(200, 400)
     ones = {(next(iter(f.effects)), f.sensors) for f in flights if f.kind == "one"}
     assert ones == {(e, s) for e in plan.ALONE for s in ("full", "onboard")}
+    weather = {(e, f.sensors, f.gusts) for f in flights if f.kind == "one" for e in f.effects}
+    assert len(weather) > 3 * len(plan.ALONE), "in gusts and in still air"
+    assert all(f.gusts == (f.kind == "gusty") for f in flights if not f.effects)
     for kind, count in (("two", 2), ("three", 3)):
         assert {len(f.effects) for f in flights if f.kind == kind} == {count}
     for flight in flights:
-        assert flight.gusts == (flight.kind != "still")
         assert "wind" not in flight.effects or "rotor_drag" in flight.effects
         names = list(flight.effects)
         assert not any(judge.tied(a, b) for a in names for b in names if a != b)
