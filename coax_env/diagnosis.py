@@ -27,10 +27,17 @@ from coax_env.engine.whiteness import Whiteness, whiteness
 from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight
 from coax_env.gain import gain_of
-from coax_env.heli_model import FARTHEST, HeliModel, record_of, sensor_std, starting_noise
+from coax_env.heli_model import (
+    BUFFET_LEVELS,
+    FARTHEST,
+    HeliModel,
+    record_of,
+    sensor_std,
+    starting_noise,
+)
 from coax_env.layout import CHANNELS
 from coax_env.prediction import RunReplay, fly_again, gusts_of
-from coax_env.search import EVIDENCE, TIE, Quadratic, Search, State, together
+from coax_env.search import EVIDENCE, TIE, Quadratic, Search, State, Weight, together
 from coax_env.vehicle import Parameter, Vehicle, load_vehicle
 
 HORIZON = 1.0  # s
@@ -45,7 +52,9 @@ class Diagnosis:
     findings: what findings.json says (contract.md). vehicle_after: the extended model, refitted on
     all runs. replay_before, replay_refitted, replay_after: held-out runs flown again with the vehicle
     as given, its base parameters refitted, and extended. innovations_before, innovations_after: run ->
-    {"t": (n,), channel: (n,) whitened}, fit runs. remarks: on data and on unusual values.
+    {"t": (n,), channel: (n,) whitened}, fit runs. remarks: on data and on unusual values. design: the
+    maneuvers that part the strongest cause from its look-alikes; None without any.
+    strongest: candidate of most evidence, named or not (search.py).
     """
 
     findings: dict[str, Any]
@@ -61,6 +70,8 @@ class Diagnosis:
     evidence_history: list[tuple[str, float]]
     remarks: tuple[str, ...] = ()
     noise: dict[str, float] = field(default_factory=dict)
+    design: next_maneuver.Design | None = None
+    strongest: tuple[float, str] = (-math.inf, "")
 
 
 def diagnose(
@@ -117,10 +128,11 @@ def diagnose(
     )
     state, quadratic, terms = unlisted.explain(search, state, quadratic)
     say("weighing the causes against their look-alikes")
+    state, quadratic, weights = search.prune(state, quadratic)
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
     white_after = whiteness(passes_after, CHANNELS)
-    causes = _causes(search, state, quadratic, white_after)
+    causes, ties = _causes(search, state, quadratic, weights, white_after)
     if line and "vibration" not in vehicle.effects:
         causes = sorted([*causes, _vibration(line)], key=lambda c: -c["evidence"])
     described = unlisted.entries(search, state, quadratic, passes_after, terms)
@@ -138,21 +150,21 @@ def diagnose(
         gain = gain_of(replays[0], replays[1], replays[2], sensors, HORIZON)
         gain["held_out"] = [r.name for r in held]
     say("refitting the extended model on everything")
-    colours = {e: search.colour(quadratic, state.active, e) for e in state.active}
+    colours = {effect: weight.colour for effect, weight in weights.items()}
     colours |= unlisted.colours(search, state, quadratic, terms)
     vehicle_after = _extended(model, records, search, state, flight, vehicle, colours)
+    design = _design(search, state, quadratic, ties, flight, say)
     if line and "vibration" not in vehicle.effects:
         vehicle_after = vehicle_after.with_parameters(
             {"vibration.amplitude": Parameter(line.amplitude, line.std, "m/s2", _diagnosed(flight))}
         )
-    ties = [(c["effect"], other) for c in causes for other in c["confusable_with"]]
     findings = {
         "verdict": _verdict(bool(causes), bool(unexplained)),
         "causes": causes,
         "gusts": gusts_of(state.noise),
         "unexplained": unexplained,
         "gain": gain,
-        "next_maneuver": next_maneuver.advise(ties),
+        "next_maneuver": next_maneuver.advise(design, EVIDENCE),
         "false_alarm_rate": None,
     }
     return Diagnosis(
@@ -167,8 +179,10 @@ def diagnose(
         innovations_after=_innovations(passes_after),
         whiteness={"before": white_before, "after": white_after},
         evidence_history=search.history,
-        remarks=tuple(remarks + _unusual(search, state)),
+        strongest=search.strongest,
+        remarks=tuple(remarks + _shaken(search, state) + _unusual(search, state)),
         noise=sensors,
+        design=design,
     )
 
 
@@ -253,45 +267,47 @@ def _fair_share(
 
 
 def _causes(
-    search: Search, state: State, quadratic: Quadratic, white: Mapping[str, Whiteness]
-) -> list[dict[str, Any]]:
+    search: Search,
+    state: State,
+    quadratic: Quadratic,
+    weights: Mapping[str, Weight],
+    white: Mapping[str, Whiteness],
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, State]]]:
+    """Entries of findings.json, strongest first, and the refits with each one's look-alikes."""
     std = standard_deviations(search, state, quadratic)
     dt = median_step(search.engine.records)
-    causes = []
+    causes: list[dict[str, Any]] = []
+    ties: dict[str, dict[str, State]] = {}
     for effect in state.active:
         entry = effects.CATALOGUE[effect]
-        rest = [e for e in state.active if e != effect]
-        without = State(
-            rest, state.values | search.off(effect) | search.pinned(effect), state.noise
-        )
-        without = search.refit_noise(without)
-        search.settle(without, steps=2, without=entry.replaces)
-        colour = search.colour(quadratic, state.active, effect)
+        weight = weights[effect]
         channels = _channels(search, state, effect)
+        ties[effect] = _look_alikes(
+            search,
+            state,
+            quadratic,
+            effect,
+            max([weight.colour, *(white[c].inflation for c in channels)]),
+            weight.lost,
+        )
         causes.append(
             {
                 "effect": effect,
                 "parameters": {
                     f.name: {
                         "value": float(state.values[f.name]),
-                        "std": with_timing(f, std[f.name] * math.sqrt(colour), dt),
+                        "std": with_timing(f, std[f.name] * math.sqrt(weight.colour), dt),
                         "unit": p.unit,
                     }
                     for f, p in zip(search.by_effect[effect], entry.parameters, strict=True)
                 },
-                "evidence": float(without.objective - state.objective) / colour,
-                "confusable_with": _look_alikes(
-                    search,
-                    state,
-                    quadratic,
-                    effect,
-                    max([colour, *(white[c].inflation for c in channels)]),
-                    float(without.objective - state.objective),
-                ),
+                "evidence": weight.evidence,
+                "confusable_with": list(ties[effect]),
                 "channels": channels,
             }
         )
-    return sorted(causes, key=lambda c: -c["evidence"])
+    causes.sort(key=lambda c: -c["evidence"])
+    return causes, {c["effect"]: ties[c["effect"]] for c in causes}
 
 
 def _vibration(line: vibration.Line) -> dict[str, Any]:
@@ -345,8 +361,8 @@ def _look_alikes(
     effect: str,
     colour: float,
     lost: float,
-) -> list[str]:
-    """Effects that would do as well in this one's place, by refitted likelihood.
+) -> dict[str, State]:
+    """Effects that would do as well in this one's place, by refitted likelihood, and those refits.
 
     Coloured innovations carry less than they seem to: the tie widens by the colour, up to half of
     what is `lost` (nats) with nothing in the effect's place.
@@ -362,17 +378,50 @@ def _look_alikes(
             does_something = nothing - now - change > 0.5 * (nothing - now)
             if change < 3.0 * tie and does_something:
                 near.append((change, other, move))
-    result = []
-    for _, other, move in sorted(near, key=lambda n: n[0])[:3]:
+
+    def in_its_place(other: str, move: np.ndarray) -> State:
         values = dict(zip(quadratic.names, (quadratic.at + move).tolist(), strict=True))
         active = [other if e == effect else e for e in state.active]
-        trial = search.settle(State(active, state.values | values, state.noise), steps=2)
+        return search.settle(State(active, state.values | values, state.noise), steps=2)
+
+    result = {}
+    for _, other, move in sorted(near, key=lambda n: n[0])[:3]:
+        trial = in_its_place(other, move)
         if trial.objective - state.objective < tie:
-            result.append(other)
+            result[other] = trial
     for twin in sorted(together(effect) & set(search.candidates) - set(result)):
         if search.score(quadratic, state.active, twin)[1] > EVIDENCE:  # a mixture of the two
-            result.append(twin)
+            _, move = search.swap(quadratic, state.active, effect, twin)
+            result[twin] = in_its_place(twin, move)
     return result
+
+
+def _design(
+    search: Search,
+    state: State,
+    quadratic: Quadratic,
+    ties: Mapping[str, Mapping[str, State]],
+    flight: Flight,
+    say: Progress,
+) -> next_maneuver.Design | None:
+    """The maneuvers that part the strongest tied cause from its look-alikes.
+
+    What the flights told of the alternatives' numbers is taken from the final quadratic.
+    """
+    tied = next((effect for effect, others in ties.items() if others), None)
+    if tied is None:
+        return None
+    say("designing the next maneuver")
+    alternatives = []
+    for name, refit in {tied: state, **ties[tied]}.items():
+        free = search.free(refit.active)
+        i = quadratic.index([f.name for f in free])
+        alternatives.append(
+            next_maneuver.Alternative.of(
+                name, search.model.vehicle, free, refit.values, quadratic.G[np.ix_(i, i)]
+            )
+        )
+    return next_maneuver.design(alternatives, state.noise, next_maneuver.logged_rates(flight))
 
 
 def _channels(search: Search, state: State, effect: str) -> list[str]:
@@ -384,6 +433,17 @@ def _channels(search: Search, state: State, effect: str) -> list[str]:
     order = np.argsort(-strength)
     total = strength.sum()
     return [CHANNELS[i] for i in order if total > 0.0 and strength[i] > 0.1 * total]
+
+
+def _shaken(search: Search, state: State) -> list[str]:
+    """What shakes the machine too fast to be a gust, in words; nothing where there is no sign of it."""
+    if BUFFET_LEVELS[0] not in search.levels:
+        return []
+    xy, z, moment_xy, moment_z = (state.noise.process[level] for level in BUFFET_LEVELS)
+    return [
+        "shaken by white noise beside the gusts, x and y, z:"
+        f" force {xy:.2g}, {z:.2g} N s^1/2, moment {moment_xy:.2g}, {moment_z:.2g} N m s^1/2"
+    ]
 
 
 def _unusual(search: Search, state: State) -> list[str]:
@@ -462,16 +522,16 @@ def _extended(
     free = search.free(state.active)
     estimate = engine.fit(free, state.values, state.noise, iterations=3, tolerance=0.5)
     dt = median_step(records)
+
+    def std(f: FreeParameter) -> float:
+        colour = colours.get(f.name.partition(".")[0], 1.0)
+        return with_timing(f, estimate.std[f.name] * math.sqrt(colour), dt)
+
     return fitted_vehicle(
         vehicle,
         free,
         estimate.values,
-        {
-            f.name: with_timing(
-                f, estimate.std[f.name] * math.sqrt(colours.get(f.name.partition(".")[0], 1.0)), dt
-            )
-            for f in free
-        },
+        {f.name: std(f) for f in free},
         estimate.covariance,
         _diagnosed(flight),
         flight,

@@ -27,6 +27,14 @@ FARTHEST = 5.0
 GUST_LEVELS = ("force_xy", "force_z", "moment_xy", "moment_z")
 """Std of the gust states [N, N m]; x and y share one level."""
 
+BUFFET_LEVELS = ("buffet_xy", "buffet_z", "buffet_moment_xy", "buffet_moment_z")
+"""Intensity of what shakes too fast to have a memory [N s^1/2, N m s^1/2]: white force and moment.
+
+Without it, real flights buy damping that is not there: a damped rate driven by a gust with memory is
+how a likelihood with nothing else at hand writes a rate driven by white noise, and the gust states
+then undo the damping in every prediction.
+"""
+
 HELD = (
     "gravity", "air_density", "rotor_radius",
     "fuselage_length", "fuselage_width", "fuselage_drag_coefficient", "flybar_inertia",
@@ -121,6 +129,14 @@ class HeliModel:
         q[10:16] = 1e-5**2
         q[16:18] = 0.1**2
         q[18:20] = 1e-4**2
+        level = noise.process
+        p = self.vehicle
+        mass = p["mass"].value
+        q[0:2] += (level["buffet_xy"] / mass) ** 2
+        q[2] += (level["buffet_z"] / mass) ** 2
+        q[3] += (level["buffet_moment_xy"] / p["inertia_xx"].value) ** 2
+        q[4] += (level["buffet_moment_xy"] / p["inertia_yy"].value) ** 2
+        q[5] += (level["buffet_moment_z"] / p["inertia_zz"].value) ** 2
         q[20:26] = 2.0 * _gust_levels(noise) ** 2 / noise.process["memory"]
         return q
 
@@ -209,6 +225,9 @@ def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
         "moment_xy": 3e-4 * weight * arm,
         "moment_z": 1e-4 * weight * arm,
     }
+    for gust, buffet in zip(GUST_LEVELS, BUFFET_LEVELS, strict=True):
+        floor[buffet] = 0.1 * floor[gust]
+        process[buffet] = 0.1 * floor[gust]
     shake = vehicle.values().get("vibration.amplitude", 0.0) / np.sqrt(2.0)
     reading = {
         c: float(np.hypot(flight.noise[c], shake if c in ("ax", "ay", "az") else 0.0))

@@ -25,7 +25,7 @@ import numpy as np
 from coax_env import effects
 from coax_env.engine.fit import Engine, Linearised, RunPass, bounded_solve, objective
 from coax_env.engine.model import FreeParameter, Noise
-from coax_env.heli_model import GUST_LEVELS, HeliModel
+from coax_env.heli_model import BUFFET_LEVELS, GUST_LEVELS, HeliModel
 
 EVIDENCE = 12.0
 """Nats a cause must be worth, Occam factor deducted."""
@@ -37,8 +37,8 @@ PROMISE = 2.0
 MOST_MOVES = 3
 TOGETHER = (frozenset({"servo_lag", "servo_delay"}),)
 """Effects of which one at most is named: a real servo is a mixture of both (design/effects.md)."""
-MEMORIES = (0.15, 0.5, 1.5)
-"""Correlation times that gusts may have [s]."""
+BUFFET_SHARE = 0.2
+"""White noise to start from, per gust level [s^1/2]: a gust that forgets within 20 ms."""
 MOST_FAILURES = 3
 """Additions in a row that do not hold before the search gives up."""
 Progress = Callable[[str], None]
@@ -163,12 +163,28 @@ class State:
     objective: float = np.inf
 
 
+@dataclass(frozen=True)
+class Weight:
+    """What a cause is worth. lost: nats without it, all else refitted. colour: see Quadratic.colour."""
+
+    lost: float
+    colour: float
+
+    @property
+    def evidence(self) -> float:
+        """Nats that coloured innovations leave of what is lost."""
+        return self.lost / self.colour
+
+
 @dataclass
 class Search:
     """The structure search over one set of records.
 
     Attributes:
         history: (effect, score) of every move, in order.
+        levels: the noise levels that are fitted.
+        strongest: evidence [nats] and name of the candidate that came nearest to being added, or
+            was; the threshold is calibrated on it (scripts/study_diagnosis.py --calibrate).
     """
 
     engine: Engine
@@ -176,6 +192,8 @@ class Search:
     candidates: tuple[str, ...]
     progress: Progress | None = None
     history: list[tuple[str, float]] = field(default_factory=list)
+    levels: tuple[str, ...] = GUST_LEVELS
+    strongest: tuple[float, str] = (-math.inf, "")
 
     def __post_init__(self) -> None:
         self.base = self.model.base_parameters()
@@ -230,8 +248,9 @@ class Search:
         values = {**self.model.bare_values, "gust_memory": noise.process["memory"]}
         for f in self.all:
             values.setdefault(f.name, f.value)
-        noise = self.engine.fit_noise(values, noise, GUST_LEVELS)
-        return State([], values, noise)
+        state = State([], values, self.engine.fit_noise(values, noise, GUST_LEVELS))
+        self.look_for_buffet(state)
+        return state
 
     def linearise(self, state: State) -> tuple[list[RunPass], Quadratic]:
         """The quadratic at a state, over all parameters that might be free."""
@@ -271,31 +290,24 @@ class Search:
 
     def refit_noise(self, state: State) -> State:
         """Noise levels again, from where they stand."""
-        noise = self.engine.fit_noise(state.values, state.noise, GUST_LEVELS, iterations=4)
+        noise = self.engine.fit_noise(state.values, state.noise, self.levels, iterations=4)
         return replace(state, noise=noise)
 
-    def choose_memory(self, state: State) -> bool:
-        """Take the gusts' memory of largest likelihood out of MEMORIES; True where it changed."""
-        now = state.noise.process["memory"]
-        best = self.engine.log_likelihood(state.values, state.noise) + TIE
-        chosen = None
-        for memory in MEMORIES:
-            for power in (
-                0.0,
-                0.5,
-                -0.5,
-            ):  # same std, same fast part, same slow part of the spectrum
-                factor = (memory / now) ** power
-                levels = {n: state.noise.process[n] * factor for n in GUST_LEVELS}
-                noise = replace(state.noise, process={**levels, "memory": memory})
-                values = {**state.values, "gust_memory": memory}
-                reached = self.engine.log_likelihood(values, noise)
-                if memory != now and reached > best:
-                    best, chosen = reached, (values, noise)
-        if chosen is None:
+    def look_for_buffet(self, state: State) -> bool:
+        """Let white force and moment in, where that is worth more than TIE; True where it is."""
+        start = dict(state.noise.process)
+        for gust, buffet in zip(GUST_LEVELS, BUFFET_LEVELS, strict=True):
+            start[buffet] = BUFFET_SHARE * start[gust]
+        levels = GUST_LEVELS + BUFFET_LEVELS
+        trial = self.engine.fit_noise(
+            state.values, replace(state.noise, process=start), levels, iterations=8
+        )
+        gained = self.engine.log_likelihood(state.values, trial)
+        gained -= self.engine.log_likelihood(state.values, state.noise)
+        if gained < TIE:
             return False
-        state.values, state.noise = chosen
-        self.say(f"gusts forget within {state.noise.process['memory']:g} s")
+        self.say(f"shaken by white noise beside the gusts: {gained:.1f} nats")
+        state.noise, self.levels = trial, levels
         return True
 
     # --- scores -------------------------------------------------------------------------------------
@@ -377,6 +389,37 @@ class Search:
         occam_old = 0.0 if self.pinned(old) else quadratic.occam(self.candidate_names(old), rest)
         return then + occam_new - now - occam_old, move
 
+    def weigh(self, state: State, quadratic: Quadratic) -> dict[str, "Weight"]:
+        """What each cause is worth: everything refitted without it, noise levels too."""
+        weights = {}
+        for effect in state.active:
+            rest = [e for e in state.active if e != effect]
+            values = state.values | self.off(effect) | self.pinned(effect)
+            without = self.refit_noise(State(rest, values, state.noise))
+            self.settle(without, steps=2, without=effects.CATALOGUE[effect].replaces)
+            lost = float(without.objective - state.objective)
+            weights[effect] = Weight(lost, self.colour(quadratic, state.active, effect))
+        return weights
+
+    def prune(
+        self, state: State, quadratic: Quadratic
+    ) -> tuple[State, Quadratic, dict[str, "Weight"]]:
+        """Take out, one at a time, causes whose evidence is gone once the noise may answer too."""
+        weights = self.weigh(state, quadratic)
+        while weights:
+            weakest = min(weights, key=lambda e: weights[e].evidence)
+            if weights[weakest].evidence >= EVIDENCE:
+                break
+            self.history.append((f"- {weakest}", max(weights[weakest].evidence, 0.0)))
+            self.say(f"dropped {weakest}: worth {weights[weakest].evidence:.1f} nats in the end")
+            state.active = [e for e in state.active if e != weakest]
+            state.values |= self.off(weakest) | self.pinned(weakest)
+            state = self.refit_noise(self.settle(state))
+            self.settle(state)
+            _, quadratic = self.linearise(state)
+            weights = self.weigh(state, quadratic)
+        return state, quadratic, weights
+
     # --- the search ---------------------------------------------------------------------------------
 
     def run(self, state: State) -> tuple[State, Quadratic]:
@@ -385,7 +428,7 @@ class Search:
         drops: Counter[str] = Counter()
         tried: set[tuple[str, ...]] = set()
         moves = failures = most = 0
-        complete = remembered = False
+        complete = False
         state = self.refit_noise(self.settle(state))
         for _ in range(4 * MOST_CAUSES):
             passes, quadratic = self.linearise(state)
@@ -412,8 +455,8 @@ class Search:
                 pass
             elif complete:
                 break
-            elif not remembered and self.choose_memory(state):
-                remembered = True
+            elif self.levels == GUST_LEVELS and self.look_for_buffet(state):
+                pass
             else:  # nothing more to add: what is in must also stand against coloured residuals
                 complete = True
                 continue
@@ -491,8 +534,10 @@ class Search:
             if effect in state.active or effect in banned or together(effect) & set(state.active):
                 continue
             score, evidence, large = self.score(quadratic, state.active, effect)
-            if large and evidence > EVIDENCE and score > 0.0:
-                ranked.append((score, effect))
+            if large and score > 0.0:
+                self.strongest = max(self.strongest, (evidence, effect))
+                if evidence > EVIDENCE:
+                    ranked.append((score, effect))
         if not ranked:
             return None
         score, effect = max(ranked)

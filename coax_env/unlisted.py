@@ -51,6 +51,11 @@ HIDDEN_SHARE = 0.3
 SCREENED = 10  # candidates of an axis that are looked at by their signatures
 MOST_TERMS = 4  # taken in all
 MOST_FAILURES = 3  # that do not hold before the search gives up
+SHARE = 0.15
+"""Share of an axis' estimated disturbance that a term must follow: less is told apart from nothing.
+
+On real flights everything is a little coloured, and some term is always worth a few nats.
+"""
 SETTLING = 1.0  # s at the start of each run that are not screened
 
 Candidate = tuple[str, tuple[Term, ...]]
@@ -119,7 +124,7 @@ def explain(
         screened = {
             c: TERM_EVIDENCE if axis in coloured else HIDDEN_EVIDENCE
             for axis in AXES
-            for c in _screen(along, axis, known, 0.0 if axis in coloured else HIDDEN_SHARE)
+            for c in _screen(along, axis, known, SHARE if axis in coloured else HIDDEN_SHARE)
             if c not in refused
         }
         best = _best(search, state, screened)

@@ -15,6 +15,7 @@ The file imports from `coax_env.effects` and decorates a function, as the catalo
 import importlib.util
 import sys
 from pathlib import Path
+from typing import Any
 
 from numba import float64, int64
 from numba.core.errors import NumbaError
@@ -73,7 +74,8 @@ def _run(path: Path) -> None:
 def _check(path: Path, name: str) -> None:
     """Compile an effect by itself, so that its faults are its own and not the kernel's."""
     try:
-        effects.GROUPS[name].function.compile((_A, _A, _A, int64))
+        function: Any = effects.GROUPS[name].function
+        function.compile((_A, _A, _A, int64))
     except NumbaError as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise InputError(

@@ -52,8 +52,9 @@ def main() -> None:
 
 
 def save(result: "Diagnosis", out: Path, command: str) -> None:
-    """findings.json, vehicle.toml and report.html, all or none."""
+    """findings.json, vehicle.toml and report.html, all or none; then the next flight's card."""
     from coax_env import report
+    from coax_env.next_maneuver import write_flight_card
     from coax_env.vehicle import vehicle_toml
 
     page = report.diagnosis_page(result, command)
@@ -61,6 +62,8 @@ def save(result: "Diagnosis", out: Path, command: str) -> None:
         write_json(folder / "findings.json", result.findings)
         write_text(folder / "vehicle.toml", vehicle_toml(result.vehicle_after))
         write_text(folder / "report.html", page)
+    if result.design and result.design.ranked:
+        write_flight_card(result.design, result.flight, out / "next_flight")
 
 
 def summary(result: "Diagnosis") -> str:
@@ -87,6 +90,9 @@ def summary(result: "Diagnosis") -> str:
             f"gain on {', '.join(gain['held_out'])}: {gain['error_removed_percent']:.0f} % of the "
             f"{gain['horizon_s']:g} s prediction error removed{interval}"
         )
+    following = findings["next_maneuver"]
+    if following:
+        lines.append(f"fly next: {following['maneuver']}: {following['why']}")
     for remark in result.remarks:
         lines.append(f"note: {remark}")
     return "\n".join(lines)

@@ -26,7 +26,7 @@ from coax_env.files import write_text
 from coax_env.flight import Flight
 from coax_env.heli_model import HeliModel, record_of, starting_noise
 from coax_env.layout import CHANNELS
-from coax_env.maneuvers import MANEUVERS
+from coax_env.next_maneuver import candidates
 from coax_env.vehicle import vehicle_toml
 
 ON_AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
@@ -197,7 +197,8 @@ def check_form(result: Diagnosis) -> None:
         check_gain(findings["gain"], result.flight)
     following = findings["next_maneuver"]
     if following is not None:
-        assert following["maneuver"] in {*MANEUVERS, *injector.MANEUVERS} and following["why"]
+        assert following["maneuver"] in {plan.name for plan in candidates()}
+        assert "nats" in following["why"]
         assert set(following["separates"]) <= set(effects.CATALOGUE)
 
 

@@ -18,6 +18,7 @@ import pytest
 import tomlkit
 
 from coax_env import load_vehicle, read_flight
+from coax_env.effects import CATALOGUE
 from coax_env.vehicle import vehicle_toml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -255,6 +256,21 @@ def test_diagnose_writes_what_the_contract_says(tmp_path):
     assert "gyro_bias" in load_vehicle(out / "vehicle.toml").effects
     page = (out / "report.html").read_text()
     assert "gyro bias" in page.lower() and 'src="http' not in page
+
+
+@pytest.mark.slow
+def test_diagnose_writes_the_next_flight_of_a_tie(tmp_path):
+    """A hover cannot tell a scale error of az from a bias; a second diagnosis replaces the first."""
+    flight = injector.fly(tmp_path / "flight", {"accel_scale": {}}, runs=["hover"], seed=4)
+    others = [name for name in CATALOGUE if name not in ("accel_scale", "accel_bias")]
+    for _ in range(2):
+        done = script("diagnose.py", flight, "--exclude", ",".join(others), cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    out = tmp_path / "runs" / "diagnose"
+    following = json.loads((out / "findings.json").read_text())["next_maneuver"]
+    assert set(following["separates"]) == {"accel_scale", "accel_bias"}
+    assert f"fly next: {following['maneuver']}" in done.stdout
+    assert read_flight(out / "next_flight").run_names == (following["maneuver"],)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ One engine, three uses: every parameter fixed is the simulation check, base para
 identification, effects' parameters free is diagnosis.
 """
 
+import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -82,12 +83,15 @@ class Estimate:
 
 
 class Engine:
-    """A model, the records it is held against, and the two passes over them."""
+    """A model, the records it is held against, and the two passes over them.
 
-    def __init__(self, model: Model, records: Sequence[Record], threads: int = 2) -> None:
+    threads: runs worked on at once; default COAX_THREADS of the environment, else 2.
+    """
+
+    def __init__(self, model: Model, records: Sequence[Record], threads: int | None = None) -> None:
         self.model = model
         self.records = list(records)
-        self.threads = threads
+        self.threads = threads or int(os.environ.get("COAX_THREADS", "2"))
         self.intervals = [np.append(np.diff(r.t), 0.0) for r in self.records]
 
     def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:

@@ -1,0 +1,200 @@
+"""One flight of the study: fly it, diagnose it, judge what could have been known."""
+
+import json
+import math
+import os
+import tempfile
+import time
+import traceback
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import injector
+import numpy as np
+
+from coax_env.diagnosis import HORIZON, Diagnosis, diagnose
+from coax_env.effects import CATALOGUE
+from coax_env.engine.fit import Engine
+from coax_env.engine.model import Record
+from coax_env.flight import Flight, read_flight
+from coax_env.gain import gain_of
+from coax_env.heli_model import HeliModel, record_of, starting_noise
+from coax_env.prediction import fly_again
+from coax_env.search import Quadratic, Search, State
+from coax_env.vehicle import load_vehicle
+from study import baselines
+from study.judge import OWN
+from study.plan import HOVER, PlannedFlight
+from study.store import code_hash
+
+GUSTS = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003, "memory": 0.5}
+"""Std of the generator's gusts [N, N m] and their correlation time [s]."""
+
+SIZE_IN_CATALOGUE = {
+    # Cheeseman-Bennett between z/R 1.2 and 2.4 is 0.22 exp(-1.3 z/R)
+    "ground_effect.gain": 0.22,
+    "rate_damping.coefficient": 0.9,  # (0.8 + 0.4 |rate|) at 0.25 rad/s
+}
+"""Size of the catalogue's form per size of the generator's, where the two differ."""
+SHAPES = {"ground_effect.decay": 1.3}
+
+
+def fly_and_diagnose(flight: PlannedFlight, only_own: bool = False) -> dict[str, Any]:
+    """The row of a flight; a failure is a row with `error`, so that the study goes on.
+
+    One thread, since the study's workers share the cores. `only_own`: without the baselines.
+    """
+    os.environ["COAX_THREADS"] = "1"
+    row: dict[str, Any] = {"plan": flight.as_json(), "code": code_hash()}
+    try:
+        with tempfile.TemporaryDirectory(prefix="coax-study-") as folder:
+            return row | _result(flight, Path(folder) / "flight", only_own)
+    except Exception as error:  # a crash on one flight is a result too
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        return row | {"error": f"{type(error).__name__}: {error} ({where.name}:{where.lineno})"}
+
+
+def _result(planned: PlannedFlight, folder: Path, only_own: bool) -> dict[str, Any]:
+    truth = hide(planned, folder)
+    flight = read_flight(folder)
+    start = time.perf_counter()
+    result = diagnose(flight)
+    seconds = time.perf_counter() - start
+    findings = result.findings
+    held = (findings["gain"] or {}).get("held_out", [])
+    evidence, effect = result.strongest
+    methods: dict[str, Any] = {
+        OWN: {key: findings[key] for key in ("verdict", "causes", "unexplained")}
+    }
+    row = {
+        "hidden": truth["hidden"],
+        "values": truth["values"],
+        "comparable": truth["comparable"],
+        "expected": expected_evidence(planned, flight, truth, held),
+        "methods": methods,
+        "gain": findings["gain"],
+        "strongest": {"evidence": evidence if math.isfinite(evidence) else None, "effect": effect},
+        "history": result.evidence_history,
+        "remarks": list(result.remarks),
+        "seconds": seconds,
+        "flown_s": sum(run.duration for run in flight.runs),
+    }
+    catalogued = [e for e in truth["hidden"] if e in CATALOGUE]
+    if catalogued == truth["hidden"] and truth["hidden"] and planned.runs != HOVER:
+        row["true_structure"] = gain_of_the_truth(result, catalogued, truth["values"], held)
+    if not only_own:
+        methods |= baselines.name_causes(flight)
+    return json.loads(json.dumps(row, allow_nan=False))
+
+
+def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
+    """Fly the planned flight into a folder; its truth is returned and not left there.
+
+    Where the pilot loses the helicopter, the effects are flown at four fifths of their size.
+    """
+    factor = 1.0
+    for _ in range(5):
+        sizes = {e: {p: factor * v for p, v in t.items()} for e, t in planned.effects.items()}
+        try:
+            injector.fly(
+                folder, sizes, gusts=planned.gusts, sensors=planned.sensors, seed=planned.seed,
+                runs=planned.runs,
+            )  # fmt: skip
+        except RuntimeError:
+            factor *= 0.8
+            continue
+        path = folder / "truth.json"
+        truth = json.loads(path.read_text())
+        path.unlink()
+        return truth
+    raise RuntimeError(f"the pilot cannot fly {planned.effects}")
+
+
+# --- what could have been known ---------------------------------------------------------------------
+
+
+def catalogue_values(values: Mapping[str, float]) -> dict[str, float]:
+    """The generator's sizes as the catalogue would have them; effects it does not list left out."""
+    result = {}
+    for name, value in values.items():
+        if name.partition(".")[0] in CATALOGUE:
+            result[name] = value * SIZE_IN_CATALOGUE.get(name, 1.0)
+    groups = {name.partition(".")[0] for name in result}
+    return result | {n: v for n, v in SHAPES.items() if n.partition(".")[0] in groups}
+
+
+def expected_evidence(
+    planned: PlannedFlight, flight: Flight, truth: Mapping[str, Any], held: Collection[str]
+) -> dict[str, float | None]:
+    """Nats each hidden effect should be worth on the runs that are fitted, from no residual.
+
+    Half theta' S theta less the Occam factor: S is the information of the effect's parameters at
+    their true values on this flight's commands, with the generator's noise, the base parameters
+    (under their priors) and the other hidden effects projected out. None: not in the catalogue.
+    """
+    values = catalogue_values(truth["values"])
+    listed = [e for e in truth["hidden"] if e in CATALOGUE]
+    result: dict[str, float | None] = dict.fromkeys(truth["hidden"])
+    if not listed:
+        return result
+    vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
+    model = HeliModel(vehicle)
+    noise = starting_noise(flight, vehicle)
+    levels = {**noise.process, **(GUSTS if planned.gusts else noise.floor)}
+    noise = replace(noise, process=levels)
+    engine = Engine(model, _records(flight, held, within=False))
+    search = Search(engine, model, tuple(listed))
+    at = {**model.bare_values, "gust_memory": levels["memory"], **values}
+    _, quadratic = search.linearise(State(listed, at, noise))
+    for effect in listed:
+        result[effect] = _worth(search, quadratic, listed, effect, values)
+    return result
+
+
+def _worth(
+    search: Search,
+    quadratic: Quadratic,
+    listed: Sequence[str],
+    effect: str,
+    values: Mapping[str, float],
+) -> float:
+    own = search.candidate_names(effect)
+    rest = [n for n in search.free_names(listed) if not n.startswith(effect + ".")]
+    c, f = quadratic.index(own), quadratic.index(rest)
+    A = quadratic.G[np.ix_(f, f)] + np.diag(quadratic.precision[f])
+    across = quadratic.G[np.ix_(f, c)]
+    S = quadratic.G[np.ix_(c, c)] - across.T @ np.linalg.solve(A, across)
+    theta = np.array([values[name] for name in own])
+    return float(0.5 * theta @ S @ theta - quadratic.occam(own, rest))
+
+
+def gain_of_the_truth(
+    result: Diagnosis, hidden: list[str], values: Mapping[str, float], held: Collection[str]
+) -> dict[str, Any]:
+    """What the true structure removes on the same held-out runs, refitted on the same others."""
+    state, engine_held = forced(result.flight, hidden, values, held)
+    replayed = fly_again(engine_held, state.values, state.noise, HORIZON)
+    gain = gain_of(
+        result.replay_before, result.replay_refitted, replayed, result.noise, HORIZON
+    )  # fmt: skip
+    return {key: gain[key] for key in ("error_removed_percent", "ci95")}
+
+
+def forced(
+    flight: Flight, hidden: list[str], values: Mapping[str, float], held: Collection[str]
+) -> tuple[State, Engine]:
+    """These effects fitted, from their true sizes on; and the engine of the held-out runs."""
+    vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
+    model = HeliModel(vehicle)
+    search = Search(Engine(model, _records(flight, held, within=False)), model, tuple(hidden))
+    bare = search.begin(starting_noise(flight, vehicle))
+    state = State(hidden, {**bare.values, **catalogue_values(values)}, bare.noise)
+    state = search.settle(search.refit_noise(state))
+    return search.settle(search.refit_noise(state)), Engine(model, _records(flight, held, True))
+
+
+def _records(flight: Flight, held: Collection[str], within: bool) -> list[Record]:
+    """Records of the held-out runs, or of the others (of all where parts of runs are held out)."""
+    return [record_of(run) for run in flight.runs if (run.name in held) == within]

@@ -1,0 +1,166 @@
+"""Which flights the study flies: kind, hidden effects and their sizes, gusts, sensors, runs.
+
+A flight is planned from the study's seed, its kind and its number within the kind alone, so that a
+larger study contains the smaller one and what is stored stays good.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from study.judge import TIES
+
+DEGREE = math.pi / 180.0
+
+RICH = (
+    "lon_3211", "lat_3211", "heave_3211", "yaw_3211", "forward_run", "side_run", "low_hover",
+    "heading_turn",
+)  # fmt: skip
+"""Eight of the generator's twelve runs, 136 s: every axis, speed, the ground, a full turn.
+
+What is left out repeats it: two doublets, a second climb, thirty seconds of hover.
+"""
+HOVER = ("hover",)
+
+KINDS = ("still", "gusty", "one", "two", "three", "outside", "hover")
+SHARES = {"one": 0.5, "two": 0.2, "three": 0.1, "outside": 0.1, "hover": 0.1}
+"""Of the flights with effects. All of them are gusty; half of the clean ones are."""
+
+SIZES: dict[str, dict[str, tuple[float, float, bool]]] = {
+    "ground_effect": {"gain": (0.7, 1.3, False)},
+    "rotor_drag": {"coefficient": (1.5e-4, 7e-4, False)},
+    "airframe_drag": dict.fromkeys(("area_x", "area_y", "area_z"), (0.01, 0.04, False)),
+    "axial_damping": {"coefficient": (0.05, 0.15, False)},
+    "flap_blowback": {"gain": (0.005, 0.01, False)},
+    "wake_interference": {"gain": (0.15, 0.35, False)},
+    "yaw_damping": {"coefficient": (0.002, 0.006, False)},
+    "rate_damping": {"coefficient": (0.002, 0.006, False)},
+    "thrust_exponent": {"excess": (0.1, 0.3, False)},
+    "wind": dict.fromkeys(("north", "east"), (1.0, 2.0, True)),
+    "swash_offset": dict.fromkeys(("lon", "lat"), (0.5 * DEGREE, 1.5 * DEGREE, True)),
+    "cg_offset": dict.fromkeys(("x", "y"), (0.5e-3, 2e-3, True)),
+    "swash_phase": {"angle": (5.0 * DEGREE, 20.0 * DEGREE, True)},
+    "swash_gain": {"scale": (0.05, 0.2, True)},
+    "servo_lag": {"time": (0.02, 0.06, False)},
+    "servo_delay": {"time": (0.01, 0.05, False)},
+    "motor_lag": dict.fromkeys(("upper", "lower"), (0.05, 0.2, False)),
+    "battery_sag": {"rate": (0.001, 0.003, False)},
+    "added_mass": {"mass": (0.02, 0.1, False)},
+    "thrust_scale": {"scale": (0.03, 0.1, True)},
+    "torque_balance": {"scale": (0.03, 0.1, True)},
+    "yaw_inertia": {"scale": (0.1, 0.3, True)},
+    "hub_stiffness": dict.fromkeys(("upper", "lower"), (0.05, 0.5, False)),
+    "spin_up_reaction": {"gain": (0.8, 1.2, False)},
+    "flybar_time_constant": {"scale": (0.2, 0.5, True)},
+    "gyro_bias": dict.fromkeys("xyz", (0.01, 0.05, True)),
+    "accel_bias": dict.fromkeys("xyz", (0.05, 0.3, True)),
+    "accel_scale": dict.fromkeys("xyz", (0.01, 0.03, True)),
+    "imu_lever_arm": dict.fromkeys("xyz", (0.01, 0.05, True)),
+    "imu_tilt": dict.fromkeys("xy", (0.5 * DEGREE, 1.5 * DEGREE, True)),
+    "attitude_bias": dict.fromkeys("xyz", (1.0 * DEGREE, 2.0 * DEGREE, True)),
+    "sonar_scale": {"scale": (0.02, 0.05, True)},
+    "sonar_tilt": {"on": (1.0, 1.0, False)},
+    "sonar_delay": {"time": (0.08, 0.15, False)},
+    "vibration": {"amplitude": (0.2, 1.0, False)},
+    "outside": {"heading_moment": (0.015, 0.03, False)},
+}
+"""effect -> parameter of the generator -> least, most, either sign: usual sizes of effects.md."""
+
+CARRIERS = {"wind": "rotor_drag"}
+"""Effects that act only through another one, which is then hidden with them."""
+ALONE = tuple(e for e in SIZES if e not in CARRIERS and e != "outside")
+
+
+@dataclass(frozen=True)
+class PlannedFlight:
+    """One flight of the study. effects: name -> parameter -> size."""
+
+    kind: str
+    number: int
+    effects: dict[str, dict[str, float]]
+    gusts: bool
+    sensors: str
+    seed: int
+    runs: tuple[str, ...] | None
+
+    @property
+    def name(self) -> str:
+        """Name of the flight, and of the file it is stored in."""
+        return f"{self.kind}-{self.number:04d}"
+
+    def as_json(self) -> dict[str, Any]:
+        """The plan as it is stored with the result."""
+        content = asdict(self)
+        content["runs"] = None if self.runs is None else list(self.runs)
+        return content
+
+
+def plan(
+    clean: int, effects: int, seed: int = 0, runs: Sequence[str] | None = RICH
+) -> list[PlannedFlight]:
+    """The flights of a study, its kinds evenly mixed so that a part of it is a fair sample.
+
+    Args:
+        clean: flights without an effect. effects: flights with one or more.
+        runs: of the flights that are not hover-only; None: all that the generator has.
+    """
+    counts = {"still": clean - clean // 2, "gusty": clean // 2}
+    for kind, share in SHARES.items():
+        counts[kind] = round(share * effects)
+    counts["one"] += clean + effects - sum(counts.values())
+    flights = [
+        planned(kind, number, seed, tuple(runs) if runs is not None else None)
+        for kind in KINDS
+        for number in range(counts[kind])
+    ]
+    return sorted(flights, key=lambda f: ((f.number + 0.5) / counts[f.kind], f.kind))
+
+
+def planned(kind: str, number: int, seed: int, runs: tuple[str, ...] | None) -> PlannedFlight:
+    """One flight, by its kind and number."""
+    rng = np.random.default_rng([seed, KINDS.index(kind), number])
+    names = _hidden(kind, number, rng)
+    return PlannedFlight(
+        kind=kind,
+        number=number,
+        effects={name: _sizes(name, rng) for name in names},
+        gusts=kind != "still",
+        sensors="full" if number % 2 == 0 else "onboard",
+        seed=int(rng.integers(2**31)),
+        runs=HOVER if kind == "hover" else runs,
+    )
+
+
+def _hidden(kind: str, number: int, rng: np.random.Generator) -> list[str]:
+    if kind in ("still", "gusty"):
+        return []
+    if kind == "outside":
+        return ["outside"]
+    if kind in ("one", "hover"):  # every effect in turn, with both sets of sensors
+        order = np.random.default_rng(KINDS.index(kind)).permutation(len(ALONE))
+        return [ALONE[order[(number // 2) % len(ALONE)]]]
+    return _several(2 if kind == "two" else 3, rng)
+
+
+def _several(count: int, rng: np.random.Generator) -> list[str]:
+    """Different effects, no two of one tie group: of those one alone may be named."""
+    names: list[str] = []
+    while len(names) < count:
+        name = str(rng.choice([e for e in SIZES if e != "outside"]))
+        carried = [name] if name not in CARRIERS else [name, CARRIERS[name]]
+        new = [e for e in carried if e not in names]
+        tied = any({a, b} <= tie for tie in TIES for a in new for b in names)
+        if new and not tied and len(names) + len(new) <= count:
+            names += new
+    return names
+
+
+def _sizes(name: str, rng: np.random.Generator) -> dict[str, float]:
+    sizes = {}
+    for parameter, (least, most, signed) in SIZES[name].items():
+        sign = rng.choice([-1.0, 1.0]) if signed else 1.0
+        sizes[parameter] = float(sign * rng.uniform(least, most))
+    return sizes

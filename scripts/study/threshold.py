@@ -1,0 +1,71 @@
+"""The evidence that a share of clean flights reaches: what the search's threshold is calibrated to.
+
+Each clean flight gives the evidence of the candidate that came nearest to being named (search.py,
+`Search.strongest`), all of them false. The tail above its upper quartile is taken as exponential,
+which is what a likelihood ratio's tail is; the interval is a bootstrap's over flights.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from coax_env.search import EVIDENCE
+from study import judge
+from study.judge import Row
+
+FALSE_ALARMS = 0.01
+FEWEST = 20  # clean flights
+TAIL = 0.25
+DRAWS = 2000
+
+
+def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
+    """The threshold for 1 % false alarms and how it was found; None with too few clean flights."""
+    clean = [r for r in judge.finished(rows) if r["plan"]["kind"] in ("still", "gusty")]
+    if len(clean) < FEWEST:
+        return None
+    evidence = np.array(
+        [
+            -np.inf if r["strongest"]["evidence"] is None else r["strongest"]["evidence"]
+            for r in clean
+        ]
+    )
+    rng = np.random.default_rng(0)
+    draws = [tail_quantile(rng.choice(evidence, evidence.size)) for _ in range(DRAWS)]
+    low, high = np.nanpercentile(np.array(draws), [2.5, 97.5])
+    alarms = sum(bool(judge.named(row)) for row in clean)
+    finite = np.sort(evidence[np.isfinite(evidence)])[::-1]
+    return {
+        "false_alarm_rate": FALSE_ALARMS,
+        "threshold_nats": _number(tail_quantile(evidence)),
+        "ci95": [_number(low), _number(high)],
+        "clean_flights": len(clean),
+        "threshold_used_nats": EVIDENCE,
+        "false_alarms_at_it": alarms,
+        "wilson95_at_it": list(judge.wilson(alarms, len(clean))),
+        "largest_nats": [round(float(e), 2) for e in finite[:20]],
+        "code": sorted({row["code"] for row in clean}),
+        "command": command,
+    }
+
+
+def tail_quantile(evidence: np.ndarray, exceeded_by: float = FALSE_ALARMS) -> float:
+    """Evidence that a share of clean flights exceeds, by an exponential tail above the quartile.
+
+    Flights without any candidate have -inf. NaN where fewer than a tenth of the tail is finite.
+    """
+    ordered = np.sort(evidence)[::-1]
+    count = max(2, math.ceil(TAIL * ordered.size))
+    tail = ordered[:count]
+    finite = tail[np.isfinite(tail)]
+    if finite.size < 5:
+        return math.nan
+    start = finite[-1]
+    share = (finite.size - 1) / ordered.size
+    return float(start + np.mean(finite[:-1] - start) * max(math.log(share / exceeded_by), 0.0))
+
+
+def _number(value: float) -> float | None:
+    return round(float(value), 3) if math.isfinite(value) else None

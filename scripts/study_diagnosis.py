@@ -1,0 +1,154 @@
+"""How often is the diagnosis right? Flights whose truth is known, flown, diagnosed and counted."""
+
+import os
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import command_line
+import numpy as np
+from study import plan, store, table, threshold
+from study.one_flight import fly_and_diagnose
+from study.plan import PlannedFlight
+from tqdm import tqdm
+
+from coax_env.errors import InputError, require
+from coax_env.files import make_folder, write_json, write_text
+from coax_env.report.page import Section, figure, page
+
+QUICK = {"clean": 8, "effects": 16}
+PORTION = 4  # flights per worker between two savings on Ray
+
+
+def main() -> None:
+    options = parse()
+    runs = None if options.full else plan.RICH
+    flights = plan.plan(options.clean, options.effects, options.seed, runs)
+    if options.calibrate:
+        flights = [f for f in flights if f.kind in ("still", "gusty")]
+    make_folder(options.out)
+    command = "scripts/study_diagnosis.py " + shlex.join(sys.argv[1:])
+    waiting = store.missing(options.out, flights)
+    done = len(flights) - len(waiting)
+    try:
+        results = each(waiting, options)
+        for flight, row in tqdm(results, "study", len(flights), initial=done, unit="flight"):
+            store.store(options.out, flight, row)
+    finally:
+        rows = store.rows_of(options.out, flights)
+        if rows:
+            write_results(options.out, rows, command)
+    print((options.out / "table.md").read_text())
+
+
+def parse() -> Any:
+    """The command line."""
+    parser = command_line.parser("study_diagnosis", __doc__, seed=True)
+    parser.set_defaults(out=Path("runs/study"))
+    parser.add_argument("--clean", type=int, default=200, help="flights without effects")
+    parser.add_argument("--effects", type=int, default=400, help="flights with effects")
+    parser.add_argument("--quick", action="store_true", help="24 flights in all")
+    parser.add_argument(
+        "--full",
+        action="store_true",
+        help="all twelve runs a flight, 220 s, not the eight of 136 s",
+    )
+    parser.add_argument(
+        "--calibrate", action="store_true",
+        help="clean flights only; DIR/threshold.json says which evidence 1 %% of them reach",
+    )  # fmt: skip
+    parser.add_argument("--no-baselines", action="store_true", help="the package alone")
+    parser.add_argument("--jobs", type=int, default=-1, help="flights at once (default: all cores)")
+    parser.add_argument(
+        "--backend", choices=("loky", "ray"), default="loky",
+        help="joblib's own processes, or a Ray cluster (RAY_ADDRESS; else a local one)",
+    )  # fmt: skip
+    options = parser.parse_args()
+    if options.quick:
+        options.clean, options.effects = QUICK["clean"], QUICK["effects"]
+    if options.clean < 0 or options.effects < 0 or options.clean + options.effects == 0:
+        raise InputError("a study needs at least one flight")
+    if options.jobs == 0:
+        raise InputError("--jobs must not be 0")
+    return options
+
+
+def each(
+    flights: list[PlannedFlight], options: Any
+) -> Iterator[tuple[PlannedFlight, dict[str, Any]]]:
+    """Results as they come, of flights worked on in parallel; one job works in this process."""
+    alone = options.no_baselines
+    if options.jobs == 1 and options.backend == "loky":
+        for flight in flights:
+            yield flight, fly_and_diagnose(flight, alone)
+        return
+    require("joblib", "study")
+    from joblib import Parallel, delayed, parallel_config
+
+    ray = options.backend == "ray"
+    jobs = start_ray(options.jobs) if ray else options.jobs
+    work = [delayed(labelled)(flight, alone) for flight in flights]
+    with parallel_config(backend=options.backend, n_jobs=jobs):
+        if not ray:
+            yield from Parallel(return_as="generator_unordered", batch_size=1)(work)
+            return
+        portion = PORTION * jobs  # Ray's backend hands a whole call's results over together
+        for first in range(0, len(work), portion):
+            yield from Parallel(batch_size=1)(work[first : first + portion])
+
+
+def labelled(flight: PlannedFlight, alone: bool) -> tuple[PlannedFlight, dict[str, Any]]:
+    """A flight with its result: they come back in no order."""
+    return flight, fly_and_diagnose(flight, alone)
+
+
+def start_ray(jobs: int) -> int:
+    """Join the cluster of RAY_ADDRESS, or start one here; the number of its workers.
+
+    Every machine of a cluster needs this checkout at the same place.
+    """
+    require("ray", "study")
+    import ray
+    from ray.util.joblib import register_ray
+
+    local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": jobs if jobs > 0 else None}
+    modules = {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    ray.init(
+        include_dashboard=False, logging_level="ERROR", ignore_reinit_error=True,
+        runtime_env={"env_vars": modules}, **local,
+    )  # fmt: skip
+    register_ray()
+    return jobs if jobs > 0 else int(ray.cluster_resources()["CPU"])
+
+
+def write_results(out: Path, rows: list[dict[str, Any]], command: str) -> None:
+    """table.md, summary.json, the confusion matrix, and the threshold where there is enough."""
+    write_text(out / "table.md", table.table_text(rows, command))
+    methods = sorted({m for row in rows for m in row.get("methods", ())})
+    write_json(
+        out / "summary.json",
+        {
+            "command": command,
+            "flights": len(rows),
+            "failed": sum("error" in row for row in rows),
+            "code": sorted({row["code"] for row in rows}),
+            "methods": {m: [f.as_json() for f in table.all_figures(rows, m)] for m in methods},
+        },
+    )
+    truths, names, shares = table.confusion(rows)
+    write_text(out / "confusion.csv", table.confusion_csv(truths, names, shares))
+    if np.any(shares):
+        drawn = figure(table.confusion_figure(truths, names, shares))
+        write_text(
+            out / "confusion.html",
+            page("What was hidden, what was named", [], [Section("One effect", [drawn])]),
+        )
+    calibrated = threshold.calibration(rows, command)
+    if calibrated:
+        write_json(out / "threshold.json", calibrated)
+
+
+if __name__ == "__main__":
+    command_line.run(main)

@@ -1,0 +1,458 @@
+"""The study of the diagnosis: plan, folder, judgement on rows written by hand, baselines.
+
+No flight is diagnosed here but one, marked slow; what is asked is whether the counting is right.
+"""
+
+import argparse
+import csv
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import injector
+import numpy as np
+import pytest
+import study_diagnosis
+from study import baselines, judge, plan, store, table, threshold
+from study.baselines import Gram, by_bic, by_f, sparse, stepwise
+from study.one_flight import catalogue_values, expected_evidence, fly_and_diagnose, hide
+from study.plan import PlannedFlight
+
+from coax_env import load_vehicle, read_flight
+from coax_env.effects import CATALOGUE
+from coax_env.engine.fit import Engine
+from coax_env.errors import InputError
+from coax_env.heli_model import HeliModel, record_of, starting_noise
+from coax_env.search import EVIDENCE
+
+# --- the plan ---------------------------------------------------------------------------------------
+
+
+def test_the_plan_is_the_same_every_time_and_grows_without_changing() -> None:
+    small, large = plan.plan(10, 20, seed=3), plan.plan(20, 60, seed=3)
+    assert small == plan.plan(10, 20, seed=3)
+    assert {f.name: f for f in small}.items() <= {f.name: f for f in large}.items()
+    assert {f.name: f for f in small} != {f.name: f for f in plan.plan(10, 20, seed=4)}
+    assert len({f.seed for f in large}) == len(large) == 80
+
+
+@pytest.mark.parametrize(("clean", "effects"), [(200, 400), (8, 16), (0, 1), (1, 0), (7, 33)])
+def test_the_plan_has_as_many_flights_as_asked(clean: int, effects: int) -> None:
+    flights = plan.plan(clean, effects)
+    kinds = [f.kind for f in flights]
+    assert sum(k in ("still", "gusty") for k in kinds) == clean
+    assert len(kinds) == clean + effects
+    assert all(bool(f.effects) == (f.kind not in ("still", "gusty")) for f in flights)
+
+
+def test_a_full_study_has_every_effect_with_both_sensor_sets() -> None:
+    flights = plan.plan(200, 400)
+    ones = {(next(iter(f.effects)), f.sensors) for f in flights if f.kind == "one"}
+    assert ones == {(e, s) for e in plan.ALONE for s in ("full", "onboard")}
+    for kind, count in (("two", 2), ("three", 3)):
+        assert {len(f.effects) for f in flights if f.kind == kind} == {count}
+    for flight in flights:
+        assert flight.gusts == (flight.kind != "still")
+        assert "wind" not in flight.effects or "rotor_drag" in flight.effects
+        names = list(flight.effects)
+        assert not any(judge.tied(a, b) for a in names for b in names if a != b)
+
+
+def test_any_part_of_the_plan_is_a_fair_sample() -> None:
+    flights = plan.plan(200, 400)
+    early = [f.kind for f in flights[:60]]
+    for kind in plan.KINDS:
+        expected = 0.1 * sum(f.kind == kind for f in flights)
+        assert abs(early.count(kind) - expected) <= 1.0, kind
+
+
+def test_the_plan_knows_all_that_the_generator_hides_and_the_catalogue_has() -> None:
+    """An effect new to either must be given a size here."""
+    assert set(plan.SIZES) == set(injector.EFFECTS)
+    for effect, sizes in plan.SIZES.items():
+        assert set(sizes) == set(injector.EFFECTS[effect])
+        assert all(0.0 < least <= most for least, most, _ in sizes.values())
+    assert set(CATALOGUE) <= set(plan.SIZES)
+
+
+# --- the folder --------------------------------------------------------------------------------------
+
+
+def row_of(flight: PlannedFlight, causes: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    """A row as one_flight.py writes it."""
+    hidden = list(flight.effects)
+    named = [{"confusable_with": [], "parameters": {}, "evidence": 50.0} | c for c in causes]
+    return {
+        "plan": flight.as_json(),
+        "code": "abc",
+        "hidden": hidden,
+        "values": {f"{e}.{p}": v for e, t in flight.effects.items() for p, v in t.items()},
+        "comparable": {},
+        "expected": dict.fromkeys(hidden, 100.0 * EVIDENCE),
+        "methods": {"coax": {"verdict": "explained", "causes": named, "unexplained": []}},
+        "gain": None,
+        "strongest": {"evidence": 1.0, "effect": "wind"},
+        "seconds": 1.0,
+        "flown_s": 100.0,
+    } | more
+
+
+def flight_with(*effects: str, kind: str = "one", number: int = 0) -> PlannedFlight:
+    sizes = {e: {p: low for p, (low, _, _) in plan.SIZES[e].items()} for e in effects}
+    return PlannedFlight(kind, number, sizes, kind != "still", "full", 1, plan.RICH)
+
+
+@pytest.fixture
+def study(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[list[str], list[PlannedFlight]]]:
+    """The script with a diagnosis that always names the truth; returns what it had to fly."""
+
+    def call(
+        *words: str, fails: str = "", stops: str = ""
+    ) -> tuple[list[str], list[PlannedFlight]]:
+        flown: list[str] = []
+
+        def stub(flight: PlannedFlight, alone: bool) -> dict[str, Any]:
+            flown.append(flight.name)
+            if flight.name == stops:
+                raise KeyboardInterrupt
+            if flight.name == fails:
+                return {"plan": flight.as_json(), "code": "abc", "error": "lost"}
+            return row_of(flight, [{"effect": e} for e in flight.effects if e != "outside"])
+
+        monkeypatch.setattr(study_diagnosis, "fly_and_diagnose", stub)
+        out = ["--out", str(tmp_path), "--jobs", "1"]
+        monkeypatch.setattr(sys, "argv", ["study_diagnosis.py", "--quick", *out, *words])
+        study_diagnosis.main()
+        return flown, plan.plan(8, 16)
+
+    return call
+
+
+def test_a_study_goes_on_where_it_stopped(study: Callable, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        study(stops=plan.plan(8, 16)[10].name)
+    assert (tmp_path / "table.md").exists(), "what there is is told at any stop"
+    flown, flights = study()
+    assert flown == [f.name for f in flights[10:]]
+    assert study()[0] == []
+
+
+def test_half_a_file_and_another_plan_are_flown_again(study: Callable, tmp_path: Path) -> None:
+    _, flights = study()
+    first, second, third = (store.path_of(tmp_path, f) for f in flights[:3])
+    first.write_text(first.read_text()[:200])
+    second.write_text("[]")
+    row = json.loads(third.read_text())
+    row["plan"]["seed"] += 1
+    third.write_text(json.dumps(row))
+    assert study()[0] == [f.name for f in flights[:3]]
+    assert store.missing(tmp_path, flights) == []
+
+
+def test_a_failure_is_told_counted_and_tried_again(study: Callable, tmp_path: Path) -> None:
+    name = plan.plan(8, 16)[5].name
+    study(fails=name)
+    assert json.loads((tmp_path / "summary.json").read_text())["failed"] == 1
+    assert f"- {name}: lost" in (tmp_path / "table.md").read_text()
+    assert study()[0] == [name]
+    assert "Flights that failed" not in (tmp_path / "table.md").read_text()
+
+
+def test_what_a_study_writes(study: Callable, tmp_path: Path) -> None:
+    """The stub is never wrong where the truth has a name: all of its figures say so."""
+    _, flights = study()
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    figures = {f["figure"]: f for f in summary["methods"]["coax"]}
+    assert figures["false alarms, clean flights"]["percent"] == 0.0
+    assert figures["exact cause, one effect"]["percent"] == 100.0
+    assert figures["exact cause, one effect"]["count"] == sum(f.kind == "one" for f in flights)
+    assert figures["exact set, two effects"]["percent"] == 100.0
+    assert figures["hover only: wrongly certain"]["percent"] == 0.0
+    matrix = list(csv.reader((tmp_path / "confusion.csv").read_text().splitlines()))
+    for name, *shares in matrix[1:]:
+        assert shares[matrix[0].index(name) - 1] == "1.000"
+    assert "plotly" in (tmp_path / "confusion.html").read_text().lower()
+
+
+def test_calibration_flies_clean_flights_alone(study: Callable, tmp_path: Path) -> None:
+    flown, _ = study("--calibrate")
+    assert len(flown) == 8 and all(name.startswith(("still", "gusty")) for name in flown)
+
+
+@pytest.mark.parametrize("words", [["--clean", "-1"], ["--clean", "0", "--effects", "0"]])
+def test_a_study_of_nothing_is_refused(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["study_diagnosis.py", *words])
+    with pytest.raises(InputError):
+        study_diagnosis.main()
+
+
+# --- the judgement -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("hidden", "found", "exact"),
+    [
+        ([], [], True),
+        ([], ["wind"], False),
+        (["wind"], ["wind"], True),
+        (["wind"], [], False),
+        (["wind"], ["wind", "rotor_drag"], False),
+        (["wind"], ["rotor_drag"], False),
+        (["servo_lag"], ["servo_delay"], True),
+        (["servo_lag"], ["servo_delay", "servo_lag"], False),
+        (["wind", "servo_lag"], ["servo_delay", "wind"], True),
+        (["wind", "servo_lag"], ["servo_delay", "servo_lag"], False),
+        (["added_mass"], ["thrust_scale"], True),
+    ],
+)
+def test_exact_is_the_truth_or_its_tie_and_nothing_else(
+    hidden: list[str], found: list[str], exact: bool
+) -> None:
+    assert judge.is_exact(hidden, found) is exact
+
+
+def test_groups_and_wrong_certainty() -> None:
+    flight = flight_with("wind", kind="hover")
+    right = row_of(flight, [{"effect": "wind"}])
+    within = row_of(flight, [{"effect": "cg_offset", "confusable_with": ["wind", "swash_offset"]}])
+    unsure = row_of(flight, [{"effect": "cg_offset", "confusable_with": ["swash_offset"]}])
+    wrong = row_of(flight, [{"effect": "cg_offset"}])
+    two = row_of(flight, [{"effect": "cg_offset"}, {"effect": "wind"}])
+    nothing = row_of(flight, [])
+    rows = [right, within, unsure, wrong, two, nothing]
+    assert [judge.group_with_truth(r) for r in rows] == [1, 3, 0, 0, 1, 0]
+    assert [judge.is_wrongly_certain(r) for r in rows] == [False] * 3 + [True, False, False]
+
+
+def test_an_effect_that_cannot_show_is_counted_apart() -> None:
+    faint = row_of(flight_with("wind", number=1), [], expected={"wind": 1.9 * EVIDENCE})
+    unknown = row_of(flight_with("vibration", number=2), [], expected={"vibration": None})
+    shown = row_of(flight_with("rotor_drag"), [{"effect": "rotor_drag"}])
+    figures = {f.name: f for f in table.all_figures([faint, unknown, shown])}
+    exact = figures["exact cause, one effect"]
+    assert (exact.good, exact.count) == (1, 1) and exact.apart.startswith("0 of 2")
+
+
+def test_the_unexplained_counts_on_its_axis_and_without_blame() -> None:
+    flight = flight_with("outside", kind="outside")
+    right = row_of(flight, [])
+    right["methods"]["coax"]["unexplained"] = [{"channel": "q"}]
+    elsewhere = row_of(flight, [])
+    elsewhere["methods"]["coax"]["unexplained"] = [{"channel": "r"}]
+    blamed = row_of(flight, [{"effect": "wind"}])
+    blamed["methods"]["coax"]["unexplained"] = [{"channel": "q"}]
+    assert [judge.says_unexplained(r, "q") for r in (right, elsewhere, blamed)] == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_intervals_are_of_true_effects_in_the_same_form() -> None:
+    said = {"value": 0.03, "std": 0.01, "unit": "rad"}
+    parameters = {"swash_offset.lon": said, "swash_offset.lat": said}
+    row = row_of(
+        flight_with("swash_offset"),
+        [{"effect": "swash_offset", "parameters": parameters},
+         {"effect": "cg_offset", "parameters": {"cg_offset.x": said}}],
+        comparable={"swash_offset.lon": 0.03 + 0.0195, "swash_offset.lat": 0.03 - 0.0197},
+    )  # fmt: skip
+    assert judge.intervals(row) == [("swash_offset.lon", True), ("swash_offset.lat", False)]
+
+
+def test_the_gain_is_a_share_of_what_the_truth_removes() -> None:
+    def with_gain(own: float, truth: float) -> dict[str, Any]:
+        return row_of(
+            flight_with("wind"), [], gain={"error_removed_percent": own},
+            true_structure={"error_removed_percent": truth},
+        )  # fmt: skip
+
+    rows = [with_gain(40.0, 50.0), with_gain(30.0, 30.0), with_gain(0.0, 1.0)]
+    gain = next(f for f in table.all_figures(rows) if "held-out" in f.name)
+    assert gain.percent == pytest.approx(100.0 * 70.0 / 80.0) and gain.count == 2
+
+
+@pytest.mark.parametrize(
+    ("good", "count", "low", "high"),
+    [  # Newcombe, Statistics in Medicine 17 (1998) 857-872, Table I, method 3
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
+)
+def test_wilson_against_published_intervals(good: int, count: int, low: float, high: float) -> None:
+    assert judge.wilson(good, count) == pytest.approx((low, high), abs=5e-5)
+    mirrored = judge.wilson(count - good, count)
+    assert mirrored == pytest.approx((1.0 - high, 1.0 - low), abs=5e-5)
+
+
+def test_the_threshold_of_an_exponential_tail() -> None:
+    """Evidence that exceeds e with probability exp(-e/3) passes 3 ln 100 once in a hundred."""
+    rng = np.random.default_rng(1)
+    drawn = [threshold.tail_quantile(rng.exponential(3.0, 200)) for _ in range(100)]
+    assert np.mean(drawn) == pytest.approx(3.0 * math.log(100.0), rel=0.04)
+    assert math.isnan(threshold.tail_quantile(np.full(50, -np.inf)))
+
+
+def test_a_calibration_says_what_made_it() -> None:
+    rows = [
+        row_of(
+            flight_with(kind="gusty", number=i), [],
+            strongest={"evidence": None if i % 2 else float(i), "effect": ""},
+        )
+        for i in range(60)
+    ]  # fmt: skip
+    result = threshold.calibration(rows, "the command")
+    assert result is not None and result["clean_flights"] == 60 and result["code"] == ["abc"]
+    assert result["threshold_nats"] > 50.0 and result["false_alarms_at_it"] == 0
+    json.dumps(result, allow_nan=False)
+    assert threshold.calibration(rows[:10], "too few") is None
+
+
+# --- the baselines -----------------------------------------------------------------------------------
+
+GROUPS = {"thrust_scale": [1], "wind": [2, 3], "yaw_damping": [4], "rotor_drag": [5]}
+"""Effects with made-up regressors: the pickers know columns alone."""
+
+
+def planted(noise: float, seed: int = 0) -> Gram:
+    """y = 3 + thrust_scale - 2 wind_east, and noise."""
+    rng = np.random.default_rng(seed)
+    X = np.column_stack([np.ones(2000), rng.standard_normal((2000, 5))])
+    y = 3.0 + X[:, 1] - 2.0 * X[:, 3] + noise * rng.standard_normal(2000)
+    return Gram(X, y, always=1)
+
+
+@pytest.mark.parametrize("rule", [by_f(20.0), by_bic])
+def test_stepwise_regression_finds_what_is_planted(rule: baselines.Rule) -> None:
+    assert set(stepwise(planted(1.0), GROUPS, rule)) == {"thrust_scale", "wind"}
+
+
+def test_stepwise_regression_takes_nothing_out_of_noise() -> None:
+    rng = np.random.default_rng(2)
+    X = np.column_stack([np.ones(2000), rng.standard_normal((2000, 5))])
+    gram = Gram(X, 3.0 + rng.standard_normal(2000), always=1)
+    assert stepwise(gram, GROUPS, by_f(20.0)) == []
+
+
+def test_the_gram_matrix_gives_the_least_squares_fit() -> None:
+    rng = np.random.default_rng(3)
+    X, y = rng.standard_normal((50, 4)), rng.standard_normal(50)
+    coefficients, left = Gram(X, y, always=1).fit([2, 3])
+    expected, residual, *_ = np.linalg.lstsq(X[:, [0, 2, 3]], y, rcond=None)
+    np.testing.assert_allclose(coefficients, expected[1:])
+    assert left == pytest.approx(residual[0])
+
+
+def test_sparse_regression_finds_what_is_planted() -> None:
+    pytest.importorskip("pysindy")
+    assert sparse(planted(1.0), GROUPS) == ["thrust_scale", "wind"]
+
+
+def test_without_pysindy_there_is_no_sparse_regression(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is left out and said to be, never replaced by something of our own."""
+    monkeypatch.setitem(sys.modules, "pysindy", None)
+    assert sparse(planted(1.0), GROUPS) is None
+    assert "PySINDy is not installed" in table.table_text([row_of(flight_with("wind"), [])], "c")
+
+
+@pytest.fixture(scope="module")
+def damped(tmp_path_factory: pytest.TempPathFactory) -> tuple[PlannedFlight, Path, dict[str, Any]]:
+    """One short still run with strong yaw damping."""
+    folder = tmp_path_factory.mktemp("study") / "flight"
+    effects = {"yaw_damping": {"coefficient": 0.006}}
+    flight = PlannedFlight("still", 0, effects, False, "full", 5, ("yaw_3211",))
+    return flight, folder, hide(flight, folder)
+
+
+def test_the_wrench_is_what_the_model_says(damped: tuple) -> None:
+    """Along the filter's states, yaw damping changes the yaw axis alone, by -k r / I_zz."""
+    _, folder, truth = damped
+    assert truth["values"] == {"yaw_damping.coefficient": 0.006}
+    assert not (folder / "truth.json").exists(), "the package must not find the truth"
+    flight = read_flight(folder)
+    vehicle = load_vehicle("lama400d").in_air(flight.air)
+    model = HeliModel(vehicle)
+    noise = starting_noise(flight, vehicle)
+    bare = {**model.bare_values, "gust_memory": 0.5}
+    run = Engine(model, [record_of(flight.runs[0])]).filter(bare, noise)[0]
+    change = baselines.wrench(model, run, {**bare, "yaw_damping.coefficient": 0.004})
+    change -= baselines.wrench(model, run, bare)
+    expected = np.zeros_like(change)
+    expected[:, 5] = -0.004 * run.states[:, 5] / vehicle["inertia_zz"].value
+    np.testing.assert_allclose(change, expected, atol=1e-9)
+
+
+def test_the_usual_way_finds_yaw_damping_in_still_air(damped: tuple) -> None:
+    named = baselines.name_causes(read_flight(damped[1]))
+    assert "yaw_damping" in [c["effect"] for c in named["F > 20"]["causes"]]
+
+
+def test_expected_evidence_grows_with_the_square_of_the_size(damped: tuple) -> None:
+    """Half theta' S theta: four times as much at twice the size, but for the Occam factor."""
+    planned, folder, truth = damped
+    flight = read_flight(folder)
+
+    def worth(factor: float) -> float:
+        values = {n: factor * v for n, v in truth["values"].items()}
+        nats = expected_evidence(planned, flight, truth | {"values": values}, ())["yaw_damping"]
+        assert nats is not None
+        return nats
+
+    none, one, two = worth(0.0), worth(0.2), worth(0.4)
+    assert none < 0.0 and one > none
+    assert (two - none) / (one - none) == pytest.approx(4.0, rel=0.15)
+
+
+def test_sizes_in_the_catalogues_form() -> None:
+    """The ground's lift by Cheeseman and Bennett and by the catalogue's exponential agree."""
+    values = catalogue_values({"ground_effect.gain": 1.0, "outside.heading_moment": 0.02})
+    assert set(values) == {"ground_effect.gain", "ground_effect.decay"}
+    for ratio in (1.2, 1.6, 2.0, 2.4):  # z/R
+        rise = 1.0 / (1.0 - (0.25 / ratio) ** 2) - 1.0
+        ours = values["ground_effect.gain"] * math.exp(-values["ground_effect.decay"] * ratio)
+        assert ours == pytest.approx(rise, rel=0.15)
+
+
+@pytest.mark.slow
+def test_one_flight_from_plan_to_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A strong gyro bias: found, worth about what was expected, and told in every file."""
+    monkeypatch.setenv("COAX_THREADS", "1")
+    effects = {"gyro_bias": {"x": 0.05, "y": -0.04, "z": 0.03}}
+    flight = PlannedFlight("one", 0, effects, True, "full", 5, ("lon_3211", "yaw_3211"))
+    row = fly_and_diagnose(flight)
+    assert "error" not in row, row["error"]
+    assert judge.is_exact_row(row)
+    evidence = row["methods"]["coax"]["causes"][0]["evidence"]
+    assert 0.5 < evidence / row["expected"]["gyro_bias"] < 2.0
+    assert {"F > 4", "F > 20", "BIC"} <= set(row["methods"])
+    store.store(tmp_path, flight, row)
+    assert store.stored(tmp_path, flight) == row
+    study_diagnosis.write_results(tmp_path, [row], "command")
+    assert (
+        "| exact cause, one effect | >= 95 % | 100.0 % | 1/1 |"
+        in (tmp_path / "table.md").read_text()
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["loky", "ray"])
+def test_two_workers_do_what_one_does(backend: str) -> None:
+    """joblib's processes and a local Ray of two workers: every flight comes back, once."""
+    if backend == "ray":
+        pytest.importorskip("ray")
+    flights = [
+        PlannedFlight("still", i, {}, False, "full", 5, ("lon_3211",)) for i in range(3)
+    ]  # fmt: skip
+    options = argparse.Namespace(jobs=2, backend=backend, no_baselines=True)
+    rows = {flight.name: row for flight, row in study_diagnosis.each(flights, options)}
+    assert set(rows) == {f.name for f in flights}
+    for row in rows.values():
+        assert "error" not in row, row["error"]
+        assert row["methods"]["coax"] == rows["still-0000"]["methods"]["coax"], "the same seed"
