@@ -124,7 +124,7 @@ def explain(
         screened = {
             c: TERM_EVIDENCE if axis in coloured else HIDDEN_EVIDENCE
             for axis in AXES
-            for c in _screen(along, axis, known, 0.0 if axis in coloured else HIDDEN_SHARE)
+            for c in _screen(along, axis, known, SHARE if axis in coloured else HIDDEN_SHARE)
             if c not in refused
         }
         best = _best(search, state, screened)

@@ -3,14 +3,15 @@
 import shlex
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import command_line
 
-from coax_env import report
-from coax_env.diagnosis import Diagnosis, diagnose
+from coax_env import load_effect
 from coax_env.files import staged_folder, write_json, write_text
-from coax_env.next_maneuver import write_flight_card
-from coax_env.vehicle import vehicle_toml
+
+if TYPE_CHECKING:
+    from coax_env.diagnosis import Diagnosis
 
 
 def main() -> None:
@@ -24,7 +25,14 @@ def main() -> None:
     parser.add_argument(
         "--exclude", default="", metavar="EFFECT,EFFECT", help="effects that must not be named"
     )
+    parser.add_argument(
+        "--effect", action="append", default=[], type=Path, metavar="FILE",
+        help="Python file with an effect of your own (coax_env/user_effects.py); may be repeated",
+    )  # fmt: skip
     options = parser.parse_args()
+    for file in options.effect:
+        load_effect(file)
+    from coax_env.diagnosis import diagnose  # compiles the kernel, with the catalogue as it is now
 
     held = None
     if options.hold_out is not None:
@@ -43,8 +51,12 @@ def main() -> None:
           f"{options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")  # fmt: skip
 
 
-def save(result: Diagnosis, out: Path, command: str) -> None:
+def save(result: "Diagnosis", out: Path, command: str) -> None:
     """findings.json, vehicle.toml and report.html, all or none; then the next flight's card."""
+    from coax_env import report
+    from coax_env.next_maneuver import write_flight_card
+    from coax_env.vehicle import vehicle_toml
+
     page = report.diagnosis_page(result, command)
     with staged_folder(out) as folder:
         write_json(folder / "findings.json", result.findings)
@@ -54,7 +66,7 @@ def save(result: Diagnosis, out: Path, command: str) -> None:
         write_flight_card(result.design, result.flight, out / "next_flight")
 
 
-def summary(result: Diagnosis) -> str:
+def summary(result: "Diagnosis") -> str:
     """The finding in a few lines."""
     findings = result.findings
     lines = [f"verdict: {findings['verdict']}"]

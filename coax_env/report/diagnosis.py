@@ -278,7 +278,7 @@ def _left(findings: Findings, vehicle: Vehicle) -> list[str]:
     ]
     caption = "Structure beyond noise and gusts that no effect of the catalogue explains"
     return [
-        table(["channel", "share of its innovations", "follows", "form"], rows, caption)
+        table(["channel", "share", "follows", "form"], rows, caption)
         if rows
         else callout("Nothing beyond noise and gusts is left in the innovations.", "good"),
         prose(_gust_words(findings["gusts"], vehicle)),

@@ -1,0 +1,320 @@
+"""What no signature of the catalogue finds: generic terms, a user's own effect, a spectral line.
+
+The flights come from `injector`, which shares no code with the package.
+"""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import injector
+import numpy as np
+import pytest
+
+from coax_env import InputError, derivative, diagnose, effects, load_vehicle, read_flight, vibration
+from coax_env.dynamics import hover_trim
+from coax_env.generic_terms import AXES, TERMS, hover_speeds
+from coax_env.layout import N_STATES, STATES
+from coax_env.simulation import Gusts, simulate
+from coax_env.vehicle import Vehicle, vehicle_toml
+
+ROOT = Path(__file__).resolve().parents[1]
+LAMA = load_vehicle("lama400d")
+NAMES = [name for name, _ in STATES]
+TURNING = ("lon_3211", "heading_turn")
+
+
+def all_but(*names: str) -> list[str]:
+    return [name for name in effects.CATALOGUE if name not in names]
+
+
+FEW = all_but("gyro_bias", "swash_offset", "rotor_drag")
+
+# --- the terms themselves ---------------------------------------------------------------------------
+
+
+def with_terms(**coefficients: float) -> Vehicle:
+    """The bare vehicle with coefficients such as ``M__sin_3psi``."""
+    vehicle = LAMA
+    for key, value in coefficients.items():
+        axis, term = key.split("__")
+        vehicle = vehicle.with_effect(f"unlisted_{axis}", **{term: value})
+    return vehicle
+
+
+def expected(term: str, s: dict[str, float], command: np.ndarray) -> float:
+    """A term's value by its formula, from the named state."""
+    hover = hover_speeds(LAMA.vector)
+    known = {
+        "sin_phi": math.sin(s["phi"]), "sin_theta": math.sin(s["theta"]),
+        "cos_phi": 1.0 - math.cos(s["phi"]), "cos_theta": 1.0 - math.cos(s["theta"]),
+        "omega_u": command[0] - hover[0], "omega_l": command[1] - hover[1],
+        "delta_lon": command[2], "delta_lat": command[3],
+        "omega_u_rate": 0.0, "omega_l_rate": 0.0,  # rotors without a lag have arrived
+    }  # fmt: skip
+    if term in known:
+        return known[term]
+    if term.endswith("psi"):
+        wave, _, harmonic = term.partition("_")
+        angle = float(harmonic.removesuffix("psi") or 1) * s["psi"]
+        return math.sin(angle) if wave == "sin" else math.cos(angle)
+    if term.startswith("abs_"):
+        return abs(s[term[4]]) * s[term[4]]
+    return math.prod(s[name] for name in term.split("_"))
+
+
+@pytest.mark.parametrize("term", [t.key for t in TERMS])
+def test_every_term_is_its_formula(term):
+    rng = np.random.default_rng(3)
+    state = 0.3 * rng.standard_normal(N_STATES)
+    command = np.array([205.0, 221.0, 0.03, -0.02])
+    values = dict(zip(NAMES, state, strict=True))
+    bare = derivative(state, command, LAMA)
+    inertia = [LAMA[n].value for n in ("mass",) * 3 + ("inertia_xx", "inertia_yy", "inertia_zz")]
+    for i, axis in enumerate("XYZLMN"):
+        change = derivative(state, command, with_terms(**{f"{axis}__{term}": 0.01})) - bare
+        wanted = np.zeros(N_STATES)
+        wanted[i] = 0.01 * expected(term, values, command) / inertia[i]
+        np.testing.assert_allclose(change, wanted, atol=1e-11)
+
+
+def test_hover_speeds_hold_the_bare_model():
+    """Without the download on the fuselage, the trim of the bare vehicle."""
+    free = LAMA.with_values({"fuselage_drag_coefficient": 0.0})
+    np.testing.assert_allclose(hover_speeds(free.vector), hover_trim(free)[1][:2], rtol=1e-9)
+
+
+def test_only_what_is_not_zero_is_written(tmp_path):
+    vehicle = with_terms(M__sin_3psi=0.02, X__abs_u_u=-0.1, M__u=0.0)
+    path = tmp_path / "v.toml"
+    path.write_text(vehicle_toml(vehicle), encoding="utf-8")
+    back = load_vehicle(path)
+    assert {g: list(t) for g, t in back.effects.items()} == {
+        "unlisted_M": ["sin_3psi"], "unlisted_X": ["abs_u_u"],
+    }  # fmt: skip
+    assert back["unlisted_X.abs_u_u"].unit == "N per (m/s)2"
+    np.testing.assert_array_equal(back.vector, vehicle.vector)
+    assert np.count_nonzero(vehicle.vector != LAMA.vector) == 3, "two numbers and one switch"
+
+
+def test_terms_are_no_part_of_the_catalogue():
+    assert set(AXES) <= set(effects.GROUPS) and not set(AXES) & set(effects.CATALOGUE)
+
+
+# --- found in flight --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("gusts", "size"), [(False, 0.01), (True, 0.02)])
+def test_a_force_in_no_list_becomes_part_of_the_model(tmp_path, gusts, size):
+    """M = a sin(3 psi), hidden: the right axis, form and size, and no effect of the list is blamed."""
+    runs = (*TURNING, "lat_3211", "yaw_3211")
+    folder = injector.fly(tmp_path / "f", {"outside": size}, gusts=gusts, runs=runs, seed=41)
+    result = diagnose(folder, hold_out=[], exclude=FEW)
+    findings = result.findings
+    assert findings["verdict"] == "unexplained" and not findings["causes"]
+    (left,) = findings["unexplained"]
+    assert left["channel"] == "q" and left["depends_on"] == ["psi"]
+    assert left["form"].endswith("sin(3 psi) [N m]") and left["share"] > 0.2
+    found = result.vehicle_after["unlisted_M.sin_3psi"]
+    assert found.unit == "N m" and abs(found.value - size) < 3.0 * found.std < 0.3 * size
+    again = load_vehicle(_written(result.vehicle_after, tmp_path))
+    assert set(again.effects) == {"unlisted_M"}
+
+
+def _written(vehicle: Vehicle, folder: Path) -> Path:
+    path = folder / "vehicle.toml"
+    path.write_text(vehicle_toml(vehicle), encoding="utf-8")
+    return path
+
+
+@pytest.mark.slow
+def test_an_unlisted_term_is_worth_its_gain(tmp_path):
+    """On a turn that the fit has not seen, most of the pitch error goes."""
+    folder = injector.fly(
+        tmp_path / "f", {"outside": 0.02}, runs=(*TURNING, "lat_3211", "yaw_3211"), seed=42
+    )
+    flight = read_flight(folder)
+    turn = flight.run("heading_turn")
+    other = read_flight(
+        injector.fly(tmp_path / "g", {"outside": 0.02}, runs=["heading_turn"], seed=43)
+    ).runs[0]
+    flight = replace(flight, runs=(*flight.runs, replace(other, name="second_turn")))
+    assert not np.array_equal(turn.measured["q"], other.measured["q"])
+    gain = diagnose(flight, hold_out=["second_turn"], exclude=FEW).findings["gain"]
+    for channel in ("q", "theta"):
+        entry = gain["channels"][channel]
+        before, after = (
+            max(entry[k] ** 2 - entry["noise"] ** 2, 0.0) ** 0.5 for k in ("before", "after")
+        )
+        assert after < 0.4 * before, entry
+
+
+def test_nothing_unlisted_in_clean_gusts(tmp_path):
+    folder = injector.fly(
+        tmp_path / "f", {}, gusts=True, runs=(*TURNING, "lat_3211", "forward_run"), seed=44
+    )
+    result = diagnose(folder, hold_out=[], exclude=FEW)
+    assert result.findings["verdict"] == "consistent" and not result.vehicle_after.effects
+
+
+def test_a_listed_effect_comes_before_unlisted_terms(tmp_path):
+    """A drag is a drag, though terms in u and v would do as well."""
+    folder = injector.fly(
+        tmp_path / "f", {"rotor_drag": 6e-4}, runs=("forward_run", "side_run", "lon_3211"), seed=45
+    )
+    findings = diagnose(folder, hold_out=[], exclude=FEW).findings
+    assert [c["effect"] for c in findings["causes"]] == ["rotor_drag"]
+    assert findings["verdict"] == "explained"
+
+
+# --- a user's own effect ----------------------------------------------------------------------------
+
+HEADING_MOMENT = '''
+import math
+from coax_env import flow as F
+from coax_env.effects import LOAD, EffectParameter, effect
+
+@effect(LOAD, EffectParameter("k", "N m", usual=0.02, smallest=0.002),
+        channels="q theta", source="seen on the bench")
+def heading_moment(x, f, p, e):
+    """A pitching moment that follows the heading, k sin(3 psi)."""
+    f[F.MOMENT_Y] += p[e] * math.sin(3.0 * x[12])
+'''
+
+
+def run_diagnose(*words: object, cwd: Path) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "diagnose.py"), *map(str, words)],
+        cwd=cwd, capture_output=True, text=True, timeout=500, env=os.environ.copy(),
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_an_effect_of_ones_own_is_named(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(HEADING_MOMENT)
+    folder = injector.fly(tmp_path / "f", {"outside": 0.02}, runs=TURNING, seed=46)
+    done = run_diagnose(
+        folder, "--effect", file, "--hold-out", "none", "--exclude", ",".join(FEW), "--out", "o",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    findings = json.loads((tmp_path / "o" / "findings.json").read_text())
+    (cause,) = findings["causes"]
+    assert cause["effect"] == "heading_moment" and findings["verdict"] == "explained"
+    found = cause["parameters"]["heading_moment.k"]
+    assert abs(found["value"] - 0.02) < 3.0 * found["std"] and found["unit"] == "N m"
+    assert "heading_moment" in (tmp_path / "o" / "report.html").read_text().replace(" ", "_")
+
+    forbidden = run_diagnose(
+        folder, "--effect", file, "--hold-out", "none", "--out", "p",
+        "--exclude", ",".join([*FEW, "heading_moment"]), cwd=tmp_path,
+    )  # fmt: skip
+    assert forbidden.returncode == 0, forbidden.stderr
+    findings = json.loads((tmp_path / "p" / "findings.json").read_text())
+    assert not findings["causes"] and findings["unexplained"][0]["channel"] == "q"
+
+
+BAD_EFFECTS = {
+    "no effect file": None,
+    "no function under @effect": "x = 1\n",
+    "line 2": "import math\ndef broken(:\n",
+    "already": HEADING_MOMENT.replace("def heading_moment", "def rotor_drag"),
+    "no channel": HEADING_MOMENT.replace("q theta", "q speed"),
+    "NameError": HEADING_MOMENT.replace("LOAD, EffectParameter", "EffectParameter"),
+    "does not compile": HEADING_MOMENT.replace("math.sin(", "math.sine("),
+}
+
+
+@pytest.mark.parametrize("words", BAD_EFFECTS)
+def test_a_bad_effect_file_is_refused_in_one_line(tmp_path, words):
+    file = tmp_path / "mine.py"
+    if BAD_EFFECTS[words] is not None:
+        file.write_text(BAD_EFFECTS[words])
+    done = run_diagnose(tmp_path, "--effect", file, cwd=tmp_path)
+    assert done.returncode == 2 and words in done.stderr, done.stderr
+    assert done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
+    assert not (tmp_path / "runs").exists()
+
+
+def test_an_effect_cannot_be_added_to_a_compiled_kernel(tmp_path):
+    from coax_env import load_effect
+
+    file = tmp_path / "mine.py"
+    file.write_text(HEADING_MOMENT)
+    with pytest.raises(InputError, match="before the model is first used"):
+        load_effect(file)
+
+
+# --- vibration --------------------------------------------------------------------------------------
+
+
+def test_vibration_is_named_and_explains_the_accelerometers(tmp_path):
+    folder = injector.fly(
+        tmp_path / "f", {"vibration": 0.5}, gusts=True, runs=("lon_3211", "lat_3211"), seed=47
+    )
+    result = diagnose(folder, hold_out=[], exclude=[e for e in FEW if e != "vibration"])
+    assert [c["effect"] for c in result.findings["causes"]] == ["vibration"]
+    assert result.findings["verdict"] == "explained", result.findings["unexplained"]
+    found = result.findings["causes"][0]["parameters"]["vibration.amplitude"]
+    assert abs(found["value"] - 0.5) < 3.0 * found["std"] < 0.05
+    assert result.vehicle_after["vibration.amplitude"].value == found["value"]
+    forbidden = diagnose(folder, hold_out=[], exclude=[*FEW, "vibration"]).findings
+    assert "vibration" not in [c["effect"] for c in forbidden["causes"]]
+    assert {u["channel"] for u in forbidden["unexplained"]} >= {"ax", "ay", "az"}
+
+
+@pytest.mark.parametrize("loud", [1.0, 2.0])
+def test_louder_noise_is_no_vibration(tmp_path, loud):
+    flight = read_flight(injector.fly(tmp_path / "f", {}, gusts=True, runs=TURNING, seed=48))
+    rng = np.random.default_rng(0)
+    extra = math.sqrt(loud**2 - 1.0) * 0.1
+    runs = [
+        replace(
+            run,
+            measured={
+                c: z + extra * rng.standard_normal(z.size) * (c in vibration.ACCELEROMETERS)
+                for c, z in run.measured.items()
+            },
+        )
+        for run in flight.runs
+    ]
+    assert vibration.find(replace(flight, runs=tuple(runs))) is None
+
+
+@pytest.mark.parametrize("sensors", ["onboard", "paper"])
+def test_our_own_vibration_is_found_and_taken_out(sensors):
+    """The simulation's line, at every row and aliased by a slower reading (every third row)."""
+    shaking = LAMA.with_effect("vibration", amplitude=0.3)
+    flight = simulate(
+        shaking, ["lon_3211", "heave_3211"], sensors=sensors, seed=3, gusts=Gusts(), tremor=1.0
+    )
+    for every in (1, 3):
+        runs = [
+            replace(run, measured={
+                c: np.where(np.arange(z.size) % every == 0, z, np.nan)
+                if c in vibration.ACCELEROMETERS else z
+                for c, z in run.measured.items()
+            })
+            for run in flight.runs
+        ]  # fmt: skip
+        thin = replace(flight, runs=tuple(runs))
+        line = vibration.find(thin)
+        assert line is not None and line.rotor == "upper"
+        assert abs(line.amplitude - 0.3) < 3.0 * line.std
+        assert vibration.find(vibration.taken_out(thin, line)) is None
+
+
+def test_vibration_is_reading_noise_to_the_filter():
+    from coax_env.heli_model import starting_noise
+
+    flight = simulate(LAMA, "hover", seed=1)
+    shaking = LAMA.with_effect("vibration", amplitude=0.4)
+    bare, loud = (starting_noise(flight, v).reading for v in (LAMA, shaking))
+    for channel, std in bare.items():
+        more = 0.4**2 / 2.0 if channel in vibration.ACCELEROMETERS else 0.0
+        assert loud[channel] ** 2 == pytest.approx(std**2 + more)
