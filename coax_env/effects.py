@@ -120,11 +120,13 @@ def effect(
     """Enter a function into the catalogue under its own (or this) name; its docstring says what it is.
 
     Raises:
-        InputError: the name is taken, or a channel does not exist.
+        InputError: the name is taken, a channel does not exist, or the stage or parameters are none.
     """
 
     def enter(function: Callable) -> Callable:
         own = name or function.__name__
+        if not isinstance(stage, int) or not parameters:
+            raise InputError(f"effect {own!r}: @effect(stage, EffectParameter(...), ...) is wanted")
         if own in GROUPS:
             raise InputError(f"the catalogue of effects has {own!r} already")
         for channel in channels.split():

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from numba import float64, int64
-from numba.core.errors import NumbaError
 
 from coax_env import effects, jit
 from coax_env.errors import InputError
@@ -76,7 +75,7 @@ def _check(path: Path, name: str) -> None:
     try:
         function: Any = effects.GROUPS[name].function
         function.compile((_A, _A, _A, int64))
-    except NumbaError as error:
+    except Exception as error:  # numba raises its own errors and, for unknown names, Python's
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise InputError(
             f"{path}: effect {name!r} does not compile: {' '.join(lines[:2])}"

@@ -26,7 +26,7 @@ from coax_env.search import Quadratic, Search, State
 from coax_env.vehicle import load_vehicle
 from study import baselines
 from study.judge import OWN
-from study.plan import HOVER, PlannedFlight
+from study.plan import PlannedFlight
 from study.store import code_hash
 
 GUSTS = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003, "memory": 0.5}
@@ -82,7 +82,8 @@ def _result(planned: PlannedFlight, folder: Path, only_own: bool) -> dict[str, A
         "flown_s": sum(run.duration for run in flight.runs),
     }
     catalogued = [e for e in truth["hidden"] if e in CATALOGUE]
-    if catalogued == truth["hidden"] and truth["hidden"] and planned.runs != HOVER:
+    whole_runs = bool(held) and set(held) <= set(flight.run_names)
+    if catalogued == truth["hidden"] and truth["hidden"] and whole_runs:
         row["true_structure"] = gain_of_the_truth(result, catalogued, truth["values"], held)
     if not only_own:
         methods |= baselines.name_causes(flight)
