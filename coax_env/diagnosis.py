@@ -128,7 +128,7 @@ def diagnose(
     )
     state, quadratic, terms = unlisted.explain(search, state, quadratic)
     say("weighing the causes against their look-alikes")
-    state, quadratic, weights = search.prune(state, quadratic)
+    state, quadratic, weights = search.prune(state)
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
     white_after = whiteness(passes_after, CHANNELS)
@@ -281,7 +281,7 @@ def _causes(
     for effect in state.active:
         entry = effects.CATALOGUE[effect]
         weight = weights[effect]
-        channels = _channels(search, state, effect)
+        channels = _channels(search, state, quadratic, effect)
         ties[effect] = _look_alikes(
             search,
             state,
@@ -424,12 +424,11 @@ def _design(
     return next_maneuver.design(alternatives, state.noise, next_maneuver.logged_rates(flight))
 
 
-def _channels(search: Search, state: State, effect: str) -> list[str]:
+def _channels(search: Search, state: State, quadratic: Quadratic, effect: str) -> list[str]:
     """Channels that carry most of an effect's signature, strongest first."""
-    free = [f for f in search.free(state.active) if f.name.startswith(effect + ".")]
-    _, lin = search.engine.linearise(state.values, state.noise, free)
-    size = np.array([state.values[f.name] - f.value for f in free])
-    strength = np.einsum("k,rkm->m", size**2, lin.by_channel)
+    own = search.by_effect[effect]
+    size = np.array([state.values[f.name] - f.value for f in own])
+    strength = size**2 @ quadratic.by_channel[quadratic.index([f.name for f in own])]
     order = np.argsort(-strength)
     total = strength.sum()
     return [CHANNELS[i] for i in order if total > 0.0 and strength[i] > 0.1 * total]

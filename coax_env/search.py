@@ -25,6 +25,7 @@ import numpy as np
 from coax_env import effects
 from coax_env.engine.fit import Engine, Linearised, RunPass, bounded_solve, objective
 from coax_env.engine.model import FreeParameter, Noise
+from coax_env.generic_terms import AXES
 from coax_env.heli_model import BUFFET_LEVELS, GUST_LEVELS, HeliModel
 
 EVIDENCE = 12.0
@@ -34,7 +35,15 @@ TIE = 6.0
 MOST_CAUSES = 10
 PROMISE = 2.0
 """Nats below which another Gauss-Newton step is not worth its time."""
-MOST_MOVES = 3
+MOST_TURNS = 6
+GLANCE = 60.0
+"""Seconds of flight on which noise levels are fitted while the search goes on."""
+PLAIN = 2.0
+"""Standard deviations by which white noise must want to be more before its levels are fitted."""
+BEYOND_DOUBT = 10.0
+"""A cause worth so many thresholds after the first refit without it needs no closer one."""
+CLEAR = 10.0
+"""An effect worth so many times what another step promises is added before the fit has settled."""
 TOGETHER = (frozenset({"servo_lag", "servo_delay"}),)
 """Effects of which one at most is named: a real servo is a mixture of both (design/effects.md)."""
 BUFFET_SHARE = 0.2
@@ -62,6 +71,7 @@ class Quadratic:
     lower: np.ndarray
     upper: np.ndarray
     stretches: np.ndarray
+    by_channel: np.ndarray
 
     @classmethod
     def of(
@@ -78,6 +88,7 @@ class Quadratic:
             np.array([f.lower for f in free]),
             np.array([f.upper for f in free]),
             lin.stretches,
+            lin.by_channel.sum(0),
         )
 
     def index(self, names: Collection[str]) -> np.ndarray:
@@ -248,7 +259,8 @@ class Search:
         values = {**self.model.bare_values, "gust_memory": noise.process["memory"]}
         for f in self.all:
             values.setdefault(f.name, f.value)
-        state = State([], values, self.engine.fit_noise(values, noise, GUST_LEVELS))
+        noise = self.engine.fit_noise(values, noise, GUST_LEVELS, 10, PROMISE, GLANCE)
+        state = State([], values, noise)
         self.look_for_buffet(state)
         return state
 
@@ -274,6 +286,23 @@ class Search:
         )
         return gained
 
+    def moved(
+        self,
+        state: State,
+        quadratic: Quadratic,
+        active: list[str],
+        pinned: Mapping[str, float],
+        more: Collection[str] = (),
+    ) -> State:
+        """Where the quadratic says the fit with other effects is, noise as it was.
+
+        `more`: parameters loose beside those of `active`.
+        """
+        free = [n for n in self.free_names(active) if n not in pinned]
+        _, move = quadratic.best([*free, *(n for n in more if n not in free)], dict(pinned))
+        values = dict(zip(quadratic.names, (quadratic.at + move).tolist(), strict=True))
+        return State(active, state.values | values | dict(pinned), state.noise)
+
     def settle(
         self,
         state: State,
@@ -288,19 +317,45 @@ class Search:
         state.objective = estimate.objective
         return state
 
-    def refit_noise(self, state: State) -> State:
-        """Noise levels again, from where they stand."""
-        noise = self.engine.fit_noise(state.values, state.noise, self.levels, iterations=4)
+    def refit_noise(self, state: State, seconds: float = GLANCE) -> State:
+        """Noise levels again, from where they stand, on so many seconds of flight."""
+        noise = self.engine.fit_noise(
+            state.values,
+            state.noise,
+            self.levels,
+            evaluations=5,
+            tolerance=PROMISE,
+            seconds=seconds,
+        )
         return replace(state, noise=noise)
 
+    def converge(self, state: State, without: Collection[str] = ()) -> State:
+        """Noise levels and loose parameters by turns until neither gains, those in `without` held.
+
+        Evidence is a difference of two such states: what one of them lacks in convergence would count
+        for the other.
+        """
+        for _ in range(MOST_TURNS):
+            before = state.objective
+            state = self.settle(self.refit_noise(state, math.inf), steps=1, without=without)
+            if before - state.objective < PROMISE:
+                break
+        return state
+
     def look_for_buffet(self, state: State) -> bool:
-        """Let white force and moment in, where that is worth more than TIE; True where it is."""
+        """Let white force and moment in, where that is worth more than TIE; True where it now is."""
+        if self.levels != GUST_LEVELS:
+            return False
+        _, by_noise, _ = self.engine.noise_score(state.values, state.noise)
+        sigmas = by_noise.sum(0) / (np.sqrt(len(by_noise)) * by_noise.std(0) + 1e-300)
+        if sigmas[: len(AXES)].max() < PLAIN:
+            return False
         start = dict(state.noise.process)
         for gust, buffet in zip(GUST_LEVELS, BUFFET_LEVELS, strict=True):
             start[buffet] = BUFFET_SHARE * start[gust]
         levels = GUST_LEVELS + BUFFET_LEVELS
         trial = self.engine.fit_noise(
-            state.values, replace(state.noise, process=start), levels, iterations=8
+            state.values, replace(state.noise, process=start), levels, 10, PROMISE, GLANCE
         )
         gained = self.engine.log_likelihood(state.values, trial)
         gained -= self.engine.log_likelihood(state.values, state.noise)
@@ -389,23 +444,27 @@ class Search:
         occam_old = 0.0 if self.pinned(old) else quadratic.occam(self.candidate_names(old), rest)
         return then + occam_new - now - occam_old, move
 
+    def without(self, state: State, quadratic: Quadratic, effect: str) -> State:
+        """The state without an effect, the rest moved to where the quadratic says."""
+        rest = [e for e in state.active if e != effect]
+        return self.moved(state, quadratic, rest, self.off(effect) | self.pinned(effect))
+
     def weigh(self, state: State, quadratic: Quadratic) -> dict[str, "Weight"]:
         """What each cause is worth: everything refitted without it, noise levels too."""
         weights = {}
         for effect in state.active:
-            rest = [e for e in state.active if e != effect]
-            values = state.values | self.off(effect) | self.pinned(effect)
-            without = self.refit_noise(State(rest, values, state.noise))
-            self.settle(without, steps=2, without=effects.CATALOGUE[effect].replaces)
-            lost = float(without.objective - state.objective)
-            weights[effect] = Weight(lost, self.colour(quadratic, state.active, effect))
+            held = effects.CATALOGUE[effect].replaces
+            colour = self.colour(quadratic, state.active, effect)
+            without = self.refit_noise(self.without(state, quadratic, effect))
+            self.settle(without, steps=1, without=held)
+            if without.objective - state.objective < BEYOND_DOUBT * EVIDENCE * colour:
+                without = self.converge(without, held)
+            weights[effect] = Weight(float(without.objective - state.objective), colour)
         return weights
 
-    def prune(
-        self, state: State, quadratic: Quadratic
-    ) -> tuple[State, Quadratic, dict[str, "Weight"]]:
+    def prune(self, state: State) -> tuple[State, Quadratic, dict[str, "Weight"]]:
         """Take out, one at a time, causes whose evidence is gone once the noise may answer too."""
-        weights = self.weigh(state, quadratic)
+        state, quadratic, weights = self._weighed(state)
         while weights:
             weakest = min(weights, key=lambda e: weights[e].evidence)
             if weights[weakest].evidence >= EVIDENCE:
@@ -414,31 +473,35 @@ class Search:
             self.say(f"dropped {weakest}: worth {weights[weakest].evidence:.1f} nats in the end")
             state.active = [e for e in state.active if e != weakest]
             state.values |= self.off(weakest) | self.pinned(weakest)
-            state = self.refit_noise(self.settle(state))
-            self.settle(state)
-            _, quadratic = self.linearise(state)
-            weights = self.weigh(state, quadratic)
+            state, quadratic, weights = self._weighed(state)
         return state, quadratic, weights
+
+    def _weighed(self, state: State) -> tuple[State, Quadratic, dict[str, "Weight"]]:
+        state = self.converge(state)
+        _, quadratic = self.linearise(state)
+        return state, quadratic, self.weigh(state, quadratic)
 
     # --- the search ---------------------------------------------------------------------------------
 
     def run(self, state: State) -> tuple[State, Quadratic]:
-        """Forward, backward and swap until nothing moves; the final state and its quadratic."""
+        """Forward, backward and swap from a fitted state until nothing moves; with the quadratic."""
         banned: set[str] = set()  # dropped since the last addition
         drops: Counter[str] = Counter()
         tried: set[tuple[str, ...]] = set()
-        moves = failures = most = 0
-        complete = False
-        state = self.refit_noise(self.settle(state))
+        failures = most = 0
+        complete = settled = False
         for _ in range(4 * MOST_CAUSES):
             passes, quadratic = self.linearise(state)
             promised, _ = quadratic.best(self.free_names(state.active))
-            if -promised > PROMISE and moves < MOST_MOVES:
-                moves += 1
-                if self.advance(state, passes, quadratic, {}) > PROMISE:
-                    continue
-            moves = 0
-            dropped = self._drop(state, quadratic, coloured=complete)
+            ranked = self._ranked(state, quadratic, banned)
+            clear = not complete and ranked and ranked[0][0] > -CLEAR * promised
+            if -promised > PROMISE and not settled and not clear:
+                self.advance(state, passes, quadratic, {})
+                self.settle(state, steps=1)
+                settled = True
+                continue
+            settled = False
+            dropped = None if complete else self._drop(state, quadratic, coloured=False)
             if dropped:
                 drops[dropped] += 1
                 banned.add(dropped)
@@ -446,21 +509,20 @@ class Search:
             elif (
                 not complete
                 and failures < MOST_FAILURES
-                and self._add(state, passes, quadratic, banned)
+                and self._add(state, passes, quadratic, ranked)
             ):
                 if len(state.active) > most + 1:  # the one before held
                     most, failures = len(state.active) - 1, 0
                     banned = {e for e, count in drops.items() if count > 1}
-            elif not complete and self._swap(state, quadratic, tried):
-                pass
-            elif complete:
-                break
-            elif self.levels == GUST_LEVELS and self.look_for_buffet(state):
+            elif not complete and (
+                self._swap(state, quadratic, tried) or self.look_for_buffet(state)
+            ):
                 pass
             else:  # nothing more to add: what is in must also stand against coloured residuals
                 complete = True
-                continue
-            state = self.refit_noise(self.settle(state))
+                if not self._drop(state, quadratic, coloured=True):
+                    break
+            state = self.refit_noise(state)
         return state, quadratic
 
     def _drop(self, state: State, quadratic: Quadratic, coloured: bool) -> str | None:
@@ -482,8 +544,10 @@ class Search:
             return None
         self.history.append((f"- {effect}", max(worth[effect], 0.0)))
         self.say(f"dropped {effect}: worth {worth[effect]:.1f} nats")
-        state.active = [e for e in state.active if e != effect]
-        state.values |= self.off(effect)
+        without = self.moved(
+            state, quadratic, [e for e in state.active if e != effect], self.off(effect)
+        )
+        state.active, state.values = without.active, without.values
         return effect
 
     def _holds_not(self, state: State, quadratic: Quadratic, effect: str, coloured: bool) -> bool:
@@ -491,14 +555,12 @@ class Search:
 
         The quadratic reaches from where the effect stands back to nothing, which is far for a lag.
         """
-        rest = [e for e in state.active if e != effect]
         without = self.settle(
-            State(rest, state.values | self.off(effect) | self.pinned(effect), state.noise),
-            without=effects.CATALOGUE[effect].replaces,
+            self.without(state, quadratic, effect), without=effects.CATALOGUE[effect].replaces
         )
         colour = self.colour(quadratic, state.active, effect) if coloured else 1.0
         own = self.candidate_names(effect)
-        occam = quadratic.occam(own, self.free_names(rest))
+        occam = quadratic.occam(own, self.free_names(without.active))
         return (without.objective - state.objective) / colour - occam < EVIDENCE
 
     def _swap(self, state: State, quadratic: Quadratic, tried: set[tuple[str, ...]]) -> bool:
@@ -524,11 +586,10 @@ class Search:
                 return True
         return False
 
-    def _add(
-        self, state: State, passes: Sequence[RunPass], quadratic: Quadratic, banned: set[str]
-    ) -> str | None:
-        if len(state.active) >= MOST_CAUSES:
-            return None
+    def _ranked(
+        self, state: State, quadratic: Quadratic, banned: Collection[str]
+    ) -> list[tuple[float, str]]:
+        """Effects that may be added, with their scores, the best first."""
         ranked = []
         for effect in self.candidates:
             if effect in state.active or effect in banned or together(effect) & set(state.active):
@@ -538,11 +599,21 @@ class Search:
                 self.strongest = max(self.strongest, (evidence, effect))
                 if evidence > EVIDENCE:
                     ranked.append((score, effect))
-        if not ranked:
-            return None
-        score, effect = max(ranked)
+        return sorted(ranked, reverse=True)
+
+    def _add(
+        self,
+        state: State,
+        passes: Sequence[RunPass],
+        quadratic: Quadratic,
+        ranked: Sequence[tuple[float, str]],
+    ) -> bool:
+        """Put in the best effect that may be added, if there is one."""
+        if not ranked or len(state.active) >= MOST_CAUSES:
+            return False
+        score, effect = ranked[0]
         self.history.append((f"+ {effect}", score))
         self.say(f"added {effect}: {score:.1f} nats")
         state.active = [*state.active, effect]
         self.advance(state, passes, quadratic, self.pinned(effect))
-        return effect
+        return True

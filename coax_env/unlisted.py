@@ -274,8 +274,8 @@ def _with(search: Search, state: State, candidate: Candidate, needed: float) -> 
     names = [f.name for f in own]
     search.loosen(own)
     values = {**state.values, **dict.fromkeys(names, 0.0)}
-    trial = search.refit_noise(search.settle(replace(state, values=values)))
-    trial = search.settle(trial)
+    trial = search.refit_noise(search.settle(replace(state, values=values), steps=1))
+    trial = search.settle(trial, steps=1)
     passes, quadratic = search.linearise(trial)
     free = search.free_names(trial.active)
     worth = (state.objective - trial.objective) / quadratic.colour(names, free)

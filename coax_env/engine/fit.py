@@ -4,6 +4,7 @@ One engine, three uses: every parameter fixed is the simulation check, base para
 identification, effects' parameters free is diagnosis.
 """
 
+import math
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +21,7 @@ from coax_env.engine.model import FreeParameter, Model, Noise, Record
 GATE = 8.0  # sigmas
 REFRESH = 4  # rows between new Jacobians
 STRETCH = 2.0  # s
+STEP_OF_LOG = 1e-3  # of a noise level, for the slopes of the model's variances
 HUGE = 1e6  # whitened innovations that only a diverging mean has
 Progress = Callable[[str], None]
 
@@ -30,7 +32,7 @@ class RunPass:
 
     innovations: (n, m) whitened, NaN where there is no reading. states: (n, nx) filtered.
     gains, whitening: see kalman.py, empty unless kept. start_covariances: (s, nx, nx) of the filtered
-    state at `start_rows`.
+    state at `start_rows`. deweighted: how many readings were beyond the gate.
     """
 
     record: Record
@@ -38,7 +40,7 @@ class RunPass:
     log_likelihood: float
     innovations: np.ndarray
     states: np.ndarray
-    left_out: int
+    deweighted: int
     gains: np.ndarray
     whitening: np.ndarray
     start_rows: np.ndarray
@@ -113,31 +115,51 @@ class Engine:
         """
         p = self.model.vector(values)
         q = self.model.process_noise(noise)
-        R = np.array([noise.reading.get(c, 1.0) for c in self.model.channels]) ** 2
+        R = self._reading_variances(noise)
 
         def one(i: int) -> RunPass:
-            record = self.records[i]
-            n, m = record.z.shape
-            nx = q.size
-            u = self.model.inputs(record, p)
-            x0, P0 = self.model.start(record, noise)
-            e = np.full((n, m), np.nan)
-            states = np.zeros((n, nx))
-            rows = n if keep else 0
-            K = np.zeros((rows, m, nx), np.float32)
-            W = np.zeros((rows, m, m), np.float32)
-            starts = np.empty(0, np.int64) if start_rows is None else start_rows[i]
-            slots = np.full(n, -1, np.int64)
-            slots[starts] = np.arange(starts.size)
-            P = np.zeros((starts.size, nx, nx))
-            log_likelihood, left_out = kalman.filter_pass(
-                self.model.step, self.model.measure, self.intervals[i], u, record.z, self.model.wraps,
-                x0, P0, R, q, p, self.model.state_scale, self.model.work_size, GATE, REFRESH,
-                keep, states, e, K, W, slots, P,
-            )  # fmt: skip
-            return RunPass(record, u, log_likelihood, e, states, left_out, K, W, starts, P)
+            starts = None if start_rows is None else start_rows[i]
+            return self._filter_run(i, p, q, R, noise, keep, start_rows=starts)[0]
 
         return self._each(one, which)
+
+    def _reading_variances(self, noise: Noise) -> np.ndarray:
+        return np.array([noise.reading.get(c, 1.0) for c in self.model.channels]) ** 2
+
+    def _filter_run(
+        self,
+        i: int,
+        p: np.ndarray,
+        q: np.ndarray,
+        R: np.ndarray,
+        noise: Noise,
+        keep: bool,
+        jacobians: bool = False,
+        start_rows: np.ndarray | None = None,
+    ) -> tuple[RunPass, np.ndarray, np.ndarray]:
+        """The filter pass of a run, and the Jacobians of readings and steps (empty unless asked)."""
+        record = self.records[i]
+        n, m = record.z.shape
+        nx = q.size
+        u = self.model.inputs(record, p)
+        x0, P0 = self.model.start(record, noise)
+        e = np.full((n, m), np.nan)
+        states = np.zeros((n, nx))
+        rows = n if keep else 0
+        K = np.zeros((rows, m, nx), np.float32)
+        W = np.zeros((rows, m, m), np.float32)
+        H = np.zeros((n if jacobians else 0, m, nx), np.float32)
+        F = np.zeros((n if jacobians else 0, nx, nx), np.float32)
+        starts = np.empty(0, np.int64) if start_rows is None else start_rows
+        slots = np.full(n, -1, np.int64)
+        slots[starts] = np.arange(starts.size)
+        P = np.zeros((starts.size, nx, nx))
+        log_likelihood, deweighted = kalman.filter_pass(
+            self.model.step, self.model.measure, self.intervals[i], u, record.z, self.model.wraps,
+            x0, P0, R, q, p, self.model.state_scale, self.model.work_size, GATE, REFRESH,
+            keep, states, e, K, W, slots, P, H, F,
+        )  # fmt: skip
+        return RunPass(record, u, log_likelihood, e, states, deweighted, K, W, starts, P), H, F
 
     def log_likelihood(
         self, values: Mapping[str, float], noise: Noise, which: Sequence[int] | None = None
@@ -164,10 +186,11 @@ class Engine:
             run = passes[i]
             n, m = run.record.z.shape
             e = np.zeros((n, m))
-            self._frozen(i, run, noise, base, e)
+            x0, _ = self.model.start(run.record, noise)
+            self._frozen(i, run, x0, base, e)
             J = np.zeros((len(free), n, m))
             for k, (p, size) in enumerate(zip(moved, steps, strict=True)):
-                flew = self._frozen(i, run, noise, p, J[k])
+                flew = self._frozen(i, run, x0, p, J[k])
                 J[k] -= e
                 if flew and np.abs(J[k]).max() < HUGE:
                     J[k] /= size
@@ -224,13 +247,14 @@ class Engine:
         p = self.model.vector(values)
 
         def one(i: int) -> float:
-            e = np.zeros(passes[i].record.z.shape)
-            return 0.5 * float(np.sum(e**2)) if self._frozen(i, passes[i], noise, p, e) else np.inf
+            run = passes[i]
+            e = np.zeros(run.record.z.shape)
+            x0, _ = self.model.start(run.record, noise)
+            return 0.5 * float(np.sum(e**2)) if self._frozen(i, run, x0, p, e) else np.inf
 
         return sum(self._each(one)) + penalty(free, values)
 
-    def _frozen(self, i: int, run: RunPass, noise: Noise, p: np.ndarray, out: np.ndarray) -> bool:
-        x0, _ = self.model.start(run.record, noise)
+    def _frozen(self, i: int, run: RunPass, x0: np.ndarray, p: np.ndarray, out: np.ndarray) -> bool:
         return kalman.mean_pass(
             self.model.step, self.model.measure, self.intervals[i],
             self.model.inputs(run.record, p), run.record.z, self.model.wraps,
@@ -249,8 +273,8 @@ class Engine:
         """Gauss-Newton for the free parameters under their priors, damped and within bounds.
 
         Each step keeps the gains of its own linearisation, then filters anew (iteratively reweighted
-        least squares). Stops when a step promises less than `tolerance` nats. A step that raises the
-        cost at those gains is halved.
+        least squares). Stops when a step promises or gains less than `tolerance` nats. A step that
+        raises the cost at those gains is halved. The covariance is that of the last linearisation.
         """
         values = dict(values)
         passes, lin = self.linearise(values, noise, free)
@@ -265,7 +289,8 @@ class Engine:
             values, gained = self.descend(passes, free, values, noise, moves)
             if progress:
                 progress(f"fit: step {count}, gained {gained:.1f} nats")
-            if gained <= 0.0:
+            if gained < tolerance or count == iterations:
+                passes = self.filter(values, noise)
                 break
             passes, lin = self.linearise(values, noise, free)
         best = objective(passes, free, values)
@@ -280,26 +305,54 @@ class Engine:
             converged=converged,
         )
 
+    def noise_score(
+        self, values: Mapping[str, float], noise: Noise
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Log-likelihood and its slopes in the process noise.
+
+        Returns nats (-inf where a filter diverged), the slope in each state's growth of variance per
+        second, by stretches of STRETCH seconds (stretches, nx), and by record in each variance of the
+        first state, (records, nx).
+        """
+        p = self.model.vector(values)
+        q = self.model.process_noise(noise)
+        R = self._reading_variances(noise)
+
+        def one(i: int) -> tuple[float, np.ndarray, np.ndarray]:
+            run, H, F = self._filter_run(i, p, q, R, noise, keep=True, jacobians=True)
+            t = run.record.t
+            stretch = ((t - t[0]) / STRETCH).astype(np.int64)
+            by_noise, by_start = np.zeros((stretch[-1] + 1, q.size)), np.zeros(q.size)
+            if np.isfinite(run.log_likelihood):
+                kalman.score_pass(
+                    self.intervals[i], run.innovations, run.gains, run.whitening, H, F,
+                    stretch, by_noise, by_start,
+                )  # fmt: skip
+            return run.log_likelihood, by_noise, by_start
+
+        log_likelihood, by_noise, by_start = zip(*self._each(one), strict=True)
+        return float(sum(log_likelihood)), np.concatenate(by_noise), np.array(by_start)
+
     def fit_noise(
         self,
         values: Mapping[str, float],
         noise: Noise,
         process: Sequence[str],
-        seconds: float = 24.0,
-        iterations: int = 12,
+        evaluations: int = 16,
+        tolerance: float = 0.5,
+        seconds: float = np.inf,
         progress: Progress | None = None,
     ) -> Noise:
-        """Process-noise levels of largest likelihood, on an excerpt of every run.
+        """Process-noise levels of largest likelihood, or the best seen in so many evaluations.
+
+        Quasi-Newton in log levels, scaled by the scatter of their slopes from stretch to stretch.
+        Nothing is done where that scatter promises less than `tolerance` nats.
 
         Args:
             process: names of the process-noise levels to fit.
-                seconds: of flight to look at in all, an equal excerpt from the middle of every run.
+            seconds: of flight that are enough to look at: whole runs, evenly picked.
         """
-        excerpt = Engine(
-            self.model,
-            [_excerpt(r, seconds / len(self.records)) for r in self.records],
-            self.threads,
-        )
+        picked = Engine(self.model, _some(self.records, seconds), self.threads)
 
         def changed(logs: np.ndarray) -> Noise:
             levels = dict(noise.process)
@@ -307,28 +360,55 @@ class Engine:
                 levels[name] = float(np.exp(log))
             return replace(noise, process=levels)
 
-        def cost(logs: np.ndarray) -> float:
-            result = -excerpt.log_likelihood(values, changed(logs))
-            return result if np.isfinite(result) else 1e12
+        def variances(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            here = changed(logs)
+            start = [np.diag(self.model.start(r, here)[1]) for r in picked.records]
+            return self.model.process_noise(here), np.array(start)
+
+        def slopes(logs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+            """Log-likelihood, its slope in each log level, and the scatter of that."""
+            log_likelihood, by_noise, by_start = picked.noise_score(values, changed(logs))
+            slope, scatter = np.empty(logs.size), np.empty(logs.size)
+            for i, unit in enumerate(STEP_OF_LOG * np.eye(logs.size)):
+                (q, start), (q_less, start_less) = variances(logs + unit), variances(logs - unit)
+                parts = by_noise @ (q - q_less) / (2.0 * STEP_OF_LOG)
+                first = float(np.sum(by_start * (start - start_less))) / (2.0 * STEP_OF_LOG)
+                slope[i] = parts.sum() + first
+                scatter[i] = np.sqrt(parts.size) * parts.std()
+            return log_likelihood, slope, scatter
 
         start = np.array([np.log(noise.process[name]) for name in process])
-        floors = [noise.floor.get(name, 1e-9) for name in process]
-        bounds = [(np.log(v), np.log(1e4 * v)) for v in floors]
+        lower = np.log([noise.floor.get(name, 1e-9) for name in process])
+        upper = lower + np.log(1e4)
+        first, slope, scatter = slopes(start)
+        scale = np.maximum(scatter, 1.0)
+        held = ((start <= lower) & (slope < 0.0)) | ((start >= upper) & (slope > 0.0))
+        if 0.5 * np.sum((slope / scale)[~held] ** 2) < tolerance:
+            return noise
+        seen = {tuple(start * scale): (first, slope)}
+
+        def cost(scaled: np.ndarray) -> tuple[float, np.ndarray]:
+            value, slope = seen.get(tuple(scaled)) or slopes(scaled / scale)[:2]
+            if not np.isfinite(value):
+                return 1e12, np.zeros(scaled.size)
+            seen[tuple(scaled)] = (value, slope)
+            return -value, -slope / scale
+
         found = minimize(
-            cost, start, method="L-BFGS-B", bounds=bounds,
-            options={"maxiter": iterations, "eps": 0.03, "ftol": 1e-5},
+            cost, start * scale, jac=True, method="L-BFGS-B",
+            bounds=list(zip(lower * scale, upper * scale, strict=True)),
+            options={"maxfun": evaluations, "ftol": 0.2 * tolerance / max(abs(first), 1.0)},
         )  # fmt: skip
         if progress:
-            progress(f"noise levels: {found.nfev} passes")
-        return changed(found.x)
+            progress(f"noise levels: {found.nfev} evaluations")
+        return changed(np.array(max(seen, key=lambda scaled: seen[scaled][0])) / scale)
 
 
-def _excerpt(record: Record, seconds: float) -> Record:
-    """The middle `seconds` of a record."""
-    span = record.t[-1] - record.t[0]
-    first = record.t[0] + max(0.0, 0.5 * (span - seconds))
-    rows = (record.t >= first) & (record.t <= first + seconds)
-    return part(record, rows)
+def _some(records: Sequence[Record], seconds: float) -> list[Record]:
+    """Records of so many seconds in all, or just more, evenly picked."""
+    whole = sum(r.t[-1] - r.t[0] for r in records)
+    count = math.ceil(min(1.0, seconds / whole) * len(records))
+    return [records[i] for i in np.linspace(0, len(records) - 1, count).round().astype(int)]
 
 
 def part(record: Record, rows: np.ndarray) -> Record:

@@ -24,8 +24,6 @@ _M = float64[:, ::1]
 STEP = types.FunctionType(types.void(_A, _A, float64, _A, _A, _A))
 MEASURE = types.FunctionType(types.void(_A, _A, _A, _A, _A))
 _LOG_2PI = math.log(2.0 * math.pi)
-PATIENCE = 5
-"""A channel refused this many times running is believed: the filter is wrong, not the sensor."""
 
 
 @compiled(types.float64(float64))
@@ -38,28 +36,33 @@ def wrap_angle(angle):
     types.Tuple((float64, int64))(
         STEP, MEASURE, _A, _M, _M, boolean[::1], _A, _M, _A, _A, _A, _A, int64, float64, int64,
         boolean, _M, _M, float32[:, :, ::1], float32[:, :, ::1], int64[::1], float64[:, :, ::1],
+        float32[:, :, ::1], float32[:, :, ::1],
     )
 )  # fmt: skip
 def filter_pass(
     step, measure, dt, u, z, wraps, x0, P0, R, q, p, scale, work_size, gate, refresh,
-    keep, states, e, K_all, W_all, slots, P_all,
+    keep, states, e, K_all, W_all, slots, P_all, H_all, F_all,
 ):  # fmt: skip
     """Extended Kalman filter over one run.
 
     Args:
         dt: (n,) seconds from each row to the next. u: (n, nu). z: (n, m), NaN where missing.
         R: (m,) reading variances. q: (nx,) growth of state variance per second. p: parameters.
-        gate: readings further than this many sigmas from their prediction are left out, but never
-            more than PATIENCE of a channel running; each costs what one at the gate would.
+        gate: readings further than this many sigmas from their prediction are believed less, as if
+            their variance put them at the gate: beyond it the cost grows with the logarithm of the
+            distance, without a jump (a heavy tail; Huber and Ronchetti 2009, ch. 7). A lasting one
+            is followed all the same, slowly at first.
         refresh: rows between new Jacobians where dt does not change.
         keep: also store gains and whitening matrices.
         states: (n, nx) filtered states, out. e: (n, m) whitened innovations, out, NaN where missing.
         K_all: (n, m, nx) gain of each reading, W_all: (n, m, m) transposed L^-1, out, if `keep`.
         slots: (n,) place in P_all where a row's filtered covariance is stored, or -1.
         P_all: (slots, nx, nx), out.
+        H_all: (n, m, nx), F_all: (n, nx, nx) Jacobians of the readings and of the step, out; empty:
+            not stored.
 
     Returns:
-        log-likelihood (-inf where the filter diverged) and the number of readings left out.
+        log-likelihood (-inf where the filter diverged) and the number of readings beyond the gate.
     """
     n, m = z.shape
     nx = x0.size
@@ -79,11 +82,13 @@ def filter_pass(
     S = np.zeros((m, m))
     W = np.zeros((m, m))
     FP = np.zeros((nx, nx))
+    PF = np.zeros((nx, nx))
+    gain = np.zeros(nx)
+    tell = H_all.shape[0] == n
     who = np.zeros(m, dtype=np.int64)
     nu = np.zeros(m)
-    refused = np.zeros(m, dtype=np.int64)
     log_likelihood = 0.0
-    left_out = 0
+    deweighted = 0
     for k in range(n):
         fresh = k % refresh == 0
         # --- correct ---------------------------------------------------------------------------
@@ -96,6 +101,10 @@ def filter_pass(
                 measure(x_probe, u[k], p, work, h_probe)
                 for i in range(m):
                     H[i, j] = (h_probe[i] - h[i]) / scale[j]
+        if tell:
+            for i in range(m):
+                for j in range(nx):
+                    H_all[k, i, j] = H[i, j]
         count = 0
         for i in range(m):
             e[k, i] = np.nan
@@ -104,7 +113,7 @@ def filter_pass(
                 if wraps[i]:
                     innovation = wrap_angle(innovation)
                 if not math.isfinite(innovation):
-                    return -np.inf, left_out
+                    return -np.inf, deweighted
                 # H P of this channel, by the non-zeros of H
                 for b in range(nx):
                     HP[count, b] = 0.0
@@ -117,13 +126,11 @@ def filter_pass(
                 for a in range(nx):
                     if H[i, a] != 0.0:
                         variance += HP[count, a] * H[i, a]
-                if innovation * innovation > gate * gate * variance and refused[i] < PATIENCE:
-                    # capped, not forgotten: leaving readings out must never pay
-                    log_likelihood -= 0.5 * (gate * gate + math.log(variance) + _LOG_2PI)
-                    refused[i] += 1
-                    left_out += 1
-                    continue
-                refused[i] = 0
+                if innovation * innovation > gate * gate * variance:
+                    inflated = innovation * innovation / (gate * gate)
+                    log_likelihood -= 0.5 * (gate * gate - 1.0) * math.log(inflated / variance)
+                    variance = inflated
+                    deweighted += 1
                 who[count] = i
                 nu[count] = innovation
                 S[count, count] = variance
@@ -143,7 +150,7 @@ def filter_pass(
                     total -= S[a, c] * S[b, c]
                 if a == b:
                     if not total > 0.0:
-                        return -np.inf, left_out
+                        return -np.inf, deweighted
                     S[a, a] = math.sqrt(total)
                     log_likelihood -= math.log(S[a, a])
                 else:
@@ -177,15 +184,20 @@ def filter_pass(
                     for j in range(nx):
                         P[i, j] -= weight * HP[a, j]
         if keep:
-            for a in range(count):
-                for b in range(a + 1):
-                    W_all[k, who[b], who[a]] = W[a, b]
+            for b in range(count):
+                for j in range(nx):
+                    gain[j] = 0.0
+                for a in range(b, count):
+                    weight = W[a, b]
+                    W_all[k, who[b], who[a]] = weight
                     for j in range(nx):
-                        K_all[k, who[b], j] += HP[a, j] * W[a, b]
+                        gain[j] += HP[a, j] * weight
+                for j in range(nx):
+                    K_all[k, who[b], j] = gain[j]
         for j in range(nx):
             states[k, j] = x[j]
             if not math.isfinite(x[j]):
-                return -np.inf, left_out
+                return -np.inf, deweighted
         if slots[k] >= 0:
             for i in range(nx):
                 for j in range(nx):
@@ -212,6 +224,7 @@ def filter_pass(
                     for j in range(nx):
                         own = 1.0 if i == j else 0.0
                         F[i, j] = own + ratio * (F[i, j] - own)
+        # P = F (F P)', row by row so that the compiler can use vectors; most of F is zero
         for i in range(nx):
             for j in range(nx):
                 FP[i, j] = 0.0
@@ -221,15 +234,150 @@ def filter_pass(
                     for j in range(nx):
                         FP[i, j] += weight * P[a, j]
         for i in range(nx):
-            for j in range(i + 1):
-                total = 0.0
-                for a in range(nx):
-                    total += FP[i, a] * F[j, a]
-                P[i, j] = total
-                P[j, i] = total
+            for j in range(nx):
+                PF[j, i] = FP[i, j]
+        if tell:
+            for i in range(nx):
+                for j in range(nx):
+                    F_all[k, i, j] = F[i, j]
+        for i in range(nx):
+            for j in range(nx):
+                P[i, j] = 0.0
+            for a in range(nx):
+                weight = F[i, a]
+                if weight != 0.0:
+                    for j in range(nx):
+                        P[i, j] += weight * PF[a, j]
+        for i in range(nx):
+            for j in range(i):
+                P[j, i] = P[i, j]
             P[i, i] += q[i] * dt[k]
             x[i] = x_next[i]
-    return log_likelihood, left_out
+    return log_likelihood, deweighted
+
+
+@compiled(
+    types.void(
+        _A, _M, float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1],
+        int64[::1], _M, _A,
+    )
+)  # fmt: skip
+def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
+    """Slope of the log-likelihood in the process noise, by the disturbance smoother, backwards.
+
+    With r the slope in the predicted state and N its variance, the slope in a variance added to
+    state i is (r_i^2 - N_ii) / 2 (Koopman and Shephard 1992, Biometrika 79: the exact score of a
+    linear model; here of the model as linearised along the filter's path).
+
+    Args:
+        dt, e, K_all, W_all, H_all, F_all: of the filter pass.
+        stretch: (n,) which stretch of time each row is in.
+        by_noise: (stretches, nx) slope in each state's growth of variance per second, out.
+        by_start: (nx,) slope in each variance of the first state, out.
+    """
+    n, m = e.shape
+    nx = by_start.size
+    r = np.zeros(nx)
+    N = np.zeros((nx, nx))
+    B = np.zeros((nx, nx))
+    moved = np.zeros(nx)
+    K = np.zeros((m, nx))
+    NK = np.zeros((m, nx))
+    Kr = np.zeros(m)
+    F = np.zeros((nx, nx))
+    by_noise[:, :] = 0.0
+    for k in range(n - 1, -1, -1):
+        if k < n - 1:
+            for i in range(nx):
+                by_noise[stretch[k], i] += 0.5 * dt[k] * (r[i] * r[i] - N[i, i])
+                for j in range(nx):
+                    F[i, j] = F_all[k, i, j]
+            # r = F' r, N = F' N F
+            for i in range(nx):
+                moved[i] = 0.0
+                for j in range(nx):
+                    B[i, j] = 0.0
+            for a in range(nx):
+                for j in range(nx):
+                    moved[j] += r[a] * F[a, j]
+            for a in range(nx):  # B = F' N, then N = F' B'
+                for i in range(nx):
+                    weight = F[a, i]
+                    if weight != 0.0:
+                        for j in range(nx):
+                            B[i, j] += weight * N[a, j]
+            for i in range(nx):
+                r[i] = moved[i]
+                for j in range(nx):
+                    N[i, j] = B[j, i]
+            for i in range(nx):
+                for j in range(nx):
+                    B[i, j] = N[i, j]
+                    N[i, j] = 0.0
+            for a in range(nx):
+                for i in range(nx):
+                    weight = F[a, i]
+                    if weight != 0.0:
+                        for j in range(nx):
+                            N[i, j] += weight * B[a, j]
+        # with A = I - sum of K_b H_b': r = A' r, N = A' N A
+        for b in range(m):
+            if W_all[k, b, b] != 0.0:
+                Kr[b] = 0.0
+                for j in range(nx):
+                    K[b, j] = K_all[k, b, j]
+                    NK[b, j] = 0.0
+                    Kr[b] += K[b, j] * r[j]
+                for i in range(nx):
+                    weight = K[b, i]
+                    for j in range(nx):
+                        NK[b, j] += weight * N[i, j]
+        for b in range(m):
+            if W_all[k, b, b] != 0.0:
+                for j in range(nx):
+                    weight = float64(H_all[k, b, j])
+                    if weight != 0.0:
+                        r[j] -= weight * Kr[b]
+                        for i in range(nx):
+                            N[i, j] -= weight * NK[b, i]
+        for b in range(m):
+            if W_all[k, b, b] != 0.0:
+                for j in range(nx):
+                    NK[b, j] = 0.0
+                for i in range(nx):
+                    weight = K[b, i]
+                    for j in range(nx):
+                        NK[b, j] += weight * N[i, j]
+        for b in range(m):
+            if W_all[k, b, b] != 0.0:
+                for i in range(nx):
+                    weight = float64(H_all[k, b, i])
+                    if weight != 0.0:
+                        for j in range(nx):
+                            N[i, j] -= weight * NK[b, j]
+        # the readings' own part: g_a = sum of (L^-1)_ab H_b
+        for a in range(m):
+            if W_all[k, a, a] != 0.0:
+                for j in range(nx):
+                    moved[j] = 0.0
+                for b in range(a + 1):
+                    weight = float64(W_all[k, b, a])
+                    if weight != 0.0:
+                        for j in range(nx):
+                            moved[j] += weight * H_all[k, b, j]
+                for i in range(nx):
+                    weight = moved[i]
+                    if weight != 0.0:
+                        r[i] += weight * e[k, a]
+                        for j in range(nx):
+                            N[i, j] += weight * moved[j]
+        for i in range(nx):  # rounding must not grow
+            for j in range(i):
+                mean = 0.5 * (N[i, j] + N[j, i])
+                N[i, j] = mean
+                N[j, i] = mean
+    for i in range(nx):
+        by_start[i] = 0.5 * (r[i] * r[i] - N[i, i])
 
 
 @compiled(
