@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from coax_env import effects, next_maneuver, unlisted, vibration
+from coax_env.calibration import false_alarm_rate
 from coax_env.engine.fit import Engine, RunPass, part
 from coax_env.engine.model import FreeParameter, Noise, Record
 from coax_env.engine.whiteness import Whiteness, whiteness
@@ -109,6 +110,7 @@ def diagnose(
     calm = vibration.taken_out(flight, line) if line else flight
     if line:
         remarks.append(_taken_out(line))
+    new_line = line if "vibration" not in vehicle.effects else None
     noise = starting_noise(calm, vibration.without(vehicle) if line else vehicle)
     records = [record_of(run) for run in calm.runs]
     sensors = {c: sensor_std(calm, c) for c in flight.channels}
@@ -133,8 +135,8 @@ def diagnose(
     white_before = whiteness(passes_before, CHANNELS)
     white_after = whiteness(passes_after, CHANNELS)
     causes, ties = _causes(search, state, quadratic, weights, white_after)
-    if line and "vibration" not in vehicle.effects:
-        causes = sorted([*causes, _vibration(line)], key=lambda c: -c["evidence"])
+    if new_line:
+        causes = sorted([*causes, _vibration(new_line)], key=lambda c: -c["evidence"])
     described = unlisted.entries(search, state, quadratic, passes_after, terms)
     unexplained = described + _unexplained(white_after, unlisted.speaks_for(described))
 
@@ -154,10 +156,9 @@ def diagnose(
     colours |= unlisted.colours(search, state, quadratic, terms)
     vehicle_after = _extended(model, records, search, state, flight, vehicle, colours)
     design = _design(search, state, quadratic, ties, flight, say)
-    if line and "vibration" not in vehicle.effects:
-        vehicle_after = vehicle_after.with_parameters(
-            {"vibration.amplitude": Parameter(line.amplitude, line.std, "m/s2", _diagnosed(flight))}
-        )
+    if new_line:
+        amplitude = Parameter(new_line.amplitude, new_line.std, "m/s2", _diagnosed(flight))
+        vehicle_after = vehicle_after.with_parameters({"vibration.amplitude": amplitude})
     findings = {
         "verdict": _verdict(bool(causes), bool(unexplained)),
         "causes": causes,
@@ -165,7 +166,7 @@ def diagnose(
         "unexplained": unexplained,
         "gain": gain,
         "next_maneuver": next_maneuver.advise(design, EVIDENCE),
-        "false_alarm_rate": None,
+        "false_alarm_rate": false_alarm_rate(EVIDENCE),
     }
     return Diagnosis(
         findings=findings,
@@ -274,7 +275,8 @@ def _causes(
     white: Mapping[str, Whiteness],
 ) -> tuple[list[dict[str, Any]], dict[str, dict[str, State]]]:
     """Entries of findings.json, strongest first, and the refits with each one's look-alikes."""
-    std = standard_deviations(search, state, quadratic)
+    free = search.free_names(state.active)
+    std = dict(zip(free, np.sqrt(np.diag(quadratic.covariance(free))), strict=True))
     dt = median_step(search.engine.records)
     causes: list[dict[str, Any]] = []
     ties: dict[str, dict[str, State]] = {}
@@ -329,14 +331,6 @@ def _taken_out(line: vibration.Line) -> str:
     )
 
 
-def standard_deviations(search: Search, state: State, quadratic: Quadratic) -> dict[str, float]:
-    """Posterior std of every loose parameter."""
-    names = search.free_names(state.active)
-    i = quadratic.index(names)
-    information = quadratic.G[np.ix_(i, i)] + np.diag(quadratic.precision[i])
-    return dict(zip(names, np.sqrt(np.diag(np.linalg.inv(information))).tolist(), strict=True))
-
-
 def median_step(records: Sequence[Record]) -> float:
     """Usual time between rows [s]."""
     return float(np.median(np.concatenate([np.diff(r.t) for r in records])))
@@ -348,8 +342,9 @@ def with_timing(parameter: FreeParameter, std: float, dt: float) -> float:
     Within a row it is not known when the machine takes a command over (zero-order hold against the
     simulator's or autopilot's own loop): uniform over a row, std dt/sqrt(12) (numerics.md, timing).
     """
-    name = parameter.name
-    if name.startswith(("motor_lag.", "servo_lag.", "servo_delay.")):
+    group, _, own = parameter.name.rpartition(".")
+    known = effects.GROUPS[group].parameters if group else ()
+    if any(p.name == own and p.timing for p in known):
         return float(np.hypot(std, dt / np.sqrt(12.0)))
     return float(std)
 

@@ -56,7 +56,7 @@ class EffectParameter:
 
     ``usual`` is the usual size and the std of the prior about ``off``; ``smallest`` the size under
     which it does not matter in prediction and is never named; a ``shape`` parameter (a decay, say)
-    acts only once the effect itself does.
+    acts only once the effect itself does; ``timing``: a lag or delay of the command.
     """
 
     name: str
@@ -67,6 +67,7 @@ class EffectParameter:
     lower: float = -INFINITY
     upper: float = INFINITY
     shape: bool = False
+    timing: bool = False
     probe: float = (
         0.0  # finite step for the signature where the effect has no slope at its off-value
     )
@@ -257,8 +258,12 @@ def flybar_time_constant(x, f, p, e):
 
 @effect(
     PROPERTY,
-    EffectParameter("upper", "s", usual=0.1, smallest=0.01, lower=0.0, upper=1.0, probe=0.03),
-    EffectParameter("lower", "s", usual=0.1, smallest=0.01, lower=0.0, upper=1.0, probe=0.03),
+    EffectParameter(
+        "upper", "s", usual=0.1, smallest=0.01, lower=0.0, upper=1.0, timing=True, probe=0.03
+    ),
+    EffectParameter(
+        "lower", "s", usual=0.1, smallest=0.01, lower=0.0, upper=1.0, timing=True, probe=0.03
+    ),
     channels="rpm_upper rpm_lower az r",
     source="first-order motor and speed controller, Beard and McLain 2012, ch. 4",
 )
@@ -270,7 +275,9 @@ def motor_lag(x, f, p, e):
 
 @effect(
     PROPERTY,
-    EffectParameter("time", "s", usual=0.04, smallest=0.008, lower=0.0, upper=0.5, probe=0.02),
+    EffectParameter(
+        "time", "s", usual=0.04, smallest=0.008, lower=0.0, upper=0.5, timing=True, probe=0.02
+    ),
     channels="p q",
     source="first-order servo, Mettler 2003, ch. 3",
 )
@@ -281,7 +288,9 @@ def servo_lag(x, f, p, e):
 
 @effect(
     PROPERTY,
-    EffectParameter("time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3, probe=0.02),
+    EffectParameter(
+        "time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3, timing=True, probe=0.02
+    ),
     channels="p q",
     source="transport delay; commands are looked up late and the step is split",
     input_shift=True,

@@ -126,6 +126,23 @@ class Quadratic:
         )
         return float(change), move
 
+    def projected(
+        self, own: Collection[str], rest: Collection[str]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Information of `own`, what `rest` could stand for taken out (priors on `rest`), (k, k).
+
+        And how `rest` answers each of `own`, (r, k).
+        """
+        c, r = self.index(own), self.index(rest)
+        across = self.G[np.ix_(r, c)]
+        weights = np.linalg.solve(self.G[np.ix_(r, r)] + np.diag(self.precision[r]), across)
+        return self.G[np.ix_(c, c)] - across.T @ weights, weights
+
+    def covariance(self, free: Collection[str]) -> np.ndarray:
+        """Posterior covariance of the loose parameters, (k, k)."""
+        i = self.index(free)
+        return np.linalg.inv(self.G[np.ix_(i, i)] + np.diag(self.precision[i]))
+
     def colour(self, own: Collection[str], free: Collection[str]) -> float:
         """How much more the slope of `own` scatters from stretch to stretch than white noise lets it.
 
@@ -135,14 +152,9 @@ class Quadratic:
         of Huber 1967, in the direction of one effect).
         """
         c = self.index(own)
-        f = self.index([n for n in free if n not in set(own)])
-        schur = self.G[np.ix_(c, c)]
-        scores = self.stretches[:, c]
-        if f.size:
-            A = self.G[np.ix_(f, f)] + np.diag(self.precision[f])
-            weights = np.linalg.solve(A, self.G[np.ix_(f, c)])
-            schur = schur - self.G[np.ix_(c, f)] @ weights
-            scores = scores - self.stretches[:, f] @ weights
+        rest = [n for n in free if n not in set(own)]
+        schur, weights = self.projected(own, rest)
+        scores = self.stretches[:, c] - self.stretches[:, self.index(rest)] @ weights
         per_stretch = np.einsum(
             "sc,sc->s", scores, np.linalg.lstsq(schur, scores.T, rcond=None)[0].T
         )
@@ -154,13 +166,9 @@ class Quadratic:
 
     def occam(self, added: Collection[str], free: Collection[str]) -> float:
         """Laplace factor of `added` beside `free`: half log det (posterior over prior precision)."""
-        c = self.index(added)
-        f = self.index(free)
-        schur = self.G[np.ix_(c, c)] + np.diag(self.precision[c])
-        if f.size:
-            A = self.G[np.ix_(f, f)] + np.diag(self.precision[f])
-            schur = schur - self.G[np.ix_(c, f)] @ np.linalg.solve(A, self.G[np.ix_(f, c)])
-        scaled = schur / np.sqrt(np.outer(self.precision[c], self.precision[c]))
+        precision = self.precision[self.index(added)]
+        posterior = self.projected(added, free)[0] + np.diag(precision)
+        scaled = posterior / np.sqrt(np.outer(precision, precision))
         return 0.5 * float(np.linalg.slogdet(scaled)[1])
 
 

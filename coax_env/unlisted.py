@@ -46,8 +46,6 @@ TERM_EVIDENCE = 2.0 * EVIDENCE
 HIDDEN_EVIDENCE = 2.0 * TERM_EVIDENCE
 """The same on an axis whose innovations are white. On a clean gusty flight of eight runs the best of
 all terms on all axes reached 4 nats, a moment a sin(3 psi) with a rms of the gusts' own 155."""
-HIDDEN_SHARE = 0.3
-"""Least share of the gust estimates that a term must follow there."""
 SCREENED = 10  # candidates of an axis that are looked at by their signatures
 MOST_TERMS = 4  # taken in all
 MOST_FAILURES = 3  # that do not hold before the search gives up
@@ -124,7 +122,7 @@ def explain(
         screened = {
             c: TERM_EVIDENCE if axis in coloured else HIDDEN_EVIDENCE
             for axis in AXES
-            for c in _screen(along, axis, known, SHARE if axis in coloured else HIDDEN_SHARE)
+            for c in _screen(along, axis, known)
             if c not in refused
         }
         best = _best(search, state, screened)
@@ -185,9 +183,7 @@ def speaks_for(found: Sequence[dict[str, Any]]) -> set[str]:
 def standard_deviation(search: Search, state: State, quadratic: Quadratic, one: str) -> float:
     """Posterior std of a term's coefficient, coloured innovations counted as `colours` does."""
     names = search.free_names(state.active)
-    i = quadratic.index(names)
-    information = quadratic.G[np.ix_(i, i)] + np.diag(quadratic.precision[i])
-    variance = float(np.linalg.inv(information)[names.index(one), names.index(one)])
+    variance = quadratic.covariance(names)[names.index(one), names.index(one)]
     return float(np.sqrt(variance * quadratic.colour([one], names)))
 
 
@@ -221,8 +217,8 @@ def _coloured_axes(passes: Sequence[RunPass]) -> list[str]:
     return [axis for axis, (_, family) in SPOKEN_FOR.items() if coloured & set(family)]
 
 
-def _screen(along: Along, axis: str, known: Collection[str], least: float) -> list[Candidate]:
-    """The candidates of an axis that explain most of its gust estimates, and at least a share."""
+def _screen(along: Along, axis: str, known: Collection[str]) -> list[Candidate]:
+    """The candidates of an axis that explain most of its gust estimates, and at least SHARE."""
     gust = along.gust(axis)
     ranked = []
     for terms in (*SINGLES, *PAIRS):
@@ -231,7 +227,7 @@ def _screen(along: Along, axis: str, known: Collection[str], least: float) -> li
         columns = along.columns(terms)
         if np.all(columns.std(0) > 1e-9):
             share = _share(columns, gust)
-            if share >= least:
+            if share >= SHARE:
                 ranked.append((share, (axis, terms)))
     return [candidate for _, candidate in sorted(ranked, key=lambda r: -r[0])[:SCREENED]]
 

@@ -14,6 +14,7 @@ from study.one_flight import fly_and_diagnose
 from study.plan import PlannedFlight
 from tqdm import tqdm
 
+from coax_env import calibration
 from coax_env.errors import InputError, require
 from coax_env.files import make_folder, write_json, write_text
 from coax_env.report.page import Section, figure, page
@@ -40,6 +41,8 @@ def main() -> None:
         rows = store.rows_of(options.out, flights)
         if rows:
             write_results(options.out, rows, command)
+    if options.adopt:
+        adopt(options.out)
     print((options.out / "table.md").read_text())
 
 
@@ -59,6 +62,10 @@ def parse() -> Any:
         "--calibrate", action="store_true",
         help="clean flights only; DIR/threshold.json says which evidence 1 %% of them reach",
     )  # fmt: skip
+    parser.add_argument(
+        "--adopt", action="store_true",
+        help="with --calibrate: what was measured becomes the package's calibration.json",
+    )  # fmt: skip
     parser.add_argument("--no-baselines", action="store_true", help="the package alone")
     parser.add_argument("--jobs", type=int, default=-1, help="flights at once (default: all cores)")
     parser.add_argument(
@@ -70,6 +77,8 @@ def parse() -> Any:
         options.clean, options.effects = QUICK["clean"], QUICK["effects"]
     if options.clean < 0 or options.effects < 0 or options.clean + options.effects == 0:
         raise InputError("a study needs at least one flight")
+    if options.adopt and not options.calibrate:
+        raise InputError("--adopt goes with --calibrate")
     if options.jobs == 0:
         raise InputError("--jobs must not be 0")
     return options
@@ -121,6 +130,14 @@ def start_ray(jobs: int) -> int:
     )  # fmt: skip
     register_ray()
     return jobs if jobs > 0 else int(ray.cluster_resources()["CPU"])
+
+
+def adopt(out: Path) -> None:
+    """Make the folder's calibration the package's."""
+    measured = out / "threshold.json"
+    if not measured.exists():
+        raise InputError(f"no calibration in {out}: it takes {threshold.FEWEST} clean flights")
+    write_text(calibration.PATH, measured.read_text(encoding="utf-8"))
 
 
 def write_results(out: Path, rows: list[dict[str, Any]], command: str) -> None:

@@ -21,7 +21,7 @@ from study.baselines import Gram, by_bic, by_f, sparse, stepwise
 from study.one_flight import catalogue_values, expected_evidence, fly_and_diagnose, hide
 from study.plan import PlannedFlight
 
-from coax_env import load_vehicle, read_flight
+from coax_env import calibration, load_vehicle, read_flight
 from coax_env.effects import CATALOGUE
 from coax_env.engine.fit import Engine
 from coax_env.errors import InputError
@@ -312,9 +312,32 @@ def test_a_calibration_says_what_made_it() -> None:
     ]  # fmt: skip
     result = threshold.calibration(rows, "the command")
     assert result is not None and result["clean_flights"] == 60 and result["code"] == ["abc"]
-    assert result["threshold_nats"] > 50.0 and result["false_alarms_at_it"] == 0
+    assert result["threshold_nats_for_1_percent"] > 50.0 and result["false_alarms_at_it"] == 0
     json.dumps(result, allow_nan=False)
     assert threshold.calibration(rows[:10], "too few") is None
+
+
+def test_the_share_beyond_a_threshold() -> None:
+    rng = np.random.default_rng(2)
+    shares = [threshold.share_beyond(rng.exponential(3.0, 200), 12.0) for _ in range(100)]
+    assert np.mean(shares) == pytest.approx(math.exp(-4.0), rel=0.15)
+    assert threshold.share_beyond(np.full(50, -np.inf), 12.0) == 0.0
+
+
+def test_an_adopted_calibration_is_void_for_another_threshold(
+    study: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = tmp_path / "package" / "calibration.json"
+    kept.parent.mkdir()
+    monkeypatch.setattr(calibration, "PATH", kept)
+    assert calibration.false_alarm_rate(EVIDENCE) is None
+    with pytest.raises(InputError, match="takes 20 clean flights"):
+        study("--calibrate", "--adopt")
+    monkeypatch.setitem(study_diagnosis.QUICK, "clean", 24)
+    study("--calibrate", "--adopt")
+    rate = calibration.false_alarm_rate(EVIDENCE)
+    assert rate is not None and 0.0 <= rate <= 1.0
+    assert calibration.false_alarm_rate(EVIDENCE + 1.0) is None
 
 
 # --- the baselines -----------------------------------------------------------------------------------

@@ -163,10 +163,7 @@ def _worth(
 ) -> float:
     own = search.candidate_names(effect)
     rest = [n for n in search.free_names(listed) if not n.startswith(effect + ".")]
-    c, f = quadratic.index(own), quadratic.index(rest)
-    A = quadratic.G[np.ix_(f, f)] + np.diag(quadratic.precision[f])
-    across = quadratic.G[np.ix_(f, c)]
-    S = quadratic.G[np.ix_(c, c)] - across.T @ np.linalg.solve(A, across)
+    S, _ = quadratic.projected(own, rest)
     theta = np.array([values[name] for name in own])
     return float(0.5 * theta @ S @ theta - quadratic.occam(own, rest))
 

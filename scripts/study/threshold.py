@@ -38,8 +38,8 @@ def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
     alarms = sum(bool(judge.named(row)) for row in clean)
     finite = np.sort(evidence[np.isfinite(evidence)])[::-1]
     return {
-        "false_alarm_rate": FALSE_ALARMS,
-        "threshold_nats": _number(tail_quantile(evidence)),
+        "false_alarm_rate": round(max(alarms / len(clean), share_beyond(evidence, EVIDENCE)), 4),
+        "threshold_nats_for_1_percent": _number(tail_quantile(evidence)),
         "ci95": [_number(low), _number(high)],
         "clean_flights": len(clean),
         "threshold_used_nats": EVIDENCE,
@@ -65,6 +65,20 @@ def tail_quantile(evidence: np.ndarray, exceeded_by: float = FALSE_ALARMS) -> fl
     start = finite[-1]
     share = (finite.size - 1) / ordered.size
     return float(start + np.mean(finite[:-1] - start) * max(math.log(share / exceeded_by), 0.0))
+
+
+def share_beyond(evidence: np.ndarray, threshold: float) -> float:
+    """Share of clean flights with evidence beyond a threshold, by the same tail."""
+    ordered = np.sort(evidence)[::-1]
+    tail = ordered[: max(2, math.ceil(TAIL * ordered.size))]
+    finite = tail[np.isfinite(tail)]
+    if finite.size < 5:
+        return finite.size / ordered.size if np.any(finite > threshold) else 0.0
+    start = finite[-1]
+    if threshold <= start:
+        return float(np.mean(evidence > threshold))
+    mean = np.mean(finite[:-1] - start)
+    return float((finite.size - 1) / ordered.size * np.exp(-(threshold - start) / mean))
 
 
 def _number(value: float) -> float | None:
