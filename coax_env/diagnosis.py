@@ -42,6 +42,7 @@ from coax_env.search import EVIDENCE, TIE, Quadratic, Search, State, Weight, tog
 from coax_env.vehicle import Parameter, Vehicle, load_vehicle
 
 HORIZON = 1.0  # s
+CALM = 5.0  # times the floor of a white level under which it is not worth a word
 FEW_RUNS = 4  # with fewer, the last third of each is held out
 Progress = Callable[[str], None]
 
@@ -181,7 +182,7 @@ def diagnose(
         whiteness={"before": white_before, "after": white_after},
         evidence_history=search.history,
         strongest=search.strongest,
-        remarks=tuple(remarks + _shaken(search, state) + _unusual(search, state)),
+        remarks=tuple(remarks + _shaken(state) + _unusual(search, state)),
         noise=sensors,
         design=design,
     )
@@ -429,11 +430,12 @@ def _channels(search: Search, state: State, quadratic: Quadratic, effect: str) -
     return [CHANNELS[i] for i in order if total > 0.0 and strength[i] > 0.1 * total]
 
 
-def _shaken(search: Search, state: State) -> list[str]:
+def _shaken(state: State) -> list[str]:
     """What shakes the machine too fast to be a gust, in words; nothing where there is no sign of it."""
-    if BUFFET_LEVELS[0] not in search.levels:
-        return []
-    xy, z, moment_xy, moment_z = (state.noise.process[level] for level in BUFFET_LEVELS)
+    process, floor = state.noise.process, state.noise.floor
+    if not any(process[level] > CALM * floor[level] for level in BUFFET_LEVELS):
+        return []  # what seemed to shake the bare model has found its cause
+    xy, z, moment_xy, moment_z = (process[level] for level in BUFFET_LEVELS)
     return [
         "shaken by white noise beside the gusts, x and y, z:"
         f" force {xy:.2g}, {z:.2g} N s^1/2, moment {moment_xy:.2g}, {moment_z:.2g} N m s^1/2"
