@@ -82,13 +82,15 @@ def diagnose(
     hold_out: Sequence[str] | None = None,
     exclude: Collection[str] = (),
     progress: Progress | None = None,
+    ceiling: bool = False,
 ) -> Diagnosis:
     """Find the causes of what a vehicle's simulation gets wrong on a flight.
 
     Args:
         flight: a Flight or its folder. vehicle: a Vehicle, name or path; default the card's.
         hold_out: names of the runs to hold out; None chooses them; empty: all data fitted, no gain.
-        exclude: effects of the catalogue that must not be named.
+        exclude: effects of the catalogue that must not be named. ceiling: also say what a black box
+            removes of the error, which takes half as long again.
 
     Raises:
         InputError: a run or effect that does not exist, or nothing left to fit.
@@ -150,7 +152,12 @@ def diagnose(
             fly_again(engine_held, s.values, s.noise, HORIZON, floor=s is state)
             for s in (bare, refitted, state)
         ]
-        gain = gain_of(replays[0], replays[1], replays[2], sensors, HORIZON)
+        boxed: list[RunReplay] = []
+        if ceiling:
+            say("fitting a black box, for comparison")
+            box = unlisted.black_box(search, refitted)
+            boxed = fly_again(engine_held, box.values, box.noise, HORIZON)
+        gain = gain_of(replays[0], replays[1], replays[2], sensors, HORIZON, boxed)
         gain["held_out"] = [r.name for r in held]
     say("refitting the extended model on everything")
     colours = {effect: weight.colour for effect, weight in weights.items()}

@@ -22,10 +22,11 @@ def gain_of(
     after: Sequence[RunReplay],
     noise: Mapping[str, float],
     horizon: float,
+    black_box: Sequence[RunReplay] = (),
 ) -> dict[str, Any]:
     """The `gain` of findings.json, without the names of the held-out runs.
 
-    noise: the sensors' std by channel.
+    noise: the sensors' std by channel. black_box: the same runs flown by a flexible model.
     """
     sums = [_block_sums(runs) for runs in (before, refitted, after)]
     channels = [c for c in COMPARED if all(c in s for s in sums)]
@@ -51,6 +52,11 @@ def gain_of(
         for c in channels
     }
     gained = removed(rms[0], rms[2], noise_rms)
+    ceiling = {}
+    if black_box:
+        boxed = _block_sums(black_box)
+        flexible = removed(rms[0], {c: _rms(boxed[c]) for c in channels}, noise_rms)
+        ceiling = {"black_box_percent": _number(flexible)}
     # the floor is an expectation, the gain a sample: luck can lift the sample above it
     return {
         "held_out": [],
@@ -60,6 +66,7 @@ def gain_of(
         "ci95": _interval(removed(drawn[0], drawn[2], noise_rms)),
         "refitted_base_percent": _number(removed(rms[0], rms[1], noise_rms)),
         "noise_floor_percent": _number(np.fmax(removed(rms[0], floor, noise_rms), gained)),
+        **ceiling,
     }
 
 

@@ -54,6 +54,7 @@ SHARE = 0.4
 
 On real flights everything is a little coloured, and some term is always worth a few nats.
 """
+PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03, 0.01)  # of all terms together, in usual sizes
 SETTLING = 1.0  # s at the start of each run that are not screened
 
 Candidate = tuple[str, tuple[Term, ...]]
@@ -140,6 +141,34 @@ def explain(
     search.say("searching again beside the unlisted terms")
     state, quadratic = search.run(state)
     return *_prune(search, state, quadratic, taken), taken
+
+
+def black_box(search: Search, refitted: State) -> State:
+    """Every term on every axis at once: what a flexible model without names makes of the fit runs.
+
+    Bayesian linear regression on the residual wrench (a Gaussian process whose kernel is these
+    terms), of the whitened innovations and not of reconstructed forces, so that what the pilot does
+    against a gust is not taken for its cause. The width of the prior is that of largest evidence.
+    """
+    terms = [f for axis in AXES for f in _parameters(axis, TERMS)]
+    names = [f.name for f in terms]
+    box = Search(search.engine, search.model, (), search.progress, levels=search.levels)
+    rest = [f.name for f in box.base]
+    box.loosen(terms)
+    state = replace(refitted, values={**refitted.values, **dict.fromkeys(names, 0.0)})
+    _, quadratic = box.linearise(state)
+    own = quadratic.index(names)
+
+    def worth(width: float) -> float:
+        precision = quadratic.precision.copy()
+        precision[own] /= width**2
+        narrow = replace(quadratic, precision=precision)
+        return -narrow.best(rest + names)[0] - narrow.occam(names, rest)
+
+    width = max(PRIOR_WIDTHS, key=worth)
+    box.tighten(names)
+    box.loosen([replace(f, std=width * f.std) for f in terms])
+    return box.settle(box.moved(state, quadratic, [], {}), steps=2)
 
 
 def entries(

@@ -29,6 +29,10 @@ def main() -> None:
         "--effect", action="append", default=[], type=Path, metavar="FILE",
         help="Python file with an effect of your own (coax_env/user_effects.py); may be repeated",
     )  # fmt: skip
+    parser.add_argument(
+        "--ceiling", action="store_true",
+        help="also fit a black box: how much of the reachable gain the named causes explain",
+    )  # fmt: skip
     options = parser.parse_args()
     for file in options.effect:
         load_effect(file)
@@ -44,6 +48,7 @@ def main() -> None:
             hold_out=held,
             exclude=[e for e in options.exclude.split(",") if e],
             progress=say,
+            ceiling=options.ceiling,
         )
     save(result, options.out, "scripts/diagnose.py " + shlex.join(sys.argv[1:]))
     print(summary(result))

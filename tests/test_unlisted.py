@@ -144,13 +144,15 @@ def test_an_unlisted_term_is_worth_its_gain(tmp_path):
     ).runs[0]
     flight = replace(flight, runs=(*flight.runs, replace(other, name="second_turn")))
     assert not np.array_equal(turn.measured["q"], other.measured["q"])
-    gain = diagnose(flight, hold_out=["second_turn"], exclude=FEW).findings["gain"]
+    gain = diagnose(flight, hold_out=["second_turn"], exclude=FEW, ceiling=True).findings["gain"]
     for channel in ("q", "theta"):
         entry = gain["channels"][channel]
         before, after = (
             max(entry[k] ** 2 - entry["noise"] ** 2, 0.0) ** 0.5 for k in ("before", "after")
         )
         assert after < 0.4 * before, entry
+    black_box, named = gain["black_box_percent"], gain["error_removed_percent"]
+    assert 0.6 * named < black_box < named + 10.0, "the one true term does at least as well as 270"
 
 
 def test_nothing_unlisted_in_clean_gusts(tmp_path):

@@ -8,6 +8,7 @@ import numpy as np
 
 from coax_env import effects, figures
 from coax_env.engine.whiteness import SHARE
+from coax_env.generic_terms import AXES, TERMS
 from coax_env.plain_words import (
     and_list,
     capital,
@@ -98,6 +99,11 @@ def lead(findings: Findings) -> list[str]:
             f"model could remove more than {whole_percent(gain['noise_floor_percent'])} with these "
             "sensors."
         )
+        if gain.get("black_box_percent") is not None:
+            sentences.append(
+                f"A black box of {len(AXES) * len(TERMS)} generic terms, fitted to the same runs, "
+                f"removes {whole_percent(gain['black_box_percent'])}."
+            )
     elif not gain:
         sentences.append("No run was held out, so how well this predicts is not known.")
     twins = sorted({t for c in findings["causes"] for t in c["confusable_with"]})
