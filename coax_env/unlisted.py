@@ -54,7 +54,7 @@ SHARE = 0.4
 
 On real flights everything is a little coloured, and some term is always worth a few nats.
 """
-PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03, 0.01)  # of all terms together, in usual sizes
+PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.001)  # of a black box' terms, in usual sizes
 SETTLING = 1.0  # s at the start of each run that are not screened
 
 Candidate = tuple[str, tuple[Term, ...]]
@@ -148,27 +148,34 @@ def black_box(search: Search, refitted: State) -> State:
 
     Bayesian linear regression on the residual wrench (a Gaussian process whose kernel is these
     terms), of the whitened innovations and not of reconstructed forces, so that what the pilot does
-    against a gust is not taken for its cause. The width of the prior is that of largest evidence.
+    against a gust is not taken for its cause. On each axis the prior's width is that of largest
+    evidence. One Newton step: a wrench enters the innovations nearly linearly.
     """
-    terms = [f for axis in AXES for f in _parameters(axis, TERMS)]
+    terms = [FreeParameter(f.name, 0.0, f.std) for axis in AXES for f in _parameters(axis, TERMS)]
     names = [f.name for f in terms]
     box = Search(search.engine, search.model, (), search.progress, levels=search.levels)
     rest = [f.name for f in box.base]
     box.loosen(terms)
     state = replace(refitted, values={**refitted.values, **dict.fromkeys(names, 0.0)})
     _, quadratic = box.linearise(state)
-    own = quadratic.index(names)
 
-    def worth(width: float) -> float:
+    def with_widths(widths: Mapping[str, float]) -> Quadratic:
+        shrink = np.array([widths[f.name.partition(".")[0]] for f in terms])
         precision = quadratic.precision.copy()
-        precision[own] /= width**2
-        narrow = replace(quadratic, precision=precision)
-        return -narrow.best(rest + names)[0] - narrow.occam(names, rest)
+        precision[quadratic.index(names)] /= shrink**2
+        return replace(quadratic, precision=precision)
 
-    width = max(PRIOR_WIDTHS, key=worth)
-    box.tighten(names)
-    box.loosen([replace(f, std=width * f.std) for f in terms])
-    return box.settle(box.moved(state, quadratic, [], {}), steps=2)
+    def worth(widths: Mapping[str, float]) -> float:
+        narrow = with_widths(widths)
+        A = narrow.G + np.diag(narrow.precision)
+        slope = narrow.g + narrow.precision * (narrow.at - narrow.mean)
+        return 0.5 * float(slope @ np.linalg.solve(A, slope)) - narrow.occam(names, rest)
+
+    widths = dict.fromkeys(AXES, PRIOR_WIDTHS[-1])
+    for axis in (*AXES, *AXES):
+        tried = [widths | {axis: width} for width in PRIOR_WIDTHS]
+        widths = max(tried, key=worth)
+    return box.moved(state, with_widths(widths), [], {})
 
 
 def entries(

@@ -77,7 +77,7 @@ def share_beyond(evidence: np.ndarray, threshold: float) -> float:
     start = finite[-1]
     if threshold <= start:
         return float(np.mean(evidence > threshold))
-    mean = np.mean(finite[:-1] - start)
+    mean = max(float(np.mean(finite[:-1] - start)), 1e-9)
     return float((finite.size - 1) / ordered.size * np.exp(-(threshold - start) / mean))
 
 
