@@ -31,6 +31,7 @@ from coax_env.gain import gain_of
 from coax_env.heli_model import (
     BUFFET_LEVELS,
     FARTHEST,
+    UNUSUAL,
     HeliModel,
     record_of,
     sensor_std,
@@ -459,7 +460,7 @@ def _unusual(search: Search, state: State) -> list[str]:
                     f"{f.name} stands at the limit of what is believed, {state.values[f.name]:.3g}:"
                     " something else hides behind this name"
                 )
-            elif size > 2.5 * f.std:
+            elif size > UNUSUAL * f.std:
                 remarks.append(
                     f"{f.name} = {state.values[f.name]:.3g} is outside its usual range"
                     f" ({f.value:g} +- {f.std:g}): take the name with care"

@@ -24,6 +24,9 @@ from coax_env.vehicle import Vehicle
 FARTHEST = 5.0
 """Usual sizes that an effect may have at most."""
 
+UNUSUAL = 2.5
+"""Usual sizes beyond which an effect's name is to be taken with care."""
+
 GUST_LEVELS = ("force_xy", "force_z", "moment_xy", "moment_z")
 """Std of the gust states [N, N m]; x and y share one level."""
 

@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Mapping
 
 from coax_env import effects
+from coax_env.heli_model import UNUSUAL
 from coax_env.vehicle import Vehicle
 
 Values = Mapping[str, float]
@@ -213,13 +214,13 @@ def consequence(effect: str, values: Values, vehicle: Vehicle) -> str:
 
 
 def outside_usual(effect: str, values: Values) -> bool:
-    """Whether a value is more than three times its usual size, or has no meaning."""
+    """Whether a value is beyond UNUSUAL times its usual size, or has no meaning."""
     known = {p.name: p for p in effects.CATALOGUE[effect].parameters}
     return any(
         name in known
         and not known[name].shape
         and (
-            abs(value - known[name].off) > 3.0 * known[name].usual
+            abs(value - known[name].off) > UNUSUAL * known[name].usual
             or not known[name].lower <= value <= known[name].upper
         )
         for name, value in values.items()
