@@ -145,7 +145,7 @@ def test_diagnosis_page_says_what_was_found():
         "These flights cannot tell it from airframe drag",
         "Cannot be mistaken for another effect",
         "Fly next: climb descend",
-        "false cause through in 1 % of clean flights",
+        "false cause through in 1 % of them",
         "outliers in h removed: 12",
         "scripts/diagnose.py <flight>",
         "axial damping -> rotor drag",

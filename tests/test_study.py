@@ -317,6 +317,12 @@ def test_a_calibration_says_what_made_it() -> None:
     assert threshold.calibration(rows[:10], "too few") is None
 
 
+def test_the_threshold_in_use_is_calibrated() -> None:
+    """Change EVIDENCE and this asks for `study_diagnosis.py --calibrate --adopt`."""
+    rate = calibration.false_alarm_rate(EVIDENCE)
+    assert rate is not None and rate <= 0.02
+
+
 def test_the_share_beyond_a_threshold() -> None:
     rng = np.random.default_rng(2)
     shares = [threshold.share_beyond(rng.exponential(3.0, 200), 12.0) for _ in range(100)]

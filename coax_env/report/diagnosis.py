@@ -329,7 +329,8 @@ def _sure(result: "Diagnosis") -> list[str]:
     rate = findings.get("false_alarm_rate")
     blocks.append(
         prose(
-            f"The threshold lets a false cause through in {100 * rate:.2g} % of clean flights."
+            f"Calibrated on clean synthetic flights: the threshold lets a false cause through in "
+            f"{100 * rate:.2g} % of them."
             if rate is not None
             else "How often a cause is named where there is none has not been calibrated yet."
         )

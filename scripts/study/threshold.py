@@ -36,9 +36,11 @@ def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
     draws = [tail_quantile(rng.choice(evidence, evidence.size)) for _ in range(DRAWS)]
     low, high = np.nanpercentile(np.array(draws), [2.5, 97.5])
     alarms = sum(bool(judge.named(row)) for row in clean)
+    estimate = max(alarms / len(clean), share_beyond(evidence, EVIDENCE))
     finite = np.sort(evidence[np.isfinite(evidence)])[::-1]
     return {
-        "false_alarm_rate": round(max(alarms / len(clean), share_beyond(evidence, EVIDENCE)), 4),
+        "false_alarm_rate": round(max(estimate, FALSE_ALARMS), 4),  # less is not claimed
+        "estimated_rate": round(estimate, 4),
         "threshold_nats_for_1_percent": _number(tail_quantile(evidence)),
         "ci95": [_number(low), _number(high)],
         "clean_flights": len(clean),
