@@ -35,6 +35,7 @@ TIE = 6.0
 MOST_CAUSES = 10
 PROMISE = 2.0
 """Nats below which another Gauss-Newton step is not worth its time."""
+MOST_ROUNDS = 3
 MOST_TURNS = 6
 GLANCE = 60.0
 """Seconds of flight on which noise levels are fitted while the search goes on."""
@@ -283,15 +284,12 @@ class Search:
         state: State,
         passes: Sequence[RunPass],
         quadratic: Quadratic,
-        pinned: Mapping[str, float],
     ) -> float:
         """Take the Newton step of the active set, halved until the cost falls. Gain, nats."""
         free = self.free(state.active)
-        _, move = quadratic.best([f.name for f in free], dict(pinned))
+        _, move = quadratic.best([f.name for f in free])
         moves = {n: float(m) for n, m in zip(quadratic.names, move, strict=True) if m != 0.0}
-        state.values, gained = self.engine.descend(
-            passes, free, state.values, state.noise, moves, whole=pinned
-        )
+        state.values, gained = self.engine.descend(passes, free, state.values, state.noise, moves)
         return gained
 
     def moved(
@@ -497,19 +495,23 @@ class Search:
         drops: Counter[str] = Counter()
         tried: set[tuple[str, ...]] = set()
         failures = most = 0
-        complete = settled = False
+        complete = False
+        rounds = 0  # of fitting since the last move
         for _ in range(4 * MOST_CAUSES):
             passes, quadratic = self.linearise(state)
             promised, _ = quadratic.best(self.free_names(state.active))
             ranked = self._ranked(state, quadratic, banned)
             clear = not complete and ranked and ranked[0][0] > -CLEAR * promised
-            if -promised > PROMISE and not settled and not clear:
-                self.advance(state, passes, quadratic, {})
+            fitted = -promised <= PROMISE or rounds == MOST_ROUNDS
+            if not fitted and not clear:
+                rounds += 1
+                self.advance(state, passes, quadratic)
                 self.settle(state, steps=1)
-                settled = True
                 continue
-            settled = False
-            dropped = None if complete else self._drop(state, quadratic, coloured=False)
+            rounds = 0
+            # on the way to a fit an effect may look small
+            drop = fitted and not complete
+            dropped = self._drop(state, quadratic, coloured=False) if drop else None
             if dropped:
                 drops[dropped] += 1
                 banned.add(dropped)
@@ -623,5 +625,9 @@ class Search:
         self.history.append((f"+ {effect}", score))
         self.say(f"added {effect}: {score:.1f} nats")
         state.active = [*state.active, effect]
-        self.advance(state, passes, quadratic, self.pinned(effect))
+        pinned = self.pinned(effect)
+        if pinned:  # takes the base parameter's place: the same model, not a better one
+            state.values = self.moved(state, quadratic, state.active, pinned).values
+        else:
+            self.advance(state, passes, quadratic)
         return True

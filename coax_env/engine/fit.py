@@ -6,7 +6,7 @@ identification, effects' parameters free is diagnosis.
 
 import math
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -216,12 +216,10 @@ class Engine:
         values: Mapping[str, float],
         noise: Noise,
         moves: Mapping[str, float],
-        whole: Collection[str] = (),
     ) -> tuple[dict[str, float], float]:
         """Move along a step, halved until the cost at frozen gains falls.
 
-        Moves named in `whole` are never shortened. Returns the new values and the gain, nats (0 and
-        the old values where no shortening helped).
+        Returns the new values and the gain, nats (0 and the old values where no shortening helped).
         """
         before = self.frozen_cost(passes, free, values, noise)
         limits = {f.name: (f.lower, f.upper) for f in free}
@@ -229,8 +227,7 @@ class Engine:
             trial = dict(values)
             for name, change in moves.items():
                 lower, upper = limits.get(name, (-np.inf, np.inf))
-                part_of_it = change if name in whole else damping * change
-                trial[name] = float(np.clip(values[name] + part_of_it, lower, upper))
+                trial[name] = float(np.clip(values[name] + damping * change, lower, upper))
             gained = before - self.frozen_cost(passes, free, trial, noise)
             if gained > 0.0:
                 return trial, gained
