@@ -184,12 +184,15 @@ _CONSEQUENCES: dict[str, Callable[[Values, Values], str]] = {
         f"{number(e['gain'], 2)} of the rotors' acceleration torque reaches the body"
     ),
     "battery_sag": lambda e, v: f"rotor speed falls by {number(6000 * e['rate'], 2)} % a minute",
-    "gyro_bias": lambda e, v: ", ".join(
-        f"{c} {_deg(e[a])}/s" for c, a in zip("pqr", "xyz", strict=True)
+    "gyro_bias": lambda e, v: (
+        "the gyros add "
+        + ", ".join(f"{_deg(e[a])}/s to {c}" for c, a in zip("pqr", "xyz", strict=True))
     ),
-    "accel_bias": lambda e, v: ", ".join(f"a{a} {number(e[a], 2)} m/s²" for a in "xyz"),
+    "accel_bias": lambda e, v: (
+        "the accelerometers add " + ", ".join(f"{number(e[a], 2)} m/s² to a{a}" for a in "xyz")
+    ),
     "attitude_bias": lambda e, v: (
-        f"roll {_deg(e['x'])}, pitch {_deg(e['y'])}, heading {_deg(e['z'])}"
+        f"the attitude reads off by: roll {_deg(e['x'])}, pitch {_deg(e['y'])}, heading {_deg(e['z'])}"
     ),
     "imu_lever_arm": lambda e, v: (
         ", ".join(f"{a} {1000 * e[a]:.0f} mm" for a in "xyz") + " off the centre of gravity"
