@@ -108,7 +108,9 @@ def test_terms_are_no_part_of_the_catalogue():
 # --- found in flight --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("gusts", "size"), [(False, 0.01), (True, 0.02)])
+@pytest.mark.parametrize(
+    ("gusts", "size"), [(False, 0.01), pytest.param(True, 0.02, marks=pytest.mark.slow)]
+)
 def test_a_force_in_no_list_becomes_part_of_the_model(tmp_path, gusts, size):
     """M = a sin(3 psi), hidden: the right axis, form and size, and no effect of the list is blamed."""
     runs = (*TURNING, "lat_3211", "yaw_3211")
@@ -155,6 +157,7 @@ def test_an_unlisted_term_is_worth_its_gain(tmp_path):
     assert 0.6 * named < black_box < named + 10.0, "the one true term does at least as well as 270"
 
 
+@pytest.mark.slow
 def test_nothing_unlisted_in_clean_gusts(tmp_path):
     folder = injector.fly(
         tmp_path / "f", {}, gusts=True, runs=(*TURNING, "lat_3211", "forward_run"), seed=44
@@ -163,6 +166,7 @@ def test_nothing_unlisted_in_clean_gusts(tmp_path):
     assert result.findings["verdict"] == "consistent" and not result.vehicle_after.effects
 
 
+@pytest.mark.slow
 def test_a_listed_effect_comes_before_unlisted_terms(tmp_path):
     """A drag is a drag, though terms in u and v would do as well."""
     folder = injector.fly(
@@ -256,6 +260,7 @@ def test_an_effect_cannot_be_added_to_a_compiled_kernel(tmp_path):
 # --- vibration --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_vibration_is_named_and_explains_the_accelerometers(tmp_path):
     folder = injector.fly(
         tmp_path / "f", {"vibration": 0.5}, gusts=True, runs=("lon_3211", "lat_3211"), seed=47
