@@ -70,13 +70,14 @@ def strip_effects(path: Path) -> None:
     """Cut every call of a stage of effects out of a copy of the kernel."""
     text = path.read_text()
     cut, count = re.subn(
-        r"\n +if (with_effects and )?p\[effects\.[A-Z]+\] != 0\.0:\n +_[a-z]+_effects\(x, f, p\)",
+        r"\n +if (with_effects and )?p\[effects\.[A-Z]+\] != 0\.0:"
+        r"\n +_[a-z]+_(effects|terms)\(x, f, p\)",
         "",
         text,
     )
-    if count != 6:
-        raise RuntimeError(f"expected 6 stages of effects in {path.name}, found {count}")
-    switch = "if p[effects.AIR] + p[effects.SWASH] + p[effects.ROTOR] + p[effects.LOAD] != 0.0:"
+    if count != 7:
+        raise RuntimeError(f"expected 7 stages of effects in {path.name}, found {count}")
+    switch = "if flown + p[effects.UNLISTED] != 0.0:"
     if switch not in cut:
         raise RuntimeError(f"the switch between the two rates is not in {path.name}")
     path.write_text(cut.replace(switch, "if False:"))

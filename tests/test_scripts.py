@@ -282,3 +282,12 @@ def test_design_then_evaluate(tmp_path):
     assert done.returncode == 0, done.stderr
     score = json.loads((tmp_path / "runs/evaluate/score.json").read_text())
     assert score["episodes"] == 10 and score["success_rate"] > 0.5
+
+
+def test_the_benchmark_finds_the_calls_it_cuts(tmp_path):
+    import benchmark
+
+    kernel = tmp_path / "dynamics.py"
+    kernel.write_text((ROOT / "coax_env" / "dynamics.py").read_text())
+    benchmark.strip_effects(kernel)
+    assert "_effects(x, f, p)" not in kernel.read_text()
