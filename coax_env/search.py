@@ -284,13 +284,12 @@ class Search:
         state: State,
         passes: Sequence[RunPass],
         quadratic: Quadratic,
-    ) -> float:
-        """Take the Newton step of the active set, halved until the cost falls. Gain, nats."""
+    ) -> None:
+        """Take the Newton step of the active set, halved until the cost falls."""
         free = self.free(state.active)
         _, move = quadratic.best([f.name for f in free])
         moves = {n: float(m) for n, m in zip(quadratic.names, move, strict=True) if m != 0.0}
-        state.values, gained = self.engine.descend(passes, free, state.values, state.noise, moves)
-        return gained
+        state.values, _ = self.engine.descend(passes, free, state.values, state.noise, moves)
 
     def moved(
         self,
@@ -298,14 +297,10 @@ class Search:
         quadratic: Quadratic,
         active: list[str],
         pinned: Mapping[str, float],
-        more: Collection[str] = (),
     ) -> State:
-        """Where the quadratic says the fit with other effects is, noise as it was.
-
-        `more`: parameters loose beside those of `active`.
-        """
+        """Where the quadratic says the fit with other effects is, noise as it was."""
         free = [n for n in self.free_names(active) if n not in pinned]
-        _, move = quadratic.best([*free, *(n for n in more if n not in free)], dict(pinned))
+        _, move = quadratic.best(free, dict(pinned))
         values = dict(zip(quadratic.names, (quadratic.at + move).tolist(), strict=True))
         return State(active, state.values | values | dict(pinned), state.noise)
 

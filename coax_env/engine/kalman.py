@@ -32,6 +32,20 @@ def wrap_angle(angle):
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
+@compiled(types.void(_M, _M, _M))
+def _product(A, B, out):
+    """A B, row by row so that the compiler can use vectors; most of A is zero."""
+    n = A.shape[0]
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = 0.0
+        for a in range(n):
+            weight = A[i, a]
+            if weight != 0.0:
+                for j in range(n):
+                    out[i, j] += weight * B[a, j]
+
+
 @compiled(
     types.Tuple((float64, int64))(
         STEP, MEASURE, _A, _M, _M, boolean[::1], _A, _M, _A, _A, _A, _A, int64, float64, int64,
@@ -224,15 +238,8 @@ def filter_pass(
                     for j in range(nx):
                         own = 1.0 if i == j else 0.0
                         F[i, j] = own + ratio * (F[i, j] - own)
-        # P = F (F P)', row by row so that the compiler can use vectors; most of F is zero
-        for i in range(nx):
-            for j in range(nx):
-                FP[i, j] = 0.0
-            for a in range(nx):
-                weight = F[i, a]
-                if weight != 0.0:
-                    for j in range(nx):
-                        FP[i, j] += weight * P[a, j]
+        # P = F (F P)'
+        _product(F, P, FP)
         for i in range(nx):
             for j in range(nx):
                 PF[j, i] = FP[i, j]
@@ -240,14 +247,7 @@ def filter_pass(
             for i in range(nx):
                 for j in range(nx):
                     F_all[k, i, j] = F[i, j]
-        for i in range(nx):
-            for j in range(nx):
-                P[i, j] = 0.0
-            for a in range(nx):
-                weight = F[i, a]
-                if weight != 0.0:
-                    for j in range(nx):
-                        P[i, j] += weight * PF[a, j]
+        _product(F, PF, P)
         for i in range(nx):
             for j in range(i):
                 P[j, i] = P[i, j]
@@ -284,42 +284,26 @@ def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
     K = np.zeros((m, nx))
     NK = np.zeros((m, nx))
     Kr = np.zeros(m)
-    F = np.zeros((nx, nx))
+    FT = np.zeros((nx, nx))
+    NF = np.zeros((nx, nx))
     by_noise[:, :] = 0.0
     for k in range(n - 1, -1, -1):
         if k < n - 1:
             for i in range(nx):
                 by_noise[stretch[k], i] += 0.5 * dt[k] * (r[i] * r[i] - N[i, i])
                 for j in range(nx):
-                    F[i, j] = F_all[k, i, j]
-            # r = F' r, N = F' N F
+                    FT[j, i] = F_all[k, i, j]
+            # r = F' r, N = F' (F' N)'
             for i in range(nx):
                 moved[i] = 0.0
                 for j in range(nx):
-                    B[i, j] = 0.0
-            for a in range(nx):
-                for j in range(nx):
-                    moved[j] += r[a] * F[a, j]
-            for a in range(nx):  # B = F' N, then N = F' B'
-                for i in range(nx):
-                    weight = F[a, i]
-                    if weight != 0.0:
-                        for j in range(nx):
-                            B[i, j] += weight * N[a, j]
+                    moved[i] += FT[i, j] * r[j]
+            _product(FT, N, B)
             for i in range(nx):
                 r[i] = moved[i]
                 for j in range(nx):
-                    N[i, j] = B[j, i]
-            for i in range(nx):
-                for j in range(nx):
-                    B[i, j] = N[i, j]
-                    N[i, j] = 0.0
-            for a in range(nx):
-                for i in range(nx):
-                    weight = F[a, i]
-                    if weight != 0.0:
-                        for j in range(nx):
-                            N[i, j] += weight * B[a, j]
+                    NF[j, i] = B[i, j]
+            _product(FT, NF, N)
         # with A = I - sum of K_b H_b': r = A' r, N = A' N A
         for b in range(m):
             if W_all[k, b, b] != 0.0:

@@ -58,29 +58,31 @@ def tail_quantile(evidence: np.ndarray, exceeded_by: float = FALSE_ALARMS) -> fl
 
     Flights without any candidate have -inf. NaN where fewer than a tenth of the tail is finite.
     """
-    ordered = np.sort(evidence)[::-1]
-    count = max(2, math.ceil(TAIL * ordered.size))
-    tail = ordered[:count]
-    finite = tail[np.isfinite(tail)]
+    finite = _tail(evidence)
     if finite.size < 5:
         return math.nan
     start = finite[-1]
-    share = (finite.size - 1) / ordered.size
+    share = (finite.size - 1) / evidence.size
     return float(start + np.mean(finite[:-1] - start) * max(math.log(share / exceeded_by), 0.0))
 
 
 def share_beyond(evidence: np.ndarray, threshold: float) -> float:
     """Share of clean flights with evidence beyond a threshold, by the same tail."""
-    ordered = np.sort(evidence)[::-1]
-    tail = ordered[: max(2, math.ceil(TAIL * ordered.size))]
-    finite = tail[np.isfinite(tail)]
+    finite = _tail(evidence)
     if finite.size < 5:
-        return finite.size / ordered.size if np.any(finite > threshold) else 0.0
+        return finite.size / evidence.size if np.any(finite > threshold) else 0.0
     start = finite[-1]
     if threshold <= start:
         return float(np.mean(evidence > threshold))
     mean = max(float(np.mean(finite[:-1] - start)), 1e-9)
-    return float((finite.size - 1) / ordered.size * np.exp(-(threshold - start) / mean))
+    return float((finite.size - 1) / evidence.size * np.exp(-(threshold - start) / mean))
+
+
+def _tail(evidence: np.ndarray) -> np.ndarray:
+    """The finite evidences of the uppermost quarter of the flights, largest first."""
+    ordered = np.sort(evidence)[::-1]
+    tail = ordered[: max(2, math.ceil(TAIL * ordered.size))]
+    return tail[np.isfinite(tail)]
 
 
 def _number(value: float) -> float | None:
