@@ -264,6 +264,33 @@ def step(x, u, dt, p, work, out):
 
 
 @compiled()
+def drift(x, u, dt, p, work, out):
+    """What a row adds to the full state (26,), into `out`, from one evaluation of the rates.
+
+    For derivatives with respect to states and parameters: first order in `dt` for the paper's states,
+    exact for actuators and gusts. The rotors' acceleration is the row's mean, as in `step`.
+    """
+    f = work[: F.N_FLOW]
+    now = work[F.N_FLOW : F.N_FLOW + N_FULL]
+    slope = work[F.N_FLOW + N_FULL : F.N_FLOW + N_FULL + N_STATES]
+    _properties(x, u, p, f)
+    for i in range(N_FULL):
+        now[i] = x[i]
+    _actuate(x, u, dt, f, now)
+    for i in range(N_STATES, N_STATES + 4):
+        out[i] = now[i] - x[i]
+    f[F.OMEGA_U_DOT] = out[16] / dt
+    f[F.OMEGA_L_DOT] = out[17] / dt
+    _actuate(x, u, READING_DELAY, f, now)
+    _rates(now, p, f, slope)
+    for i in range(N_STATES):
+        out[i] = dt * slope[i]
+    fade = math.exp(-dt / p[P.GUST_MEMORY]) - 1.0
+    for i in range(20, N_FULL):
+        out[i] = fade * x[i]
+
+
+@compiled()
 def measure(x, u, p, work, out):
     """Readings of every canonical channel, contract units, shape (18,), into `out`. Eq. (45)."""
     f = work[: F.N_FLOW]
@@ -312,6 +339,12 @@ def step_pointer(x, u, dt, p, work, out):
 def measure_pointer(x, u, p, work, out):
     """`measure`, in the form in which the engine takes a model."""
     measure(x, u, p, work, out)
+
+
+@pointer(STEP)
+def drift_pointer(x, u, dt, p, work, out):
+    """`drift`, in the form in which the engine takes a model."""
+    drift(x, u, dt, p, work, out)
 
 
 @compiled(types.void(_A, _A, _A, _A, _A))

@@ -17,6 +17,7 @@ from coax_env.layout import (
     CHANNELS,
     N_FULL,
     N_INPUTS,
+    N_STATES,
     TIME,
 )
 from coax_env.vehicle import Vehicle
@@ -64,6 +65,8 @@ class HeliModel:
     wraps = np.array([c in ANGLES for c in CHANNELS])
     step = dynamics.step_pointer
     measure = dynamics.measure_pointer
+    drift = dynamics.drift_pointer
+    exact = np.arange(N_FULL) >= N_STATES
     work_size = dynamics.WORK_SIZE
     state_scale = np.array(
         [1e-4] * 6 + [1e-5] * 4 + [1e-5] * 3 + [1e-4] * 3 + [1e-2] * 2 + [1e-5] * 2
@@ -92,7 +95,7 @@ class HeliModel:
                 u[:, column] = _mean_of_late(record.t, record.command[:, column], delay)
         return u
 
-    def start(self, record: Record, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+    def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """First state from the medians of the first half second, with a wide covariance."""
         early = record.t <= record.t[0] + 0.5
 
@@ -119,9 +122,11 @@ class HeliModel:
         x[16:20] = record.command[0]
         spread[16:18] = 4.0
         spread[18:20] = 0.03
-        levels = _gust_levels(noise)
-        spread[20:26] = levels
         return x, np.diag(spread**2 + 1e-12)
+
+    def start_noise(self, noise: Noise) -> np.ndarray:
+        """Variances of the gusts at the start of a run (26,)."""
+        return np.append(np.zeros(N_FULL - 6), _gust_levels(noise) ** 2)
 
     def process_noise(self, noise: Noise) -> np.ndarray:
         """Growth of the states' variances per second (26,): gusts, and a little everywhere."""
@@ -168,6 +173,7 @@ class HeliModel:
                 max(p.lower, p.off - FARTHEST * p.usual),
                 min(p.upper, p.off + FARTHEST * p.usual),
                 p.probe,
+                entry.stage == effects.SENSOR,
             )
             for full, p in zip(entry.names(), entry.parameters, strict=True)
         ]

@@ -220,8 +220,8 @@ class _FromHere(HeliModel):
         super().__init__(vehicle)
         self.first = start
 
-    def start(self, record: Record, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
-        _, covariance = super().start(record, noise)
+    def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
+        _, covariance = super().start(record)
         return self.first.copy(), covariance
 
 

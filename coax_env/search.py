@@ -35,7 +35,7 @@ TIE = 6.0
 MOST_CAUSES = 10
 PROMISE = 2.0
 """Nats below which another Gauss-Newton step is not worth its time."""
-MOST_ROUNDS = 3
+MOST_STEPS = 4
 MOST_TURNS = 6
 GLANCE = 60.0
 """Seconds of flight on which noise levels are fitted while the search goes on."""
@@ -491,19 +491,19 @@ class Search:
         tried: set[tuple[str, ...]] = set()
         failures = most = 0
         complete = False
-        rounds = 0  # of fitting since the last move
+        settled = False  # since the last move
         for _ in range(4 * MOST_CAUSES):
             passes, quadratic = self.linearise(state)
             promised, _ = quadratic.best(self.free_names(state.active))
             ranked = self._ranked(state, quadratic, banned)
             clear = not complete and ranked and ranked[0][0] > -CLEAR * promised
-            fitted = -promised <= PROMISE or rounds == MOST_ROUNDS
+            fitted = -promised <= PROMISE or settled
             if not fitted and not clear:
-                rounds += 1
                 self.advance(state, passes, quadratic)
-                self.settle(state, steps=1)
+                self.settle(state, MOST_STEPS, PROMISE)
+                settled = True
                 continue
-            rounds = 0
+            settled = False
             # on the way to a fit an effect may look small
             drop = fitted and not complete
             dropped = self._drop(state, quadratic, coloured=False) if drop else None

@@ -85,6 +85,55 @@ def find(folder: Path, **options: Any) -> Diagnosis:
         (folder.parent / "truth.json").rename(folder / "truth.json")
 
 
+# --- signatures ----------------------------------------------------------------------------------
+
+ACTIVE = {"motor_lag.upper": 0.06, "motor_lag.lower": 0.08, "rotor_drag.coefficient": 3e-4,
+          "wind.north": -1.0, "wind.east": 1.5, "axial_damping.coefficient": 0.07}  # fmt: skip
+
+
+@pytest.mark.parametrize("also", [{}, ACTIVE], ids=["bare", "with effects"])
+def test_signatures_are_what_moving_the_parameter_does(tmp_path, also):
+    """Information and slope, against differences of the mean pass with the gains frozen."""
+    folder = injector.fly(tmp_path / "flight", {}, runs=("lon_3211", "yaw_3211"), seed=5)
+    flight = read_flight(folder)
+    model = HeliModel(LAMA)
+    engine = Engine(model, [record_of(run) for run in flight.runs])
+    noise = starting_noise(flight, LAMA)
+    free = model.base_parameters()
+    free += [
+        f
+        for effect in effects.CATALOGUE
+        for f in model.effect_parameters(effect)
+        if f.probe == 0.0 or f.name in also
+    ]
+    values = {**model.bare_values, **{f.name: f.value for f in free}, **also}
+    passes, lin = engine.linearise(values, noise, free)
+
+    def innovations(name: str, change: float) -> np.ndarray:
+        vector = model.vector({**values, name: values[name] + change})
+        e = [np.zeros(run.record.z.shape) for run in passes]
+        for i, run in enumerate(passes):
+            assert engine._frozen(i, run, vector, e[i])
+        return np.concatenate(e)
+
+    e = innovations("mass", 0.0)
+    shown = 0
+    for i, f in enumerate(free):
+        information, slope = lin.information.sum(0)[i, i], lin.slope.sum(0)[i]
+        h = 0.3 / np.sqrt(max(information, f.std**-2))  # a third of a standard deviation
+        if information * f.std**2 < 0.1 or not f.lower < values[f.name] - h:
+            continue
+        J = (innovations(f.name, h) - innovations(f.name, -h)) / (2.0 * h)
+        size = np.sqrt(np.sum(J**2))
+        # what decays within a row is taken to first order only
+        rough = f.name == "flap_time_constant" or f.name.startswith("motor_lag")
+        assert np.sqrt(information) == pytest.approx(size, rel=0.1 if rough else 0.02), f.name
+        allowed = (0.02 if rough else 0.005) * size * np.linalg.norm(e)
+        assert abs(slope - np.sum(J * e)) < allowed, f.name
+        shown += 1
+    assert shown > 30
+
+
 # --- hidden effects ------------------------------------------------------------------------------
 
 

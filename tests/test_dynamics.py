@@ -332,6 +332,24 @@ def test_rk4_is_of_fourth_order(lag):
     assert 3.7 < slope < 4.5, (slope, errors)
 
 
+@pytest.mark.parametrize("lag", [0.0, 0.07])
+def test_drift_is_a_step_to_first_order(lag):
+    """Actuators and gusts exactly; the rest with an error that falls with the square of the row."""
+    start, command = settled_state(2)
+    start[16:26] = [1990.0, 2150.0, 0.02, -0.01, 0.1, -0.1, 0.2, 1e-3, -1e-3, 1e-4]
+    vehicle = LAMA.with_effect("motor_lag", upper=lag, lower=lag)
+    work, added = np.zeros(dynamics.WORK_SIZE), np.zeros(26)
+    errors = []
+    steps = np.array([4e-3, 2e-3, 1e-3])
+    for dt in steps:
+        dynamics.drift(start, dynamics.kernel_input(command), dt, vehicle.vector, work, added)
+        error = start + added - fly(start, command, dt, dt, vehicle)
+        np.testing.assert_allclose(error[16:], 0.0, atol=1e-10)
+        errors.append(np.abs(error[:16]).max())
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert 1.8 < slope < 2.2, (slope, errors)
+
+
 def test_a_long_row_is_split():
     start, command = settled_state(3)
     whole = fly(start, command, 0.1, 0.1, LAMA)

@@ -48,6 +48,19 @@ class RunPass:
 
 
 @dataclass(frozen=True)
+class Along:
+    """What a filter pass linearised the model at.
+
+    H: (n, m, nx) Jacobians of the readings, F: (n, nx, nx) of the step. predicted: (n, nx) states
+    before each row's readings.
+    """
+
+    H: np.ndarray
+    F: np.ndarray
+    predicted: np.ndarray
+
+
+@dataclass(frozen=True)
 class Linearised:
     """Likelihood to second order about a point, per run.
 
@@ -94,12 +107,18 @@ class Engine:
         self.model = model
         self.records = list(records)
         self.threads = threads or int(os.environ.get("COAX_THREADS", "2"))
+        self.starts = [model.start(r) for r in self.records]
         self.intervals = [np.append(np.diff(r.t), 0.0) for r in self.records]
 
     def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
+        """Work done on every run (or those in `which`), the longest first so that no thread waits."""
         indices = range(len(self.records)) if which is None else which
         with ThreadPoolExecutor(self.threads) as pool:
-            return list(pool.map(work, indices))
+            begun = {
+                i: pool.submit(work, i)
+                for i in sorted(indices, key=lambda i: -self.records[i].t.size)
+            }
+            return [begun[i].result() for i in indices]
 
     def filter(
         self,
@@ -136,13 +155,14 @@ class Engine:
         keep: bool,
         jacobians: bool = False,
         start_rows: np.ndarray | None = None,
-    ) -> tuple[RunPass, np.ndarray, np.ndarray]:
-        """The filter pass of a run, and the Jacobians of readings and steps (empty unless asked)."""
+    ) -> tuple[RunPass, Along]:
+        """The filter pass of a run, and what it went along (empty unless asked for)."""
         record = self.records[i]
         n, m = record.z.shape
         nx = q.size
         u = self.model.inputs(record, p)
-        x0, P0 = self.model.start(record, noise)
+        x0, P0 = self.starts[i]
+        P0 = P0 + np.diag(self.model.start_noise(noise))
         e = np.full((n, m), np.nan)
         states = np.zeros((n, nx))
         rows = n if keep else 0
@@ -150,16 +170,19 @@ class Engine:
         W = np.zeros((rows, m, m), np.float32)
         H = np.zeros((n if jacobians else 0, m, nx), np.float32)
         F = np.zeros((n if jacobians else 0, nx, nx), np.float32)
+        predicted = np.zeros((n if jacobians else 0, nx))
         starts = np.empty(0, np.int64) if start_rows is None else start_rows
         slots = np.full(n, -1, np.int64)
         slots[starts] = np.arange(starts.size)
         P = np.zeros((starts.size, nx, nx))
         log_likelihood, deweighted = kalman.filter_pass(
-            self.model.step, self.model.measure, self.intervals[i], u, record.z, self.model.wraps,
-            x0, P0, R, q, p, self.model.state_scale, self.model.work_size, GATE, REFRESH,
-            keep, states, e, K, W, slots, P, H, F,
+            self.model.step, self.model.measure, self.model.drift, self.model.exact,
+            self.intervals[i], u, record.z, self.model.wraps, x0, P0, R, q, p,
+            self.model.state_scale, self.model.work_size, GATE, REFRESH,
+            keep, states, e, K, W, slots, P, H, F, predicted,
         )  # fmt: skip
-        return RunPass(record, u, log_likelihood, e, states, deweighted, K, W, starts, P), H, F
+        run = RunPass(record, u, log_likelihood, e, states, deweighted, K, W, starts, P)
+        return run, Along(H, F, predicted)
 
     def log_likelihood(
         self, values: Mapping[str, float], noise: Noise, which: Sequence[int] | None = None
@@ -170,44 +193,82 @@ class Engine:
     def linearise(
         self, values: Mapping[str, float], noise: Noise, free: Sequence[FreeParameter]
     ) -> tuple[list[RunPass], Linearised]:
-        """Filter, then one mean pass per free parameter with the gains frozen."""
-        passes = self.filter(values, noise, keep=True)
-        base = self.model.vector(values)
-        moved, steps = [], []
-        for f in free:
-            now = values[f.name]
-            size = f.probe if f.probe > 0.0 and now < 0.25 * f.probe else 0.02 * f.std
-            if now + size > f.upper:
-                size = -size
-            moved.append(self.model.vector({**values, f.name: now + size}))
-            steps.append(size)
+        """Filter, then the derivatives of the innovations in every free parameter, gains frozen.
 
-        def one(i: int) -> tuple[np.ndarray, ...]:
-            run = passes[i]
-            n, m = run.record.z.shape
-            e = np.zeros((n, m))
-            x0, _ = self.model.start(run.record, noise)
-            self._frozen(i, run, x0, base, e)
-            J = np.zeros((len(free), n, m))
-            for k, (p, size) in enumerate(zip(moved, steps, strict=True)):
-                flew = self._frozen(i, run, x0, p, J[k])
-                J[k] -= e
-                if flew and np.abs(J[k]).max() < HUGE:
-                    J[k] /= size
-                else:
-                    J[k] = 0.0
-            by_channel = np.einsum("knm,knm->km", J, J)
-            slopes = np.einsum("knm,nm->nk", J, e)
+        A parameter without a slope at its off-value (`probe`) is moved that far in a mean pass of its
+        own.
+        """
+        p, q = self.model.vector(values), self.model.process_noise(noise)
+        R = self._reading_variances(noise)
+        far = np.array([f.probe > 0.0 and values[f.name] < 0.25 * f.probe for f in free], bool)
+        steps = np.array([f.probe if far[k] else 0.02 * f.std for k, f in enumerate(free)])
+        over = np.array([values[f.name] + steps[k] > f.upper for k, f in enumerate(free)], bool)
+        steps[over] *= -1.0
+        reading_only = np.array([f.reading_only for f in free], bool)
+        moved = [
+            self.model.vector({**values, f.name: values[f.name] + step})
+            for f, step in zip(free, steps, strict=True)
+        ]
+
+        def one(i: int) -> tuple[Any, ...]:
+            run, along = self._filter_run(i, p, q, R, noise, keep=True, jacobians=True)
+            e = np.nan_to_num(run.innovations)
+            J = np.zeros((*e.shape, len(free)))
+            near = np.flatnonzero(~far)
+            if np.isfinite(run.log_likelihood):
+                J[:, :, near] = self._signatures(
+                    i, run, along, p, [moved[k] for k in near], steps[near], reading_only[near]
+                )
+            there = np.zeros(e.shape)
+            for k in np.flatnonzero(far):
+                if self._frozen(i, run, moved[k], there) and np.abs(there - e).max() < HUGE:
+                    J[:, :, k] = (there - e) / steps[k]
+            flat = J.reshape(-1, len(free))
+            information = flat.T @ flat
+            wild = ~np.isfinite(np.diag(information))
+            if wild.any():
+                flat[:, wild] = 0.0
+                information[wild] = information[:, wild] = 0.0
+            slopes = np.einsum("nmk,nm->nk", J, e)
             t = run.record.t
             edges = np.searchsorted(t, np.arange(t[0], t[-1], STRETCH))
-            flat = J.reshape(len(free), -1)
-            return flat @ flat.T, slopes.sum(0), by_channel, np.add.reduceat(slopes, edges)
+            return (
+                run, information, slopes.sum(0), np.einsum("nmk,nmk->km", J, J),
+                np.add.reduceat(slopes, edges),
+            )  # fmt: skip
 
-        parts = list(zip(*self._each(one), strict=True))
-        information, slope, by_channel = (np.array(part) for part in parts[:3])
-        return passes, Linearised(
-            tuple(f.name for f in free), information, slope, by_channel, np.concatenate(parts[3])
+        passes, *parts, stretches = zip(*self._each(one), strict=True)
+        information, slope, by_channel = (np.array(part) for part in parts)
+        return list(passes), Linearised(
+            tuple(f.name for f in free), information, slope, by_channel, np.concatenate(stretches)
         )
+
+    def _signatures(
+        self,
+        i: int,
+        run: RunPass,
+        along: Along,
+        p: np.ndarray,
+        moved: Sequence[np.ndarray],
+        steps: np.ndarray,
+        reading_only: np.ndarray,
+    ) -> np.ndarray:
+        """Derivatives of a run's whitened innovations in the parameters moved, (n, m, k)."""
+        J = np.zeros((*run.innovations.shape, len(moved)))
+        if not moved:
+            return J
+        sets, which = [run.inputs], np.zeros(len(moved), np.int64)
+        for k, vector in enumerate(moved):
+            inputs = self.model.inputs(run.record, vector)
+            if not np.array_equal(inputs, run.inputs):
+                which[k] = len(sets)
+                sets.append(inputs)
+        kalman.signature_pass(
+            self.model.drift, self.model.measure, self.intervals[i], np.array(sets), which,
+            along.predicted, run.states, run.innovations, p, np.array(moved), steps, reading_only,
+            self.model.exact, self.model.work_size, run.gains, run.whitening, along.H, along.F, J,
+        )  # fmt: skip
+        return J
 
     def descend(
         self,
@@ -246,16 +307,15 @@ class Engine:
         def one(i: int) -> float:
             run = passes[i]
             e = np.zeros(run.record.z.shape)
-            x0, _ = self.model.start(run.record, noise)
-            return 0.5 * float(np.sum(e**2)) if self._frozen(i, run, x0, p, e) else np.inf
+            return 0.5 * float(np.sum(e**2)) if self._frozen(i, run, p, e) else np.inf
 
         return sum(self._each(one)) + penalty(free, values)
 
-    def _frozen(self, i: int, run: RunPass, x0: np.ndarray, p: np.ndarray, out: np.ndarray) -> bool:
+    def _frozen(self, i: int, run: RunPass, p: np.ndarray, out: np.ndarray) -> bool:
         return kalman.mean_pass(
             self.model.step, self.model.measure, self.intervals[i],
             self.model.inputs(run.record, p), run.record.z, self.model.wraps,
-            x0, p, self.model.work_size, run.gains, run.whitening, out,
+            self.starts[i][0], p, self.model.work_size, run.gains, run.whitening, out,
         )  # fmt: skip
 
     def fit(
@@ -316,13 +376,13 @@ class Engine:
         R = self._reading_variances(noise)
 
         def one(i: int) -> tuple[float, np.ndarray, np.ndarray]:
-            run, H, F = self._filter_run(i, p, q, R, noise, keep=True, jacobians=True)
+            run, along = self._filter_run(i, p, q, R, noise, keep=True, jacobians=True)
             t = run.record.t
             stretch = ((t - t[0]) / STRETCH).astype(np.int64)
             by_noise, by_start = np.zeros((stretch[-1] + 1, q.size)), np.zeros(q.size)
             if np.isfinite(run.log_likelihood):
                 kalman.score_pass(
-                    self.intervals[i], run.innovations, run.gains, run.whitening, H, F,
+                    self.intervals[i], run.innovations, run.gains, run.whitening, along.H, along.F,
                     stretch, by_noise, by_start,
                 )  # fmt: skip
             return run.log_likelihood, by_noise, by_start
@@ -359,8 +419,7 @@ class Engine:
 
         def variances(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             here = changed(logs)
-            start = [np.diag(self.model.start(r, here)[1]) for r in picked.records]
-            return self.model.process_noise(here), np.array(start)
+            return self.model.process_noise(here), self.model.start_noise(here)
 
         def slopes(logs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
             """Log-likelihood, its slope in each log level, and the scatter of that."""
@@ -394,7 +453,7 @@ class Engine:
         found = minimize(
             cost, start * scale, jac=True, method="L-BFGS-B",
             bounds=list(zip(lower * scale, upper * scale, strict=True)),
-            options={"maxfun": evaluations, "ftol": 0.2 * tolerance / max(abs(first), 1.0)},
+            options={"maxfun": evaluations, "ftol": 0.5 * tolerance / max(abs(first), 1.0)},
         )  # fmt: skip
         if progress:
             progress(f"noise levels: {found.nfev} evaluations")

@@ -23,6 +23,10 @@ _A = float64[::1]
 _M = float64[:, ::1]
 STEP = types.FunctionType(types.void(_A, _A, float64, _A, _A, _A))
 MEASURE = types.FunctionType(types.void(_A, _A, _A, _A, _A))
+REORDER = {"fastmath": {"reassoc", "contract"}}
+"""Sums may be taken in the order that is fastest."""
+MOST_DECAY = 0.5
+"""Share of a state that may decay in a row for the series of the exponential to be used."""
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -32,7 +36,7 @@ def wrap_angle(angle):
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-@compiled(types.void(_M, _M, _M))
+@compiled(types.void(_M, _M, _M), **REORDER)
 def _product(A, B, out):
     """A B, row by row so that the compiler can use vectors; most of A is zero."""
     n = A.shape[0]
@@ -46,16 +50,63 @@ def _product(A, B, out):
                     out[i, j] += weight * B[a, j]
 
 
+@compiled(**REORDER)
+def _transition(drift, step, exact, x, u, dt, p, work, scale, x_next, x_probe, x_moved, A, AA, F):
+    """Jacobian F of a step at x: the exponential of that of the drift, to third order.
+
+    A step too long for that has its own Jacobian taken, by differences of `step` (x_next at x).
+    """
+    nx = x.size
+    drift(x, u, dt, p, work, x_moved)
+    for i in range(nx):
+        F[i, i] = x_moved[i]  # kept there until A is complete
+    largest = 0.0
+    for j in range(nx):
+        for i in range(nx):
+            x_probe[i] = x[i]
+        x_probe[j] += scale[j]
+        drift(x_probe, u, dt, p, work, x_moved)
+        for i in range(nx):
+            A[i, j] = (x_moved[i] - F[i, i]) / scale[j]
+            if i == j and not exact[i]:
+                largest = max(largest, abs(A[i, j]))
+    if largest > MOST_DECAY:
+        for j in range(nx):
+            for i in range(nx):
+                x_probe[i] = x[i]
+            x_probe[j] += scale[j]
+            step(x_probe, u, dt, p, work, x_moved)
+            for i in range(nx):
+                F[i, j] = (x_moved[i] - x_next[i]) / scale[j]
+        return
+    # F = I + A (I + A/2 (I + A/3)), a row at a time; exact rows are I + A
+    _product(A, A, AA)
+    for i in range(nx):
+        if exact[i]:
+            for j in range(nx):
+                F[i, j] = A[i, j]
+        else:
+            for j in range(nx):
+                F[i, j] = A[i, j] + 0.5 * AA[i, j]
+            for a in range(nx):
+                weight = A[i, a] / 6.0
+                if weight != 0.0:
+                    for j in range(nx):
+                        F[i, j] += weight * AA[a, j]
+        F[i, i] += 1.0
+
+
 @compiled(
     types.Tuple((float64, int64))(
-        STEP, MEASURE, _A, _M, _M, boolean[::1], _A, _M, _A, _A, _A, _A, int64, float64, int64,
-        boolean, _M, _M, float32[:, :, ::1], float32[:, :, ::1], int64[::1], float64[:, :, ::1],
-        float32[:, :, ::1], float32[:, :, ::1],
-    )
+        STEP, MEASURE, STEP, boolean[::1], _A, _M, _M, boolean[::1], _A, _M, _A, _A, _A, _A, int64,
+        float64, int64, boolean, _M, _M, float32[:, :, ::1], float32[:, :, ::1], int64[::1],
+        float64[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], _M,
+    ),
+    **REORDER,
 )  # fmt: skip
 def filter_pass(
-    step, measure, dt, u, z, wraps, x0, P0, R, q, p, scale, work_size, gate, refresh,
-    keep, states, e, K_all, W_all, slots, P_all, H_all, F_all,
+    step, measure, drift, exact, dt, u, z, wraps, x0, P0, R, q, p, scale, work_size, gate, refresh,
+    keep, states, e, K_all, W_all, slots, P_all, H_all, F_all, predicted,
 ):  # fmt: skip
     """Extended Kalman filter over one run.
 
@@ -74,6 +125,7 @@ def filter_pass(
         P_all: (slots, nx, nx), out.
         H_all: (n, m, nx), F_all: (n, nx, nx) Jacobians of the readings and of the step, out; empty:
             not stored.
+        predicted: (n, nx) states before each row's readings, out, stored where H_all is.
 
     Returns:
         log-likelihood (-inf where the filter diverged) and the number of readings beyond the gate.
@@ -90,6 +142,8 @@ def filter_pass(
     h_probe = np.zeros(m)
     H = np.zeros((m, nx))
     F = np.eye(nx)
+    A = np.zeros((nx, nx))
+    AA = np.zeros((nx, nx))
     dt_of_F = -1.0  # step at which F was computed, and the one it is scaled to
     dt_now = -1.0
     HP = np.zeros((m, nx))
@@ -119,6 +173,8 @@ def filter_pass(
             for i in range(m):
                 for j in range(nx):
                     H_all[k, i, j] = H[i, j]
+            for j in range(nx):
+                predicted[k, j] = x[j]
         count = 0
         for i in range(m):
             e[k, i] = np.nan
@@ -222,13 +278,8 @@ def filter_pass(
         step(x, u[k], dt[k], p, work, x_next)
         if fresh or abs(dt[k] - dt_of_F) > 0.5 * dt_of_F:
             dt_of_F = dt_now = dt[k]
-            for j in range(nx):
-                for i in range(nx):
-                    x_probe[i] = x[i]
-                x_probe[j] += scale[j]
-                step(x_probe, u[k], dt[k], p, work, x_moved)
-                for i in range(nx):
-                    F[i, j] = (x_moved[i] - x_next[i]) / scale[j]
+            _transition(drift, step, exact, x, u[k], dt[k], p, work, scale, x_next, x_probe, x_moved,
+                        A, AA, F)  # fmt: skip
         elif dt[k] != dt_now:
             # same Jacobian, other step: rows of slow states follow the step to first order
             ratio = dt[k] / dt_now
@@ -260,7 +311,8 @@ def filter_pass(
     types.void(
         _A, _M, float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1],
         int64[::1], _M, _A,
-    )
+    ),
+    **REORDER,
 )  # fmt: skip
 def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
     """Slope of the log-likelihood in the process noise, by the disturbance smoother, backwards.
@@ -368,7 +420,8 @@ def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
     boolean(
         STEP, MEASURE, _A, _M, _M, boolean[::1], _A, _A, int64,
         float32[:, :, ::1], float32[:, :, ::1], _M,
-    )
+    ),
+    **REORDER,
 )  # fmt: skip
 def mean_pass(step, measure, dt, u, z, wraps, x0, p, work_size, K_all, W_all, e):
     """Whitened innovations (n, m) of the mean with the gains of a filter pass; 0 where missing.
@@ -401,6 +454,99 @@ def mean_pass(step, measure, dt, u, z, wraps, x0, p, work_size, K_all, W_all, e)
             for j in range(nx):
                 x[j] = x_next[j]
     return True
+
+
+@compiled(
+    types.void(
+        STEP, MEASURE, _A, float64[:, :, ::1], int64[::1], _M, _M, _M, _A, _M, _A, boolean[::1],
+        boolean[::1], int64,
+        float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1],
+        float64[:, :, ::1],
+    ),
+    **REORDER,
+)  # fmt: skip
+def signature_pass(
+    drift, measure, dt, u_sets, u_of, predicted, states, e, p, moved, steps, reading_only, exact,
+    work_size, K_all, W_all, H_all, F_all, J,
+):  # fmt: skip
+    """Derivatives of the whitened innovations in many parameters at once, gains frozen.
+
+    What `mean_pass` gives with a parameter moved a little, to first order: with s the state's
+    derivative, and b what the parameter adds to the state over a row,
+
+        dh = H s + dh/dp,   s -= K dh,   s <- F (s + b/2) + b/2
+
+    where `measure` at the predicted state gives dh/dp and `drift` at the filtered one b (Maine and
+    Iliff 1985, the sensitivity equations). A state that the drift takes exactly becomes F s + b.
+
+    Args:
+        u_sets: (sets, n, nu) inputs, the first those of `p`; u_of: (k,) which of them a parameter has.
+        predicted, states, e: of the filter pass. p: parameters; moved: (k, np) those with one moved,
+            steps: (k,) by how much. reading_only: (k,) those that add nothing to the state.
+        K_all, W_all, H_all, F_all: of the filter pass.
+        J: (n, m, k) derivatives, out; 0 where a reading is missing.
+    """
+    n, m, k_all = J.shape
+    nx = exact.size
+    work = np.zeros(work_size)
+    per_step = 1.0 / steps
+    x_base = np.zeros(nx)
+    x_here = np.zeros(nx)
+    h_base = np.zeros(m)
+    h_here = np.zeros(m)
+    b = np.zeros((nx, k_all))
+    dh = np.zeros((m, k_all))
+    s = np.zeros((nx, k_all))
+    half = np.zeros((nx, k_all))
+    before = np.zeros((nx, k_all))
+    for row in range(n):
+        measure(predicted[row], u_sets[0, row], p, work, h_base)
+        drift(states[row], u_sets[0, row], dt[row], p, work, x_base)
+        for k in range(k_all):
+            measure(predicted[row], u_sets[u_of[k], row], moved[k], work, h_here)
+            for i in range(m):
+                dh[i, k] = (h_here[i] - h_base[i]) * per_step[k]
+            if not reading_only[k] and row < n - 1:
+                drift(states[row], u_sets[u_of[k], row], dt[row], moved[k], work, x_here)
+                for i in range(nx):
+                    b[i, k] = (x_here[i] - x_base[i]) * per_step[k]
+        for i in range(m):
+            for k in range(k_all):
+                J[row, i, k] = 0.0
+            if not math.isnan(e[row, i]):
+                for j in range(nx):
+                    weight = float64(H_all[row, i, j])
+                    if weight != 0.0:
+                        for k in range(k_all):
+                            dh[i, k] += weight * s[j, k]
+        for i in range(m):
+            if not math.isnan(e[row, i]):
+                for a in range(i, m):
+                    weight = float64(W_all[row, i, a])
+                    if weight != 0.0:
+                        for k in range(k_all):
+                            J[row, a, k] -= weight * dh[i, k]
+                for j in range(nx):
+                    weight = float64(K_all[row, i, j])
+                    if weight != 0.0:
+                        for k in range(k_all):
+                            s[j, k] -= weight * dh[i, k]
+        if row == n - 1:
+            break
+        for j in range(nx):
+            for k in range(k_all):
+                half[j, k] = s[j, k] + 0.5 * b[j, k]
+                before[j, k] = s[j, k]
+        for i in range(nx):
+            source = before if exact[i] else half
+            own = 1.0 if exact[i] else 0.5
+            for k in range(k_all):
+                s[i, k] = own * b[i, k]
+            for j in range(nx):
+                weight = float64(F_all[row, i, j])
+                if weight != 0.0:
+                    for k in range(k_all):
+                        s[i, k] += weight * source[j, k]
 
 
 @compiled(boolean(STEP, MEASURE, _A, _M, _A, _A, int64, int64, int64[::1], _A))

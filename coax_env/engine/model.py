@@ -12,7 +12,7 @@ class FreeParameter:
     """A number the engine may change.
 
     ``value`` is the prior's mean and ``std`` its width; ``probe`` the finite step used for its
-    signature (0: a small one, for the derivative).
+    signature (0: a small one, for the derivative). ``reading_only``: it never moves the state.
     """
 
     name: str
@@ -21,6 +21,7 @@ class FreeParameter:
     lower: float = -np.inf
     upper: float = np.inf
     probe: float = 0.0
+    reading_only: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,8 @@ class Model(Protocol):
     state_scale: np.ndarray  # (nx,) size of a small change of each state, for derivatives
     step: Any  # compiled pointer: (x, u, dt, p, work, out)
     measure: Any  # compiled pointer: (x, u, p, work, out)
+    drift: Any  # compiled pointer: (x, u, dt, p, work, out): what a row adds, roughly
+    exact: np.ndarray  # (nx,) True where `drift` is more than first order in dt
     work_size: int
 
     def vector(self, values: Mapping[str, float]) -> np.ndarray:
@@ -69,8 +72,11 @@ class Model(Protocol):
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """Inputs (n, nu) of the compiled functions, row by row."""
 
-    def start(self, record: Record, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+    def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """First state (nx,) and its covariance (nx, nx), from the record's first readings."""
+
+    def start_noise(self, noise: Noise) -> np.ndarray:
+        """What the noise levels add to the variances of the first state (nx,)."""
 
     def process_noise(self, noise: Noise) -> np.ndarray:
         """Growth of each state's variance per second (nx,)."""

@@ -131,9 +131,10 @@ def expected_evidence(
 ) -> dict[str, float | None]:
     """Nats each hidden effect should be worth on the runs that are fitted, from no residual.
 
-    Half theta' S theta less the Occam factor: S is the information of the effect's parameters at
-    their true values on this flight's commands, with the generator's noise, the base parameters
-    (under their priors) and the other hidden effects projected out. None: not in the catalogue.
+    Half theta' S theta less the Occam factor: S is the information of the effect's parameters on this
+    flight's commands, with the generator's noise, the base parameters (under their priors) and the
+    other hidden effects projected out; taken at half the effect's size, which is the midpoint rule for
+    what its whole size does. None: not in the catalogue.
     """
     values = catalogue_values(truth["values"])
     listed = [e for e in truth["hidden"] if e in CATALOGUE]
@@ -143,13 +144,20 @@ def expected_evidence(
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     model = HeliModel(vehicle)
     noise = starting_noise(flight, vehicle)
-    levels = {**noise.process, **(GUSTS if planned.gusts else noise.floor)}
+    levels = {**noise.process, **noise.floor}
+    if planned.gusts:
+        levels |= GUSTS  # the model's are what shakes the vehicle as its file has it
+        heavier = 1.0 + values.get("added_mass.mass", 0.0) / vehicle["mass"].value
+        levels["force_xy"] /= heavier
+        levels["force_z"] /= heavier
+        levels["moment_z"] /= 1.0 + values.get("yaw_inertia.scale", 0.0)
     noise = replace(noise, process=levels)
     engine = Engine(model, _records(flight, held, within=False))
     search = Search(engine, model, tuple(listed))
-    at = {**model.bare_values, "gust_memory": levels["memory"], **values}
-    _, quadratic = search.linearise(State(listed, at, noise))
     for effect in listed:
+        own = {name: 0.5 * values[name] for name in search.candidate_names(effect)}
+        at = {**model.bare_values, "gust_memory": levels["memory"], **values, **own}
+        _, quadratic = search.linearise(State(listed, at, noise))
         result[effect] = _worth(search, quadratic, listed, effect, values)
     return result
 
