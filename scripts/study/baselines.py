@@ -25,7 +25,7 @@ from coax_env.effects import CATALOGUE
 from coax_env.engine.fit import Engine, RunPass
 from coax_env.engine.model import FreeParameter
 from coax_env.flight import Flight
-from coax_env.heli_model import HeliModel, record_of, starting_noise
+from coax_env.heli_model import GUST_LEVELS, HeliModel, record_of, starting_noise
 from coax_env.jit import compiled
 from coax_env.layout import (
     CHANNELS,
@@ -37,7 +37,7 @@ from coax_env.layout import (
     ROTOR_SPEED,
     SWASH,
 )
-from coax_env.search import Search
+from coax_env.search import GLANCE, PROMISE
 from coax_env.vehicle import load_vehicle
 from study.judge import tied
 
@@ -84,11 +84,11 @@ def regression(flight: Flight) -> tuple[np.ndarray, np.ndarray, dict[str, list[i
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     model = HeliModel(vehicle)
     engine = Engine(model, [record_of(run) for run in flight.runs])
-    search = Search(engine, model, tuple(CATALOGUE))
-    state = search.begin(starting_noise(flight, vehicle))
-    bare = {**model.bare_values, "gust_memory": state.noise.process["memory"]}
-    passes = engine.filter(bare, state.noise)
-    free = [f for effect in CATALOGUE for f in search.by_effect[effect]]
+    noise = starting_noise(flight, vehicle)
+    bare = {**model.bare_values, "gust_memory": noise.process["memory"]}
+    noise = engine.fit_noise(bare, noise, GUST_LEVELS, 10, tolerance=PROMISE, seconds=GLANCE)
+    passes = engine.filter(bare, noise)
+    free = [f for effect in CATALOGUE for f in model.effect_parameters(effect)]
     blocks, targets = [], []
     for run in passes:
         columns = [_regressor(model, run, bare, f) for f in free]
