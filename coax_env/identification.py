@@ -1,13 +1,15 @@
-"""Identification: the vehicle's own numbers from flight data, by maximum likelihood under priors.
+"""Identification: the vehicle's own numbers from flight data, by one of two methods.
 
-The same engine as in the diagnosis, with the base parameters (and the effects the vehicle already
-has) free and nothing else. Priors are the file's values with their std. The result is a vehicle file
-that `gymnasium.make("CoaxHeli-v0", vehicle=...)` takes as it is.
+"paper" is the two steps of the paper's section V (two_step/). "ml" is maximum likelihood on the full
+model under priors: the same engine as in the diagnosis, with the base parameters (and the effects
+the vehicle already has) free and nothing else. Priors are the file's values with their std. The
+result is a vehicle file that `gymnasium.make("CoaxHeli-v0", vehicle=...)` takes as it is.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal, overload
 
 from coax_env.diagnosis import double_counting, fitted_vehicle, median_step, with_timing
 from coax_env.engine.fit import Engine, Estimate
@@ -16,6 +18,7 @@ from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight
 from coax_env.heli_model import GUST_LEVELS, HeliModel, record_of, starting_noise
 from coax_env.prediction import RunReplay, fly_again
+from coax_env.two_step.method import TwoStep, two_step
 from coax_env.vehicle import Vehicle, load_vehicle
 
 METHODS = ("ml", "paper")
@@ -37,24 +40,51 @@ class Identification:
     remarks: tuple[str, ...]
 
 
+@overload
+def identify(
+    flight: Flight | str | Path,
+    vehicle: Vehicle | str | Path | None = None,
+    method: Literal["ml"] = "ml",
+    progress: Progress | None = None,
+) -> Identification: ...
+
+
+@overload
+def identify(
+    flight: Flight | str | Path,
+    vehicle: Vehicle | str | Path | None = None,
+    *,
+    method: Literal["paper"],
+    progress: Progress | None = None,
+) -> TwoStep: ...
+
+
+@overload
 def identify(
     flight: Flight | str | Path,
     vehicle: Vehicle | str | Path | None = None,
     method: str = "ml",
     progress: Progress | None = None,
-) -> Identification:
+) -> Identification | TwoStep: ...
+
+
+def identify(
+    flight: Flight | str | Path,
+    vehicle: Vehicle | str | Path | None = None,
+    method: str = "ml",
+    progress: Progress | None = None,
+) -> Identification | TwoStep:
     """Fit a vehicle's numbers to a flight.
 
     Args:
         flight: a Flight or its folder. vehicle: a Vehicle, name or path; default the card's.
-        method: "ml", maximum likelihood on the full model.
+        method: "ml", maximum likelihood on the full model; "paper", its two steps.
+
+    Raises:
+        InputError: no such method, nothing to identify, or sensors missing that the method needs.
     """
     if method not in METHODS:
         raise InputError(f"no method {method!r}; there are {', '.join(METHODS)}")
-    if method == "paper":
-        raise InputError(
-            "method 'paper' (two steps, section V of the paper) is not built yet: use ml"
-        )
 
     def say(text: str) -> None:
         if progress:
@@ -62,6 +92,10 @@ def identify(
 
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    if method == "paper":
+        result = two_step(flight, vehicle, progress=say)
+        known = (*flight.notes, *double_counting(flight, vehicle))
+        return replace(result, remarks=(*known, *result.remarks))
     model = HeliModel(vehicle)
     engine = Engine(model, [record_of(run) for run in flight.runs])
     free = free_parameters(model)

@@ -9,6 +9,7 @@ import command_line
 from coax_env import report
 from coax_env.files import staged_folder, write_text
 from coax_env.identification import METHODS, identify
+from coax_env.two_step.method import TwoStep
 from coax_env.vehicle import vehicle_toml
 
 
@@ -21,16 +22,20 @@ def main() -> None:
 
     with command_line.progress("identification") as say:
         result = identify(options.flight, options.vehicle, options.method, say)
-    page = report.identification_page(
-        result.before,
-        result.after,
-        result.fitted,
-        flight=result.flight,
-        replay_before=result.replay_before,
-        replay_after=result.replay_after,
-        remarks=result.remarks,
-        command_line="scripts/identify.py " + shlex.join(sys.argv[1:]),
-    )
+    command = "scripts/identify.py " + shlex.join(sys.argv[1:])
+    if isinstance(result, TwoStep):
+        page = report.two_step_page(result, command)
+    else:
+        page = report.identification_page(
+            result.before,
+            result.after,
+            result.fitted,
+            flight=result.flight,
+            replay_before=result.replay_before,
+            replay_after=result.replay_after,
+            remarks=result.remarks,
+            command_line=command,
+        )
     with staged_folder(options.out) as folder:
         write_text(folder / "vehicle.toml", vehicle_toml(result.after))
         write_text(folder / "report.html", page)

@@ -5,6 +5,7 @@ from coax_env.report.identification import identification_page
 from coax_env.report.page import Section, page
 from coax_env.report.replay import replay_page
 from coax_env.report.simulation import DOUBLET_HEADER, doublet_rows, simulation_page
+from coax_env.report.two_step import two_step_page
 
 __all__ = [
     "DOUBLET_HEADER",
@@ -17,4 +18,5 @@ __all__ = [
     "page",
     "replay_page",
     "simulation_page",
+    "two_step_page",
 ]

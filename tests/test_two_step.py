@@ -1,0 +1,409 @@
+"""The paper's own method: what its filters, states and regressions must give is known beforehand.
+
+Closed forms for the filters, simulated truth for the states, planted coefficients and the coverage
+of their intervals for the regressions, and what design/paper.md found in Table VIII.
+"""
+
+import gymnasium
+import numpy as np
+import pytest
+from scipy.signal import butter, sosfiltfilt
+from scipy.stats import binom
+
+from coax_env import identify, load_vehicle, simulate
+from coax_env.errors import InputError
+from coax_env.files import write_text
+from coax_env.simulation import fly_all
+from coax_env.two_step import modes
+from coax_env.two_step.modes import MODES, PHYSICS, fit_mode, fit_physics, joined, rows_of
+from coax_env.two_step.processing import (
+    even_grid,
+    integrated,
+    lagrange_derivative,
+    low_pass,
+    spectral_amplitude_filter,
+)
+from coax_env.two_step.published import direction, lift_artefact, predicted, table_viii
+from coax_env.two_step.reconstruction import BIAS, THETA, H, W, flapping, longitudinal
+from coax_env.two_step.regression import (
+    collinearity,
+    least_squares,
+    total_least_squares,
+)
+from coax_env.vehicle import vehicle_toml
+
+LAMA = load_vehicle("lama400d")
+DEGREE = np.pi / 180.0
+NOISE = {"p": 2 * DEGREE, "q": 2 * DEGREE, "r": 2 * DEGREE, "ax": 0.1, "ay": 0.1, "az": 0.1,
+         "h": 0.05, "rpm_upper": 2.0, "rpm_lower": 2.0}  # fmt: skip
+
+
+# --- filters --------------------------------------------------------------------------------------
+
+
+def test_the_low_pass_keeps_phase_and_takes_off_what_is_fast():
+    t = np.arange(0.0, 10.0, 0.01)
+    slow, fast = np.sin(2 * np.pi * 0.7 * t), np.sin(2 * np.pi * 20.0 * t)
+    kept = low_pass(slow + fast, 0.01)[200:-200]
+    np.testing.assert_allclose(kept, slow[200:-200], atol=2e-3)
+    # half power twice, forwards and backwards, at the cut-off
+    edge = low_pass(np.sin(2 * np.pi * 5.0 * t), 0.01)[200:-200]
+    assert np.sqrt(2.0) * edge.std() == pytest.approx(0.5, abs=0.01)
+
+
+def test_the_low_pass_refuses_what_it_cannot_do():
+    with pytest.raises(InputError, match="readings a second"):
+        low_pass(np.zeros(100), 0.2)
+    with pytest.raises(InputError, match="too short"):
+        low_pass(np.zeros(10), 0.01)
+
+
+def test_the_lagrange_derivative_is_exact_for_a_cubic_and_of_third_order_or_more():
+    t = np.linspace(0.0, 1.0, 23)
+    y = 2.0 - t + 3.0 * t**2 - 0.7 * t**3
+    np.testing.assert_allclose(
+        lagrange_derivative(y, t[1]), -1.0 + 6.0 * t - 2.1 * t**2, atol=1e-11
+    )
+    errors = []
+    for n in (50, 100, 200):
+        t = np.linspace(0.0, 2.0, n + 1)
+        errors.append(np.abs(lagrange_derivative(np.sin(3 * t), t[1]) - 3 * np.cos(3 * t)).max())
+    assert np.log2(errors[0] / errors[1]) > 2.8 and np.log2(errors[1] / errors[2]) > 2.8
+
+
+def test_the_spectral_filter_leaves_a_record_alone_where_there_is_no_noise():
+    rng = np.random.default_rng(0)
+    y = np.cumsum(rng.standard_normal(1234)) + 50.0
+    np.testing.assert_allclose(spectral_amplitude_filter(y, np.zeros(300), 0.01), y, atol=1e-9)
+
+
+def test_the_spectral_filter_takes_off_noise_and_leaves_no_steps():
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 12.0, 0.01)
+    motion = 2.0 * np.sin(2 * np.pi * 0.5 * t) - 9.8
+    y = motion + 0.4 * rng.standard_normal(t.size)
+    found = spectral_amplitude_filter(y, 0.4 * rng.standard_normal(600), 0.01)
+    inside = slice(100, -100)
+    assert np.std((found - motion)[inside]) < 0.6 * 0.4
+    jumps = np.abs(np.diff(found))[inside]
+    edges = jumps[::50]  # where segments begin and end
+    assert edges.mean() < 1.5 * jumps.mean()
+
+
+def test_integrating_the_imu_gives_the_flown_path():
+    """The paper's own check, on a doublet without noise: attitude, velocity and height come back."""
+    flight = simulate(LAMA, "lon_doublet", sensors="state")
+    (track,) = fly_all(LAMA, "lon_doublet")
+    dt, _, c = even_grid(flight.runs[0], ("q", "ax", "az", "h"))
+    path = integrated(c["q"], c["ax"], c["az"], dt, LAMA["gravity"].value, c["h"][0])
+    truth = track.state
+    for name, column, within in (("theta", 11, 2e-3), ("u", 0, 0.02), ("w", 2, 0.03)):
+        assert np.abs(path[name] - truth[: len(path[name]), column]).max() < within, name
+    assert np.abs(path["h"] - c["h"]).max() < 0.1
+
+
+# --- step 1 ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def doublets():
+    """Twelve of the paper's doublets with Table V noise and a bias of -0.05 m/s2, reconstructed."""
+    found = []
+    for seed in range(12):
+        (run,) = simulate(LAMA, "lon_doublet", sensors="paper", seed=seed).runs
+        (track,) = fly_all(LAMA, "lon_doublet", seed=seed)
+        dt, _, c = even_grid(run, ("q", "ax", "az"))
+        states = longitudinal(
+            c["q"], c["ax"], c["az"] - 0.05, run.measured["h"], dt, 9.804, (2 * DEGREE, 0.1, 0.05)
+        )
+        found.append((states, track.state[: len(c["q"])]))
+    return found
+
+
+def test_the_bias_converges_to_what_was_planted(doublets):
+    """-0.05 m/s2 as in the paper, within its std (both tails of a chi square over twelve flights)."""
+    z = np.array([(s.states[-1, BIAS] + 0.05) / s.std[-1, BIAS] for s, _ in doublets])
+    assert 4.4 < np.sum(z**2) < 23.4, z  # 95 % of chi square with 12 degrees
+    assert all(s.std[-1, BIAS] < 0.006 for s, _ in doublets)
+
+
+def test_height_is_within_a_tenth_of_a_metre(doublets):
+    for states, truth in doublets:
+        assert np.abs(states.states[100:, H] + truth[100:, 15]).max() < 0.1
+        assert (
+            np.abs(low_pass(states.residual, 0.01)[50:-50]).max() < 0.1
+        )  # filtered, as the paper's
+        assert np.nanstd(states.residual) == pytest.approx(0.05, rel=0.12)
+
+
+def test_the_states_scatter_as_their_std_says(doublets):
+    for column, own in ((THETA, 11), (1, 0), (W, 2)):
+        z = np.concatenate(
+            [
+                (s.smoothed[200::100, column] - truth[200::100, own])
+                / s.smoothed_std[200::100, column]
+                for s, truth in doublets
+            ]
+        )
+        assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4, column
+
+
+def test_the_smoother_knows_more_and_the_speed_is_dead_reckoned(doublets):
+    for states, _ in doublets:
+        assert np.all(states.smoothed_std <= states.std + 1e-12)
+        assert states.std[-1, 1] > 2.0 * states.std[100, 1]
+
+
+def test_flapping_follows_its_closed_form():
+    dt, tau, gain = 0.01, 0.05, 0.91
+    t = dt * np.arange(200)
+    tilt = np.where(t >= 0.5, 0.1, 0.0)
+    found = flapping(np.zeros(200), tilt, dt, tau, gain)
+    np.testing.assert_allclose(
+        found, np.where(t > 0.5, gain * 0.1 * (1.0 - np.exp(-(t - 0.5) / tau)), 0.0), atol=1e-12
+    )
+    turning = flapping(np.full(200, 0.3), 0.0, dt, tau, gain)
+    np.testing.assert_allclose(turning, -0.3 * tau * (1.0 - np.exp(-t / tau)), atol=2e-3)
+
+
+# --- regressions ----------------------------------------------------------------------------------
+
+TRUE = np.array([1.0, 2.0, -0.5])
+LOWER = np.array([[0.3, 0.0, 0.0], [0.1, 0.3, 0.0], [0.05, 0.0, 0.4]])
+
+
+def noisy_rows(seed: int, n: int, filtered: bool):
+    """Slow regressors with correlated errors in them and in y; low-passed or not."""
+    rng = np.random.default_rng(seed)
+    slow = butter(2, 1.5, fs=100.0, output="sos")
+    clean = sosfiltfilt(slow, rng.standard_normal((n, 2)), axis=0)
+    clean /= clean.std(0)
+    errors = rng.standard_normal((n, 3)) @ LOWER.T
+    if filtered:
+        errors = low_pass(errors, 0.01)
+    X = np.column_stack([np.ones(n), clean + errors[:, :2]])
+    return X, TRUE[0] + clean @ TRUE[1:] + errors[:, 2]
+
+
+def total(X, y):
+    return total_least_squares(X, y, "abc", LOWER @ LOWER.T, (True, False, False))
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_total_least_squares_is_unbiased_and_covers(filtered):
+    """95 % intervals cover, also where the rows are not independent; least squares is biased."""
+    fits = [total(*noisy_rows(seed, 2000, filtered)) for seed in range(200)]
+    mean = np.mean([f.values for f in fits], axis=0)
+    np.testing.assert_allclose(mean, TRUE, atol=0.01)
+    inside = sum(
+        int(low < true < high)
+        for f in fits
+        for (low, high), true in zip(f.interval(), TRUE, strict=True)
+    )
+    assert binom.ppf(1e-4, 600, 0.93) <= inside, inside / 600
+    plain = np.mean(
+        [least_squares(*noisy_rows(s, 2000, filtered), "abc").values for s in range(20)], 0
+    )
+    assert abs(plain[1] - TRUE[1]) > (0.1 if not filtered else 0.01)
+
+
+def test_total_least_squares_is_the_singular_vector_where_all_is_noisy_alike():
+    rng = np.random.default_rng(2)
+    X = rng.standard_normal((500, 2)) @ np.array([[2.0, 0.3], [0.0, 1.0]])
+    y = X @ [1.0, -2.0] + 0.1 * rng.standard_normal(500)
+    found = total_least_squares(X, y, "ab", np.eye(3), (False, False))
+    vector = np.linalg.svd(np.column_stack([X, y]))[2][-1]
+    np.testing.assert_allclose(found.values, -vector[:2] / vector[2], rtol=1e-9)
+
+
+def test_exact_columns_make_it_least_squares():
+    X, y = noisy_rows(0, 300, False)
+    found = total_least_squares(X, y, "abc", np.eye(1), (True, True, True))
+    np.testing.assert_allclose(found.values, np.linalg.lstsq(X, y, rcond=None)[0], rtol=1e-10)
+
+
+def test_scaling_a_column_scales_its_coefficient():
+    X, y = noisy_rows(3, 500, False)
+    units = np.array([1.0, 100.0, 0.01])
+    errors = LOWER @ LOWER.T
+    unit = np.array([100.0, 0.01, 1.0])
+    scaled = total_least_squares(
+        X * units, y, "abc", errors * np.outer(unit, unit), (True, False, False)
+    )
+    plain = total(X, y)
+    np.testing.assert_allclose(scaled.values * units, plain.values, rtol=1e-6)
+    np.testing.assert_allclose(scaled.std * units, plain.std, rtol=1e-6)
+
+
+def test_without_excitation_it_is_not_trusted():
+    rng = np.random.default_rng(4)
+    X = np.column_stack([np.ones(400), 0.1 * rng.standard_normal((400, 2)) @ LOWER[:2, :2].T])
+    X[:, 1:] += rng.standard_normal((400, 2)) @ LOWER[:2, :2].T
+    y = rng.standard_normal(400)
+    assert not total(X, y).trusted
+    assert total(*noisy_rows(0, 1000, False)).trusted
+
+
+def test_collinearity_is_named_in_words():
+    rng = np.random.default_rng(5)
+    a, b, c = rng.standard_normal((3, 1000))
+    X = np.column_stack([a, 0.5 * a + 0.01 * b, c])
+    found = collinearity(X, ("alpha", "delta", "q"))
+    assert found.inflation["alpha"] > 1000.0 and found.inflation["q"] < 5.0
+    assert len(found.directions) == 1
+    assert found.directions[0].words() in ("alpha - 2 delta", "delta - 0.5 alpha")
+
+
+# --- step 2 on simulated flights ------------------------------------------------------------------
+
+
+def fits_of(flight, vehicle=LAMA):
+    parts = {run.name: rows_of(run, vehicle, NOISE, 5.0, k) for k, run in enumerate(flight.runs)}
+    fits = [fit_mode(mode, flight.runs, parts, vehicle) for mode in MODES]
+    return {fit.mode.name: fit for fit in fits if fit is not None}
+
+
+def test_coefficients_of_the_doublet_are_those_of_the_physics():
+    """Paper's tables, Table V noise: forces within 3 std; the moment only with the missing p term."""
+    beyond = misses = 0
+    for seed in range(6):
+        fits = fits_of(simulate(LAMA, "lon_doublet", sensors="paper", seed=seed))
+        assert set(fits) == {"longitudinal force", "vertical force", "pitching moment"}
+        for name in ("longitudinal force", "vertical force"):
+            fit = fits[name]
+            z = (fit.total.values - [fit.expected[n] for n in fit.total.names]) / fit.total.std
+            beyond += int(np.sum(np.abs(z) > 3.0))
+        moment = fits["pitching moment"]
+        assert moment.completed is not None
+        for regression, count in ((moment.completed, False), (moment.total, True)):
+            z = (
+                regression.values - [moment.expected[n] for n in regression.names]
+            ) / regression.std
+            if count:
+                misses += int(np.sum(np.abs(z) > 3.0))
+            else:
+                beyond += int(np.sum(np.abs(z) > 3.0))
+    assert beyond <= 1  # of 96
+    assert misses >= 6  # the paper's form is wrong, and the std shows it
+
+
+def test_the_doublet_ties_what_equation_26_ties():
+    """Noise-free, unfiltered, as in design/paper.md: 33, 24, 8, 1.5; and the cost of no p term."""
+    (run,) = simulate(LAMA, "lon_doublet", sensors="state").runs
+    dt, t, signals = even_grid(run, modes.IMU)
+    columns = modes._columns(signals, run.command[: len(t)], dt, LAMA)
+    names = ("alpha_u", "alpha_l", "q", "delta_lon")
+    tied = collinearity(np.column_stack([columns[n] for n in names]), names)
+    expected = {"alpha_l": 33.0, "delta_lon": 24.0, "alpha_u": 8.0, "q": 1.5}
+    for name, value in expected.items():
+        assert tied.inflation[name] == pytest.approx(value, rel=0.1), name
+    weak = dict(zip(tied.directions[0].names, tied.directions[0].weights, strict=True))
+    assert weak["delta_lon"] / weak["alpha_l"] == pytest.approx(-0.8, abs=0.15)
+
+    def regressed(*regressors: str):
+        X = np.column_stack([columns[n] for n in ("1", *regressors)])
+        fit = least_squares(X, columns["C_m"], ("1", *regressors))
+        left = fit.residual.var() / columns["C_m"].var()
+        return dict(zip(fit.names, fit.values, strict=True))["alpha_l"], left
+
+    without, left = regressed(*names)
+    assert without == pytest.approx(0.0027, abs=2e-4) and left == pytest.approx(0.31, abs=0.03)
+    completed, left = regressed(*names, "p")
+    assert completed == pytest.approx(0.0048, abs=1e-4) and left < 0.01
+
+
+PLANTED = {
+    "thrust_coefficient_upper": 1.03, "thrust_coefficient_lower": 0.97,
+    "torque_coefficient_upper": 0.97, "torque_coefficient_lower": 1.02,
+    "inertia_yy": 1.08, "inertia_xx": 0.93,
+}  # fmt: skip
+
+
+def planted_flight(seed: int):
+    truth = LAMA.with_values({n: f * LAMA[n].value for n, f in PLANTED.items()})
+    runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "differential_rpm", "hover")
+    return simulate(truth, runs, seed=seed), truth
+
+
+def test_a_planted_vehicle_comes_back_and_flies(tmp_path):
+    flight, truth = planted_flight(1)
+    result = identify(flight, LAMA, method="paper")
+    assert set(result.fitted) == set(PLANTED)
+    for name in PLANTED:
+        new, old = result.after[name], LAMA[name]
+        assert abs(new.value - truth[name].value) < 3.0 * new.std, name
+        assert new.std < old.std and "two steps" in new.source
+    write_text(tmp_path / "vehicle.toml", vehicle_toml(result.after))
+    again = load_vehicle(tmp_path / "vehicle.toml")
+    assert again.values() == pytest.approx(result.after.values(), rel=1e-6)
+    env = gymnasium.make("CoaxHeli-v0", vehicle=str(tmp_path / "vehicle.toml"))
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+
+
+def test_pooled_regressions_are_one_where_the_file_is_right():
+    """Mean over flights of each factor, and the scatter that its std promises."""
+    z = []
+    for seed in range(6):
+        flight = simulate(
+            LAMA, ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "differential_rpm"), seed=seed
+        )
+        for physics in PHYSICS:
+            used = [
+                run for run in flight.runs
+                if any(modes.stir(run, axis) > modes.STIR[axis] for axis in physics.axes)
+            ]  # fmt: skip
+            rows = joined([rows_of(run, LAMA, NOISE, 5.0, k) for k, run in enumerate(used)])
+            fit = fit_physics(physics, rows)
+            assert fit is not None
+            index = [fit.names.index(n) for n in physics.regressors]
+            z.extend((fit.values[index] - 1.0) / fit.std[index])
+    assert 0.4 < np.sqrt(np.mean(np.square(z))) < 1.4
+    assert np.abs(z).max() < 3.5
+
+
+def test_a_flight_without_an_imu_is_refused_in_words():
+    flight = simulate(LAMA, "hover", sensors="paper")
+    run = flight.runs[0]
+    blind = {c: v for c, v in run.measured.items() if c not in ("q", "ax")}
+    with pytest.raises(InputError, match="gyros and accelerometers"):
+        identify(
+            type(flight)(flight.vehicle, (type(run)(run.name, run.t, run.command, blind),)),
+            method="paper",
+        )
+
+
+def test_a_hover_moves_nothing_and_says_so():
+    result = identify(simulate(LAMA, "hover", sensors="paper"), method="paper")
+    assert result.modes == () and result.physical == ()
+    assert sum("no run moves" in remark for remark in result.remarks) == 4
+    assert result.after.values() == LAMA.values()
+
+
+# --- Table VIII -----------------------------------------------------------------------------------
+
+
+def test_the_published_table_shares_one_direction():
+    ties = direction(table_viii())
+    deltas = [delta for delta, _ in ties.values()]
+    np.testing.assert_allclose(deltas, [-0.915, -0.886, -0.930], atol=5e-4)
+    assert np.mean([q for _, q in ties.values()]) == pytest.approx(0.14, abs=0.01)
+
+
+def test_the_papers_own_tables_predict_something_else():
+    theory = predicted(LAMA)
+    assert theory["C_X"]["alpha_l"] == pytest.approx(-0.0115, abs=1e-4)
+    assert theory["C_m"]["alpha_l"] == pytest.approx(0.0048, abs=1e-4)
+    assert theory["C_Z"]["T_l"] == pytest.approx(0.0033, abs=1e-4)
+    assert theory["C_Z"]["T_u"] == pytest.approx(-0.0026, abs=1e-4)
+    assert theory["C_Z"]["1"] == pytest.approx(0.0259, abs=3e-4)
+    for row in table_viii():
+        away = abs(row.values["alpha_l"] - theory[row.response]["alpha_l"]) / row.std["alpha_l"]
+        assert away > 15.0
+
+
+def test_the_published_lift_row_comes_from_dividing_by_the_rotor_speed():
+    found = lift_artefact(LAMA)
+    assert found["1"] == pytest.approx(0.0515, abs=1e-3)
+    assert found["T_l"] == pytest.approx(0.0, abs=1e-4)
+    assert found["T_u"] == pytest.approx(-0.0059, abs=2e-4)
