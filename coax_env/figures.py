@@ -448,3 +448,51 @@ def parameter_moves(moves: Mapping[str, tuple[float, float]]) -> Figure:
         yaxis={"ticklabelstandoff": 6},
         shapes=[band],
     )
+
+
+def repeatability(
+    joint: Mapping[str, tuple[float, float]],
+    runs: Mapping[str, Mapping[str, tuple[float, float]]],
+) -> Figure:
+    """Each parameter as each run alone has it, in percent of the joint estimate.
+
+    Args:
+        joint: parameter -> value and std of all runs together. runs: run -> the same, where it tells.
+    """
+    names = [n for n in joint if any(n in found for found in runs.values())][::-1]
+    place = {name: k for k, name in enumerate(names)}
+    data = []
+    for k, (run, found) in enumerate(runs.items()):
+        told = [n for n in names if n in found]
+        aside = 0.6 * ((k + 0.5) / len(runs) - 0.5)
+        percent = [100.0 / abs(joint[n][0]) for n in told]
+        dots = {
+            "type": "scatter", "mode": "markers", "name": run,
+            "marker": {"color": WHEEL[k % len(WHEEL)], "size": 6, "symbol": k // len(WHEEL)},
+            "x": [(found[n][0] - joint[n][0]) * p for n, p in zip(told, percent, strict=True)],
+            "y": [place[n] + aside for n in told],
+            "error_x": {
+                "type": "data", "thickness": 1, "width": 0,
+                "array": [found[n][1] * p for n, p in zip(told, percent, strict=True)],
+            },
+            "customdata": told,
+            "hovertemplate": "%{customdata}: %{x:+.1f} %",
+        }  # fmt: skip
+        data.append(dots)
+    bands = [
+        {
+            "type": "rect", "xref": "x", "yref": "y", "fillcolor": NOISE, "opacity": 0.2,
+            "line": {"width": 0}, "y0": place[n] - 0.4, "y1": place[n] + 0.4,
+            "x0": -100.0 * joint[n][1] / abs(joint[n][0]),
+            "x1": 100.0 * joint[n][1] / abs(joint[n][0]),
+        }
+        for n in names
+    ]  # fmt: skip
+    return _figure(
+        data,
+        120 + 46 * max(len(names), 2),
+        hovermode="closest",
+        xaxis={"title": {"text": "from the joint estimate [%] (green: its std)"}},
+        yaxis={"tickvals": list(range(len(names))), "ticktext": names, "zeroline": False},
+        shapes=bands,
+    )

@@ -6,28 +6,63 @@ the vehicle already has) free and nothing else. Priors are the file's values wit
 result is a vehicle file that `gymnasium.make("CoaxHeli-v0", vehicle=...)` takes as it is.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, overload
 
+import numpy as np
+
 from coax_env.diagnosis import double_counting, fitted_vehicle, median_step, with_timing
-from coax_env.engine.fit import Engine, Estimate
+from coax_env.effects import CATALOGUE
+from coax_env.engine.fit import Engine, Estimate, Linearised
 from coax_env.engine.model import FreeParameter, Noise
+from coax_env.engine.whiteness import whiteness
 from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight
 from coax_env.heli_model import GUST_LEVELS, HeliModel, record_of, starting_noise
+from coax_env.plain_words import and_list, plain
 from coax_env.prediction import RunReplay, fly_again
+from coax_env.search import Quadratic
 from coax_env.two_step.method import TwoStep, two_step
 from coax_env.vehicle import Vehicle, load_vehicle
 
 METHODS = ("ml", "paper")
+MOST_TURNS = 8
+ENOUGH = 1.0
+"""Nats that another turn of numbers and noise levels must gain."""
+CONFLICT = 4.0
+"""Times the expected squared move, in prior std, from which the file's std count as too small."""
+MOST_WIDENING = 30.0
+UNTOLD = 0.75
+"""Share of its prior std that a combination keeps when the flights say nothing of it."""
+WORTH_NAMING = 0.35
+"""Share of an undetermined direction below which a number is left out of its words."""
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
+class RunEstimate:
+    """What one run alone says: value and std by name, for the numbers that it determines at all.
+
+    chi_square: of those about the joint estimate, in `degrees` degrees of freedom.
+    """
+
+    run: str
+    values: dict[str, float]
+    std: dict[str, float]
+    chi_square: float
+    degrees: int
+
+
+@dataclass(frozen=True)
 class Identification:
-    """Result of `identify`: the fitted vehicle, what was free, and the runs flown again."""
+    """Result of `identify`: the fitted vehicle, what was free, and the runs flown again.
+
+    undetermined, directions: numbers and combinations that the flights leave open; see `_open`. by_run:
+    each run alone. widened: factor on the priors' std, 1 where the file's were believed.
+    """
 
     flight: Flight
     before: Vehicle
@@ -38,6 +73,10 @@ class Identification:
     replay_before: list[RunReplay]
     replay_after: list[RunReplay]
     remarks: tuple[str, ...]
+    undetermined: tuple[str, ...] = ()
+    directions: tuple[str, ...] = ()
+    by_run: tuple[RunEstimate, ...] = ()
+    widened: float = 1.0
 
 
 @overload
@@ -46,6 +85,8 @@ def identify(
     vehicle: Vehicle | str | Path | None = None,
     method: Literal["ml"] = "ml",
     progress: Progress | None = None,
+    channels: Collection[str] | None = None,
+    also: Collection[str] = (),
 ) -> Identification: ...
 
 
@@ -56,6 +97,8 @@ def identify(
     *,
     method: Literal["paper"],
     progress: Progress | None = None,
+    channels: Collection[str] | None = None,
+    also: Collection[str] = (),
 ) -> TwoStep: ...
 
 
@@ -65,6 +108,8 @@ def identify(
     vehicle: Vehicle | str | Path | None = None,
     method: str = "ml",
     progress: Progress | None = None,
+    channels: Collection[str] | None = None,
+    also: Collection[str] = (),
 ) -> Identification | TwoStep: ...
 
 
@@ -73,12 +118,16 @@ def identify(
     vehicle: Vehicle | str | Path | None = None,
     method: str = "ml",
     progress: Progress | None = None,
+    channels: Collection[str] | None = None,
+    also: Collection[str] = (),
 ) -> Identification | TwoStep:
     """Fit a vehicle's numbers to a flight.
 
     Args:
         flight: a Flight or its folder. vehicle: a Vehicle, name or path; default the card's.
         method: "ml", maximum likelihood on the full model; "paper", its two steps.
+        channels: to use; None: all that were measured. also: effects of the catalogue whose
+            parameters are free too ("gyro_bias", say), for method "ml".
 
     Raises:
         InputError: no such method, nothing to identify, or sensors missing that the method needs.
@@ -91,32 +140,53 @@ def identify(
             progress(text)
 
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
+    if channels is not None:
+        flight = with_channels(flight, channels)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    known = (*flight.notes, *double_counting(flight, vehicle))
     if method == "paper":
         result = two_step(flight, vehicle, progress=say)
-        known = (*flight.notes, *double_counting(flight, vehicle))
         return replace(result, remarks=(*known, *result.remarks))
     model = HeliModel(vehicle)
     engine = Engine(model, [record_of(run) for run in flight.runs])
-    free = free_parameters(model)
+    free = free_parameters(model, also)
     if not free:
         raise InputError(
             f"vehicle {vehicle.name!r} has no parameter with a std: nothing to identify"
         )
     say("estimating gusts and noise")
-    first = engine.fit_noise(model.bare_values, starting_noise(flight, vehicle), GUST_LEVELS)
-    estimate = engine.fit(free, model.bare_values, first, progress=say)
-    noise = engine.fit_noise({**model.bare_values, **estimate.values}, first, GUST_LEVELS)
-    start = {**model.bare_values, **estimate.values}
-    estimate = engine.fit(free, start, noise, iterations=3, progress=say)
+    start = {f.name: f.value for f in free}
+    bare = {**model.bare_values, **start}
+    first = engine.fit_noise(bare, starting_noise(flight, vehicle), GUST_LEVELS)
+    remarks = list(known)
+    own = free
+    free, estimate, noise, widened = _fitted(engine, own, bare, first, say)
+    if widened > 1.0:
+        contradiction = "the flights contradict the file's values by far more than its std"
+        if _is_white(engine, {**model.bare_values, **estimate.values}, noise):
+            remarks.append(f"{contradiction}: priors taken {widened:.1f} times as wide")
+        else:
+            say("the model lacks something: back to the file's priors")
+            free, estimate, noise, widened = _fitted(engine, own, bare, first, say, most=1.0)
+            remarks.append(
+                f"{contradiction}, and no values make the innovations white: the model lacks "
+                "something that its numbers should not answer for; see scripts/diagnose.py"
+            )
+    values = {**model.bare_values, **estimate.values}
+    _, lin = engine.linearise(values, noise, free)
+    quadratic = Quadratic.of(lin, free, values)
+    names = [f.name for f in free]
+    colour = np.array([quadratic.colour([name], names) for name in names])
+    covariance = estimate.covariance * np.sqrt(np.outer(colour, colour))
+    std = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     dt = median_step(engine.records)
     where = flight.path.name if flight.path else "flight"
     after = fitted_vehicle(
         vehicle,
         free,
         estimate.values,
-        {f.name: with_timing(f, estimate.std[f.name], dt) for f in free},
-        estimate.covariance,
+        {f.name: with_timing(f, std[f.name], dt) for f in free},
+        covariance,
         f"identified from {where} (maximum likelihood)",
         flight,
     )
@@ -125,21 +195,155 @@ def identify(
         flight,
         vehicle,
         replace(after, description=f"{vehicle.description}; identified from {where}"),
-        tuple(f.name for f in free),
+        tuple(names),
         estimate,
         noise,
         fly_again(engine, model.bare_values, first),
-        fly_again(engine, {**model.bare_values, **estimate.values}, noise),
-        (*flight.notes, *double_counting(flight, vehicle)),
+        fly_again(engine, values, noise),
+        tuple(remarks),
+        *_open(free, estimate.covariance),
+        _each_run(engine, free, lin, values, colour),
+        widened,
     )
 
 
-def free_parameters(model: HeliModel) -> list[FreeParameter]:
-    """Base parameters with a std, and those of the effects that the vehicle file has."""
+def with_channels(flight: Flight, channels: Collection[str]) -> Flight:
+    """The flight as if only these channels had been measured.
+
+    Raises:
+        InputError: one of them was not, or none is left.
+    """
+    for channel in channels:
+        if channel not in flight.channels:
+            raise InputError(
+                f"no channel {channel!r} in this flight; it has {', '.join(flight.channels)}"
+            )
+    if not channels:
+        raise InputError("no channel is left to identify from")
+    runs = [
+        replace(run, measured={c: v for c, v in run.measured.items() if c in channels})
+        for run in flight.runs
+    ]
+    return replace(flight, runs=tuple(runs))
+
+
+def _fitted(
+    engine: Engine,
+    free: list[FreeParameter],
+    start: Mapping[str, float],
+    noise: Noise,
+    say: Progress,
+    most: float = MOST_WIDENING,
+) -> tuple[list[FreeParameter], Estimate, Noise, float]:
+    """Numbers and noise levels by turns; priors widened together where the flights contradict them.
+
+    A squared move of d times the prior variance is expected of a number of which the flights tell the
+    share d (their posterior variance being 1 - d of the prior's). Far more means that the file's std
+    are too small, all by the same factor for want of a better guess.
+    """
+    values, widened = dict(start), 1.0
+    best = math.inf
+    for _ in range(MOST_TURNS):
+        estimate = engine.fit(free, values, noise, iterations=4, tolerance=0.3, progress=say)
+        values = {**values, **estimate.values}
+        told = 1.0 - np.diag(estimate.covariance) / np.array([f.std**2 for f in free])
+        moved = sum(((values[f.name] - f.value) / f.std) ** 2 for f in free)
+        ratio = moved / max(float(told.sum()), 1.0)
+        if ratio > CONFLICT and widened < most:
+            factor = min(math.sqrt(ratio), most / widened)
+            widened *= factor
+            free = [replace(f, std=factor * f.std) for f in free]
+            say(f"the file's std are too small: {widened:.1f} times as wide")
+            best = math.inf
+        elif best - estimate.objective < ENOUGH:
+            break
+        else:
+            best = estimate.objective
+        noise = engine.fit_noise(values, noise, GUST_LEVELS, 8, ENOUGH)
+    return free, estimate, noise, widened
+
+
+def _is_white(engine: Engine, values: Mapping[str, float], noise: Noise) -> bool:
+    """Whether the innovations leave nothing to explain."""
+    judged = whiteness(engine.filter(values, noise), engine.model.channels)
+    return all(channel.white for channel in judged.values())
+
+
+def _open(
+    free: Sequence[FreeParameter], covariance: np.ndarray
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Numbers that the flights do not determine, and the combinations they leave open, in words.
+
+    Open is an eigenvector of the posterior covariance, in units of the priors, whose std is most of
+    the prior's (UNTOLD). A number is undetermined where most of what is not known of it is along
+    those: motion alone tells thrust over mass, not either.
+    """
+    scale = np.array([f.std for f in free])
+    shares, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    left = shares > UNTOLD**2
+    along = np.sum(vectors[:, left] ** 2 * shares[left], axis=1)
+    whole = np.sum(vectors**2 * shares, axis=1)
+    undetermined = [f.name for f, a, w in zip(free, along, whole, strict=True) if a > 0.5 * w]
+    told = []
+    for vector in vectors.T[left][::-1]:
+        vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
+        parts = [(w, f.name) for w, f in zip(vector, free, strict=True) if abs(w) > WORTH_NAMING]
+        if len(parts) > 1:
+            up = [plain(name) for weight, name in parts if weight > 0.0]
+            down = [plain(name) for weight, name in parts if weight < 0.0]
+            told.append(
+                and_list(up) + (" up with " + and_list(down) + " down" if down else " together")
+            )
+    return tuple(undetermined), tuple(told)
+
+
+def _each_run(
+    engine: Engine,
+    free: Sequence[FreeParameter],
+    lin: Linearised,
+    values: Mapping[str, float],
+    colour: np.ndarray,
+) -> tuple[RunEstimate, ...]:
+    """One Newton step of each run alone from the joint estimate, priors in."""
+    names = [f.name for f in free]
+    prior = np.array([f.std for f in free])
+    at = np.array([values[n] for n in names])
+    pull = (at - [f.value for f in free]) / prior**2
+    joint = np.linalg.inv(lin.information.sum(0) + np.diag(prior**-2.0))
+    found = []
+    for record, information, slope in zip(engine.records, lin.information, lin.slope, strict=True):
+        alone = np.linalg.inv(information + np.diag(prior**-2.0))
+        move = -alone @ (slope + pull)
+        spread = np.sqrt(np.diag(alone) * colour)
+        apart = np.sqrt(np.maximum(np.diag(alone - joint) * colour, 1e-300))
+        told = spread < 0.5 * prior
+        found.append(
+            RunEstimate(
+                record.name,
+                {n: float(at[i] + move[i]) for i, n in enumerate(names) if told[i]},
+                {n: float(spread[i]) for i, n in enumerate(names) if told[i]},
+                float(np.sum((move / apart)[told] ** 2)),
+                int(told.sum()),
+            )
+        )
+    return tuple(found)
+
+
+def free_parameters(model: HeliModel, also: Collection[str] = ()) -> list[FreeParameter]:
+    """Base parameters with a std, and those of the effects that the vehicle file has or are `also`."""
     free = model.base_parameters()
     for effect, table in model.vehicle.effects.items():
         for f in model.effect_parameters(effect):
             own = table[f.name.split(".")[1]]
             if own.std > 0.0:
                 free.append(replace(f, value=own.value, std=own.std, probe=0.0))
+    for effect in also:
+        if effect not in CATALOGUE or CATALOGUE[effect].line:
+            raise InputError(
+                f"no effect {effect!r} to fit; the catalogue has {', '.join(CATALOGUE)}"
+            )
+        if effect not in model.vehicle.effects:
+            replaced = CATALOGUE[effect].replaces
+            free = [f for f in free if f.name not in replaced]
+            free += model.effect_parameters(effect)
     return free

@@ -18,10 +18,24 @@ def main() -> None:
     parser.add_argument("flight", type=Path, help="flight folder")
     parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
     parser.add_argument("--method", choices=METHODS, default="ml", help="default: %(default)s")
+    parser.add_argument(
+        "--channels", metavar="C,C", help="use these measured channels only (default: all)"
+    )
+    parser.add_argument(
+        "--also", metavar="EFFECT,EFFECT", default="",
+        help="free these effects' parameters too, gyro_bias,accel_bias for instance (method ml)",
+    )  # fmt: skip
     options = parser.parse_args()
 
     with command_line.progress("identification") as say:
-        result = identify(options.flight, options.vehicle, options.method, say)
+        result = identify(
+            options.flight,
+            options.vehicle,
+            options.method,
+            say,
+            channels=None if options.channels is None else options.channels.split(","),
+            also=[name for name in options.also.split(",") if name],
+        )
     command = "scripts/identify.py " + shlex.join(sys.argv[1:])
     if isinstance(result, TwoStep):
         page = report.two_step_page(result, command)
@@ -34,6 +48,9 @@ def main() -> None:
             replay_before=result.replay_before,
             replay_after=result.replay_after,
             remarks=result.remarks,
+            undetermined=result.undetermined,
+            directions=result.directions,
+            by_run=result.by_run,
             command_line=command,
         )
     with staged_folder(options.out) as folder:
@@ -42,6 +59,11 @@ def main() -> None:
     for name in result.fitted:
         old, new = result.before[name], result.after[name]
         print(f"{name:32s} {old.value:11.5g} -> {new.value:11.5g} +- {new.std:.2g} {new.unit}")
+    if not isinstance(result, TwoStep) and result.undetermined:
+        print("not determined by these flights:", ", ".join(result.undetermined))
+        print("left open:", "; ".join(result.directions) or "each of them")
+    for remark in result.remarks:
+        print(remark)
     print(f"vehicle {options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")
 
 

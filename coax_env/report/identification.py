@@ -2,14 +2,29 @@
 
 from collections.abc import Sequence
 
+from scipy.stats import chi2
+
 from coax_env import figures
 from coax_env.flight import Flight
-from coax_env.plain_words import capital, channel_name, number, plain, with_std
+from coax_env.identification import RunEstimate
+from coax_env.plain_words import and_list, capital, channel_name, number, plain, with_std
 from coax_env.prediction import RunReplay
 from coax_env.report.flown import data_blocks, ordered, points_each, prediction_figure
-from coax_env.report.page import Section, callout, chooser, command, figure, page, table
+from coax_env.report.page import (
+    Section,
+    bullets,
+    callout,
+    chooser,
+    command,
+    figure,
+    page,
+    prose,
+    table,
+)
 from coax_env.vehicle import Vehicle
 
+DOUBT = 0.001
+"""Chance below which a run disagrees with the others."""
 TIED = 0.95
 """Correlation from which two parameters count as known only together."""
 
@@ -23,12 +38,16 @@ def identification_page(
     replay_before: Sequence[RunReplay] = (),
     replay_after: Sequence[RunReplay] = (),
     remarks: Sequence[str] = (),
+    undetermined: Sequence[str] = (),
+    directions: Sequence[str] = (),
+    by_run: Sequence[RunEstimate] = (),
     command_line: str = "",
 ) -> str:
     """The report as HTML text.
 
     Args:
         fitted: full names of the fitted parameters. remarks: warnings to show beside them.
+        undetermined, directions, by_run: of the `Identification`.
         replay_before, replay_after: the same runs flown again by each vehicle, if they were.
     """
     known = before.values()
@@ -58,15 +77,26 @@ def identification_page(
     tied = _tied(after)
     if tied:
         sentences.append("Known only together: " + "; ".join(tied) + ".")
+    if undetermined:
+        sentences.append(
+            f"{len(undetermined)} of them these flights do not determine: "
+            f"{and_list([plain(n) for n in undetermined])}."
+        )
     header = ["parameter", "before", "after", "move / prior std", "std left"]
     parameters = [
         figure(figures.parameter_moves(moves), "Green: within one std of the prior.")
         if moves
         else "",
         table(header, rows),
+        *(
+            [prose("Combinations that the flights leave open:"), bullets(directions)]
+            * bool(directions)
+        ),
         *(callout(remark, "warning") for remark in remarks),
     ]
     parts = [Section("Parameters", parameters)]
+    if len(by_run) > 1:
+        parts.append(Section("From run to run", _repeatability(after, by_run)))
     if after.correlation is not None and len(after.correlated) > 1:
         names = [plain(n) for n in after.correlated]
         text = [[f"{c:.2f}" for c in row] for row in after.correlation]
@@ -98,6 +128,24 @@ def identification_page(
         parts,
         kicker=f"Identification · vehicle {before.name}",
     )
+
+
+def _repeatability(after: Vehicle, by_run: Sequence[RunEstimate]) -> list[str]:
+    names = dict.fromkeys(n for run in by_run for n in run.values)
+    joint = {plain(n): (after[n].value, after[n].std) for n in names}
+    alone = {run.run: {plain(n): (run.values[n], run.std[n]) for n in run.values} for run in by_run}
+    rows = []
+    for run in by_run:
+        chance = chi2.sf(run.chi_square, run.degrees) if run.degrees else 1.0
+        agrees = "–" if not run.degrees else ("yes" if chance > DOUBT else "**no**")
+        rows.append([run.run, str(run.degrees), f"{run.chi_square:.1f}", agrees])
+    blocks = [
+        prose("Each run fitted alone, by one step from the joint estimate, against all together.")
+    ]
+    if joint:
+        blocks.append(figure(figures.repeatability(joint, alone), "Only what a run determines."))
+    header = ["run", "numbers it determines", "chi square about the joint estimate", "agrees"]
+    return [*blocks, table(header, rows, f"Agrees: not beyond chance at {100 * DOUBT:g} %.")]
 
 
 def _tied(vehicle: Vehicle) -> list[str]:
