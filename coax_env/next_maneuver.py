@@ -235,6 +235,26 @@ def logged_rates(flight: Flight) -> dict[str, float]:
     return rates
 
 
+def expected_information(
+    flown: Track,
+    vehicle: Vehicle,
+    free: Sequence[FreeParameter],
+    noise: Noise,
+    rates: Mapping[str, float],
+) -> np.ndarray:
+    """What a flown maneuver is expected to tell of some numbers: the Fisher information (k, k).
+
+    Args:
+        flown: simulated with `vehicle`. noise: of gusts and readings. rates: of the channels [Hz].
+    """
+    noise = _for_rows(noise, rates, float(flown.t[1] - flown.t[0]))
+    model = _FromHere(vehicle, flown.state[0])
+    engine = Engine(model, [_as_logged(flown, rates)], threads=1)
+    values = {**vehicle.values(), "gust_memory": noise.process["memory"]}
+    _, lin = engine.linearise({**{f.name: f.value for f in free}, **values}, noise, free)
+    return lin.information[0]
+
+
 def _as_logged(flown: Track, rates: Mapping[str, float]) -> Record:
     """A simulated run as the engine gets it: no noise, each channel at its own rate."""
     z = np.full(flown.readings.shape, np.nan)
@@ -422,15 +442,16 @@ def write_flight_card(result: Design, flight: Flight, folder: str | Path) -> Pat
     """
     plan = result.ranked[0].maneuver
     flown = fly(result.alternatives[0].vehicle, plan)
-    run = Run(plan.name, flown.t, flown.command, {}, plan.summary, _instruction(plan))
+    run = Run(plan.name, flown.t, flown.command, {}, plan.summary, instruction(plan))
     folder = write_flight(
         Flight(flight.vehicle, (run,), air=flight.air, noise=flight.noise), folder
     )
-    write_text(folder / "asked.csv", _asked_csv(plan, flown))
+    write_text(folder / "asked.csv", asked_csv(plan, flown))
     return folder
 
 
-def _instruction(plan: Maneuver) -> str:
+def instruction(plan: Maneuver) -> str:
+    """What a pilot does with a planned run, for the card's note."""
     what = "hold" if plan.injected else "fly"
     added = f" and add the steps on {', '.join(plan.injected)}" if plan.injected else ""
     return (
@@ -439,7 +460,7 @@ def _instruction(plan: Maneuver) -> str:
     )
 
 
-def _asked_csv(plan: Maneuver, flown: Track) -> str:
+def asked_csv(plan: Maneuver, flown: Track) -> str:
     """Time, what to hold, and what to add to the pilot's own commands, row by row."""
     units = {"height": "m", "forward": "mps", "right": "mps", "heading": "rad"}
     header = ["t_s", *(f"{name}_{units[name]}" for name in ASKED)]
