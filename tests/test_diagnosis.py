@@ -20,13 +20,14 @@ from shared_flights import shared_flight
 import coax_env
 from coax_env import diagnose, diagnosis, effects, identify, load_vehicle, read_flight, replay
 from coax_env.diagnosis import Diagnosis
-from coax_env.engine.fit import Engine
+from coax_env.engine.fit import Engine, objective
 from coax_env.errors import InputError
 from coax_env.files import write_text
 from coax_env.flight import Flight
 from coax_env.heli_model import HeliModel, record_of, starting_noise
 from coax_env.layout import CHANNELS
 from coax_env.next_maneuver import candidates
+from coax_env.search import Search, State
 from coax_env.vehicle import vehicle_toml
 
 ON_AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
@@ -132,6 +133,35 @@ def test_signatures_are_what_moving_the_parameter_does(tmp_path, also):
         assert abs(slope - np.sum(J * e)) < allowed, f.name
         shown += 1
     assert shown > 30
+
+
+def test_a_polished_fit_is_at_the_top_of_the_likelihood(tmp_path):
+    """Also in gusts, where holding the gains still leaves a slope in the lever arm."""
+    folder = injector.fly(
+        tmp_path / "flight",
+        {"imu_lever_arm": {}},
+        gusts=True,
+        runs=("lon_3211", "yaw_3211"),
+        seed=7,
+    )
+    flight = read_flight(folder)
+    model = HeliModel(LAMA)
+    engine = Engine(model, [record_of(run) for run in flight.runs])
+    search = Search(engine, model, ("imu_lever_arm",))
+    state = search.begin(starting_noise(flight, LAMA))
+    state = search.polish(search.converge(State(["imu_lever_arm"], state.values, state.noise)))
+    free = search.free(state.active)
+    _, quadratic = search.linearise(state)
+    names = [f.name for f in free]
+    std = dict(zip(names, np.sqrt(np.diag(quadratic.covariance(names))), strict=True))
+
+    def cost(name: str, change: float) -> float:
+        values = {**state.values, name: state.values[name] + change * std[name]}
+        return objective(engine.filter(values, state.noise), free, values)
+
+    for name in search.candidate_names("imu_lever_arm"):
+        slope = (cost(name, 0.5) - cost(name, -0.5)) / 1.0  # nats per standard deviation
+        assert abs(slope) < 0.35, name
 
 
 # --- hidden effects ------------------------------------------------------------------------------
