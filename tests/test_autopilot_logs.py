@@ -1,0 +1,178 @@
+"""Autopilot logs, written here byte by byte from their specifications, through the importers."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coax_env import read_flight
+from coax_env.autopilot_logs import Taken, euler_angles, import_log
+from coax_env.errors import InputError
+from coax_env.flight import write_flight
+from coax_env.layout import RPM_PER_RAD_S
+
+TAKE = {"delta_lon": Taken("actuator_servos.control[0]", 0.2)}
+
+
+def ulog(path: Path, topics: dict[str, tuple[list[str], float, np.ndarray]]) -> Path:
+    """A ULog (PX4 file format, version 1): topic -> field names, rate [Hz], rows (n, fields)."""
+
+    def message(kind: bytes, body: bytes) -> bytes:
+        return struct.pack("<Hc", len(body), kind) + body
+
+    content = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
+    content += message(b"B", bytes(40))
+    for name, (fields, _, _) in topics.items():
+        text = f"{name}:uint64_t timestamp;" + "".join(f"float {field};" for field in fields)
+        content += message(b"F", text.encode())
+    for k, name in enumerate(topics):
+        content += message(b"A", struct.pack("<BH", 0, k) + name.encode())
+    for k, (_, rate, rows) in enumerate(topics.values()):
+        for i, row in enumerate(rows):
+            stamp = struct.pack("<Q", 1_000_000 + round(1e6 * i / rate))
+            content += message(
+                b"D", struct.pack("<H", k) + stamp + struct.pack(f"<{len(row)}f", *row)
+            )
+    path.write_bytes(content)
+    return path
+
+
+def px4_flight(path: Path) -> Path:
+    """Six seconds: gyros at 250 Hz turning at 0.1 rad/s, heading 0.3, motors and ESCs slower."""
+    half = 0.15
+    return ulog(
+        path,
+        {
+            "sensor_combined": (
+                ["gyro_rad[0]", "gyro_rad[1]", "gyro_rad[2]", "accelerometer_m_s2[0]",
+                 "accelerometer_m_s2[1]", "accelerometer_m_s2[2]"],
+                250.0, np.tile([0.0, 0.1, 0.0, 0.0, 0.0, -9.8], (1500, 1)),
+            ),
+            "vehicle_attitude": (
+                ["q[0]", "q[1]", "q[2]", "q[3]"], 50.0,
+                np.tile([np.cos(half), 0.0, 0.0, np.sin(half)], (300, 1)),
+            ),
+            "vehicle_local_position": (
+                ["x", "y", "z", "vx", "vy", "vz"], 20.0,
+                np.tile([1.0, 2.0, -1.5, 0.1, 0.2, 0.0], (120, 1)),
+            ),
+            "esc_status": (["esc[0].esc_rpm", "esc[1].esc_rpm"], 20.0,
+                           np.tile([2000.0, 2140.0], (120, 1))),
+            "actuator_servos": (["control[0]"], 50.0, np.tile([[0.5]], (300, 1))),
+        },
+    )  # fmt: skip
+
+
+def test_a_px4_log_becomes_a_flight_folder(tmp_path):
+    pytest.importorskip("pyulog")
+    flight = import_log(px4_flight(tmp_path / "log.ulg"), "lama400d", TAKE)
+    again = read_flight(write_flight(flight, tmp_path / "flight"))
+    (run,) = again.runs
+    assert run.duration == pytest.approx(6.0, abs=0.05)
+    assert np.median(np.diff(run.t)) == pytest.approx(0.01, abs=1e-6)
+    expected = {"q": 0.1, "az": -9.8, "psi": 0.3, "phi": 0.0, "h": 1.5, "vn": 0.1, "pe": 2.0,
+                "rpm_lower": 2140.0}  # fmt: skip
+    for channel, value in expected.items():
+        assert np.nanmean(run.measured[channel]) == pytest.approx(value, abs=1e-5), channel
+    assert np.isfinite(run.measured["vn"]).sum() == pytest.approx(120, abs=2)
+    np.testing.assert_allclose(run.command[10:-10, 2], 0.1, rtol=1e-6)
+    np.testing.assert_allclose(run.command[10:-10, 0] * RPM_PER_RAD_S, 2000.0, rtol=1e-6)
+
+
+def test_runs_are_cut_out_of_a_log(tmp_path):
+    pytest.importorskip("pyulog")
+    path = px4_flight(tmp_path / "log.ulg")
+    flight = import_log(path, "lama400d", TAKE, [(0.5, 3.0), (3.0, 99.0)])
+    assert [r.name for r in flight.runs] == ["run_1", "run_2"]
+    assert flight.runs[0].duration == pytest.approx(2.5, abs=0.02)
+    with pytest.raises(InputError, match="shorter"):
+        import_log(path, "lama400d", TAKE, [(0.0, 1.0)])
+
+
+def test_what_is_missing_is_said_in_one_line(tmp_path):
+    pytest.importorskip("pyulog")
+    topics = {
+        "sensor_combined": (["gyro_rad[0]"], 100.0, np.zeros((500, 1))),
+        "actuator_outputs": (["output[0]"], 50.0, np.ones((250, 1))),
+    }
+    bare = ulog(tmp_path / "bare.ulg", topics)
+    with pytest.raises(InputError, match=r"speed of the upper rotor.*actuator_outputs.output\[0\]"):
+        import_log(bare, "lama400d")
+    with pytest.raises(InputError, match=r"no signal 'esc\.rpm'"):
+        import_log(bare, "lama400d", {"rpm_upper": Taken("esc.rpm")})
+    with pytest.raises(InputError, match="no channel 'rpm'"):
+        import_log(bare, "lama400d", {"rpm": Taken("actuator_outputs.output[0]")})
+    (tmp_path / "junk.ulg").write_bytes(b"not a log at all")
+    with pytest.raises(InputError, match="not a ULog"):
+        import_log(tmp_path / "junk.ulg", "lama400d")
+
+
+def test_a_log_of_another_kind_is_refused(tmp_path):
+    (tmp_path / "log.csv").write_text("t\n")
+    with pytest.raises(InputError, match="a log ends in"):
+        import_log(tmp_path / "log.csv", "lama400d")
+    with pytest.raises(InputError, match="no log at"):
+        import_log(tmp_path / "none.ulg", "lama400d")
+
+
+def test_an_ardupilot_log_becomes_a_flight(tmp_path):
+    """The text form of a DataFlash log: FMT lines, then messages; angles in degrees."""
+    pytest.importorskip("pymavlink")
+    lines = [
+        "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns",
+        "FMT, 129, 40, IMU, QBffffff, TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ",
+        "FMT, 130, 30, ATT, Qfff, TimeUS,Roll,Pitch,Yaw",
+        "FMT, 131, 30, RPM, Qff, TimeUS,rpm1,rpm2",
+        "FMT, 132, 30, RFND, QBf, TimeUS,Instance,Dist",
+    ]
+    for k in range(400):
+        stamp = 1_000_000 + 10_000 * k
+        lines.append(f"IMU, {stamp}, 0, 0.0, 0.2, 0.0, 0.1, 0.0, -9.8")
+        lines.append(f"IMU, {stamp}, 1, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0")
+        if k % 4 == 0:
+            lines += [f"ATT, {stamp}, 1.0, -2.0, 90.0", f"RPM, {stamp}, 1990.0, 2130.0",
+                      f"RFND, {stamp}, 0, 1.25"]  # fmt: skip
+    path = tmp_path / "log.log"
+    path.write_text("\n".join(lines) + "\n")
+    (run,) = import_log(path, "lama400d").runs
+    assert np.nanmean(run.measured["q"]) == pytest.approx(0.2)
+    assert np.nanmean(run.measured["psi"]) == pytest.approx(np.pi / 2)
+    assert np.nanmean(run.measured["theta"]) == pytest.approx(-2.0 * np.pi / 180.0)
+    assert np.nanmean(run.measured["h"]) == pytest.approx(1.25)
+    assert run.command[100, 1] * RPM_PER_RAD_S == pytest.approx(2130.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a.b[0]", Taken("a.b[0]")),
+        ("a.b*2", Taken("a.b", 2.0)),
+        ("a.b * -2.5e-3 - 7", Taken("a.b", -2.5e-3, -7.0)),
+        ("a.b[1]*1.0-900", Taken("a.b[1]", 1.0, -900.0)),
+        ("a.b + 3", Taken("a.b", 1.0, 3.0)),
+    ],
+)
+def test_where_a_channel_comes_from_is_read(text, expected):
+    assert Taken.of(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "a.b *", "a.b * x", "2 * a.b", "a.b + 1 + 1"])
+def test_and_refused_where_it_is_not_of_that_form(text):
+    with pytest.raises(InputError, match=r"topic\.field"):
+        Taken.of(text)
+
+
+def test_euler_angles_of_a_quaternion():
+    """Against the product of three rotations, at random attitudes."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        phi, theta, psi = rng.uniform([-3.0, -1.4, -3.0], [3.0, 1.4, 3.0])
+        c, s = np.cos([phi / 2, theta / 2, psi / 2]), np.sin([phi / 2, theta / 2, psi / 2])
+        q = (
+            c[0] * c[1] * c[2] + s[0] * s[1] * s[2],
+            s[0] * c[1] * c[2] - c[0] * s[1] * s[2],
+            c[0] * s[1] * c[2] + s[0] * c[1] * s[2],
+            c[0] * c[1] * s[2] - s[0] * s[1] * c[2],
+        )
+        np.testing.assert_allclose(euler_angles(*map(np.array, q)), (phi, theta, psi), atol=1e-9)
