@@ -34,6 +34,8 @@ ENOUGH = 1.0
 """Nats that another turn of numbers and noise levels must gain."""
 CONFLICT = 4.0
 """Times the expected squared move, in prior std, from which the file's std count as too small."""
+ROOM = 2.0
+"""Times what would do on average by which priors are widened then: errors are not all alike."""
 MOST_WIDENING = 30.0
 UNTOLD = 0.75
 """Share of its prior std that a combination keeps when the flights say nothing of it."""
@@ -250,7 +252,7 @@ def _fitted(
         moved = sum(((values[f.name] - f.value) / f.std) ** 2 for f in free)
         ratio = moved / max(float(told.sum()), 1.0)
         if ratio > CONFLICT and widened < most:
-            factor = min(math.sqrt(ratio), most / widened)
+            factor = min(ROOM * math.sqrt(ratio), most / widened)
             widened *= factor
             free = [replace(f, std=factor * f.std) for f in free]
             say(f"the file's std are too small: {widened:.1f} times as wide")
@@ -315,7 +317,8 @@ def _each_run(
         alone = np.linalg.inv(information + np.diag(prior**-2.0))
         move = -alone @ (slope + pull)
         spread = np.sqrt(np.diag(alone) * colour)
-        apart = np.sqrt(np.maximum(np.diag(alone - joint) * colour, 1e-300))
+        # a run that is nearly all there is says what all say, up to how far the fit was taken
+        apart = np.sqrt(np.maximum(np.diag(alone - joint), 0.1 * np.diag(alone)) * colour)
         told = spread < 0.5 * prior
         found.append(
             RunEstimate(

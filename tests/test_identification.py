@@ -1,0 +1,100 @@
+"""Maximum likelihood identification: planted numbers come back, and what cannot is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from coax_env import identify, load_vehicle, simulate
+from coax_env.errors import InputError
+from coax_env.heli_model import HeliModel
+from coax_env.prediction import fly_again, pooled_rms
+
+LAMA = load_vehicle("lama400d")
+AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
+NAMES = [f.name for f in HeliModel(LAMA).base_parameters()]
+
+
+def off_by(factors):
+    """The Lama's file with values wrong by factors, std as they were."""
+    return LAMA.with_values({n: f * LAMA[n].value for n, f in zip(NAMES, factors, strict=True)})
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return simulate(LAMA, AXES, seed=4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factors", ["up", "down", "mixed"])
+def test_from_a_file_with_every_number_a_fifth_off(flight, factors):
+    """Determined numbers come back within 3 std, the others are named, prediction is as good."""
+    rng = np.random.default_rng(0)
+    wrong = {"up": [1.2] * len(NAMES), "down": [0.8] * len(NAMES),
+             "mixed": 1.0 + 0.2 * rng.choice([-1, 1], len(NAMES))}[factors]  # fmt: skip
+    result = identify(flight, off_by(wrong))
+    assert result.widened > 2.0
+    assert any("times as wide" in remark for remark in result.remarks)
+    determined = set(NAMES) - set(result.undetermined)
+    assert {"flap_time_constant", "flybar_time_constant", "swash_to_flap"} <= determined
+    assert {"mass", "thrust_coefficient_upper"} <= set(result.undetermined)
+    for name in determined:
+        new = result.after[name]
+        assert abs(new.value - LAMA[name].value) < 3.0 * new.std, name
+    assert result.directions
+    ratio = result.after["thrust_coefficient_upper"].value / result.after["mass"].value
+    exact = LAMA["thrust_coefficient_upper"].value / LAMA["mass"].value
+    assert ratio == pytest.approx(exact, rel=0.01)
+    predicted = pooled_rms(result.replay_after)
+    engine = _engine(flight)
+    best = pooled_rms(fly_again(engine, HeliModel(LAMA).bare_values, result.noise))
+    for channel, rms in predicted.items():
+        assert rms < 1.1 * best[channel], channel  # four runs; twelve give 1.05
+
+
+def _engine(flight):
+    from coax_env.engine.fit import Engine
+    from coax_env.heli_model import record_of
+
+    return Engine(HeliModel(LAMA), [record_of(run) for run in flight.runs])
+
+
+def test_a_model_that_lacks_something_keeps_the_files_priors():
+    """A delay that the file does not have must not be paid for by its inertias."""
+    lagging = LAMA.with_effect("servo_delay", time=0.1)
+    result = identify(simulate(lagging, ("lon_3211", "lat_3211"), seed=1), LAMA)
+    assert result.widened == 1.0
+    assert any("lacks something" in remark for remark in result.remarks)
+
+
+def test_runs_of_one_vehicle_agree_and_a_strange_one_stands_out(flight):
+    same = identify(flight, LAMA)
+    for run in same.by_run:
+        assert run.degrees == 0 or chi2.sf(run.chi_square, run.degrees) > 1e-4, run.run
+    loaded = LAMA.with_values({"inertia_yy": 1.25 * LAMA["inertia_yy"].value})
+    strange = replace(simulate(loaded, "lon_3211", seed=2).runs[0], name="strange")
+    more = simulate(LAMA, ("lon_doublet", "lat_doublet"), seed=5)
+    mixed = identify(replace(flight, runs=(*flight.runs, *more.runs, strange)), LAMA)
+    worst = max(mixed.by_run, key=lambda run: run.chi_square - run.degrees)
+    assert worst.run == "strange"
+    assert chi2.sf(worst.chi_square, worst.degrees) < 1e-3
+
+
+def test_channels_are_chosen(flight):
+    chosen = ("p", "q", "r", "phi", "theta", "psi", "rpm_upper", "rpm_lower")
+    few = identify(flight.select(["lon_3211"]), LAMA, channels=chosen)
+    assert few.flight.channels == tuple(c for c in flight.channels if c in chosen)
+    for bad, words in ((("lift",), "no channel 'lift'"), ((), "no channel is left")):
+        with pytest.raises(InputError, match=words):
+            identify(flight, LAMA, channels=bad)
+
+
+def test_sensor_biases_are_fitted_on_request():
+    biased = LAMA.with_effect("gyro_bias", x=0.02, y=-0.03, z=0.01)
+    result = identify(simulate(biased, ("lon_3211", "hover"), seed=3), LAMA, also=["gyro_bias"])
+    for name, value in (("gyro_bias.x", 0.02), ("gyro_bias.y", -0.03), ("gyro_bias.z", 0.01)):
+        assert abs(result.after[name].value - value) < 3.5 * result.after[name].std
+        assert result.after[name].std < 0.002
+    with pytest.raises(InputError, match="no effect 'bias'"):
+        identify(simulate(LAMA, "hover"), LAMA, also=["bias"])
