@@ -194,9 +194,9 @@ def _to_learn(model: HeliModel, learn: Collection[str]) -> tuple[list[FreeParame
             free = [f for f in free if f.name not in CATALOGUE[effect].replaces]
             wanted += names
         else:
+            known = ", ".join(f.name for f in model.base_parameters())
             raise InputError(
-                f"nothing called {name!r} to learn; there are "
-                + ", ".join([*(f.name for f in model.base_parameters()), *CATALOGUE])
+                f"nothing called {name!r} to learn; there are {known}, and the catalogue's effects"
             )
     return free, list(dict.fromkeys(wanted))
 

@@ -8,10 +8,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from coax_env import effects, figures, load_vehicle, plain_words, report, simulate
+from coax_env import effects, figures, identify, load_vehicle, plain_words, report, simulate
 from coax_env import simulation as sim
 from coax_env.diagnosis import Diagnosis
 from coax_env.engine.whiteness import Whiteness
+from coax_env.identification import RunEstimate
 from coax_env.prediction import ChannelReplay, RunReplay
 from coax_env.report.page import figure, inline, table
 from coax_env.vehicle import Parameter
@@ -220,6 +221,40 @@ def test_identification_page():
     assert "Mass moved most: by 2.5 standard deviations" in text
     assert "Known only together: mass with inertia xx (0.97)" in text
     assert "0.8200 ± 0.0020 kg" in text
+
+
+def test_identification_page_says_what_stays_open():
+    runs = [
+        RunEstimate(name, {"mass": 0.8 + k / 100}, {"mass": 0.01}, chi, 1)
+        for k, (name, chi) in enumerate((("hover", 0.5), ("strange", 40.0)))
+    ]
+    page = report.identification_page(
+        LAMA, LAMA, ["mass"], undetermined=["mass"], directions=["mass together"], by_run=runs
+    )
+    text = Outline(page).text
+    assert "1 of them these flights do not determine: mass" in text
+    assert "hover10.5yes" in text and "strange140.0no" in text  # cells run together
+
+
+@pytest.fixture(scope="module")
+def two_steps():
+    return identify(simulate(LAMA, "lon_doublet", sensors="paper"), method="paper")
+
+
+def test_two_step_page(two_steps):
+    page = report.two_step_page(two_steps)
+    outline = Outline(page)
+    assert not outline.external and len(page.encode()) < 6e6
+    text = " ".join(outline.text.split())
+    assert "The paper's two steps on 1 run of lama400d" in text
+    assert "1 number found" in text and "Table VIII examined" in text
+    assert "C_m, α_l" in text and "hardly moves" in text
+    assert "delta_lon" not in text.split("Longitudinal force")[1].split("Step 1")[0]
+    moment = two_steps.modes[2].completed
+    value = moment.values[moment.names.index("p")]
+    assert plain_words.number(value, 3) in text
+    for content in re.findall(r'<script type="application/json">(.*?)</script>', page):
+        assert set(json.loads(content)) == {"data", "layout"}
 
 
 # --- words and figures ----------------------------------------------------------------------------

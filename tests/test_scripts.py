@@ -187,6 +187,12 @@ REQUESTS: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "no such run": (["diagnose.py", "flight", "--hold-out", "loop"], ("loop", "lon_3211")),
     "no such effect": (["diagnose.py", "flight", "--exclude", "gremlins"], ("gremlins",)),
     "no such method": (["identify.py", "flight", "--method", "guess"], ("guess",)),
+    "no such channel": (["identify.py", "flight", "--channels", "q,lift"], ("lift", "rpm_upper")),
+    "no such effect to fit": (["identify.py", "flight", "--also", "gremlins"], ("gremlins",)),
+    "nothing of that name to learn": (["plan_flight.py", "--learn", "charm"], ("charm", "mass")),
+    "no such log": (["import_log.py", "log.ulg"], ("log.ulg",)),
+    "a log of no kind": (["import_log.py", "poor.toml"], ("poor.toml", ".ulg")),
+    "a cut in words": (["import_log.py", "poor.toml", "--cut", "early"], ("early", "FROM-TO")),
     "no such maneuver": (["simulate.py", "--maneuver", "looping"], ("looping",)),
     "no such sensors": (["simulate.py", "--sensors", "radar"], ("radar",)),
     "no such controller": (["evaluate.py", "--controller", "none.json"], ("none.json",)),
@@ -240,6 +246,20 @@ def test_simulate_then_replay_then_identify(tmp_path):
     path = tmp_path / "fitted" / "vehicle.toml"
     assert load_vehicle(path)["mass"].std <= load_vehicle("lama400d")["mass"].std
     gymnasium.make("CoaxHeli-v0", vehicle=str(path)).close()
+
+    done = script("identify.py", "sim/flight", "--method", "paper", "--out", "steps", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert {p.name for p in (tmp_path / "steps").iterdir()} == {"vehicle.toml", "report.html"}
+    assert "Table VIII examined" in (tmp_path / "steps" / "report.html").read_text()
+
+
+def test_a_planned_flight_is_a_flight_folder(tmp_path):
+    done = script("plan_flight.py", "--runs", "2", "--learn", "inertia_yy", "--out", "plan",
+                  cwd=tmp_path)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert len(read_flight(tmp_path / "plan").runs) == 2
+    assert {"asked_01.csv", "asked_02.csv"} <= {p.name for p in (tmp_path / "plan").iterdir()}
+    assert "inertia_yy" in done.stdout
 
 
 @pytest.mark.slow
