@@ -60,7 +60,7 @@ class RunEstimate:
 
 @dataclass(frozen=True)
 class Identification:
-    """Result of `identify`: the fitted vehicle, what was free, and the runs flown again.
+    """Result of `identify`: the fitted vehicle, what was free, and the runs flown again (`flight`).
 
     undetermined, directions: numbers and combinations that the flights leave open; see `_open`. by_run:
     each run alone. widened: factor on the priors' std, 1 where the file's were believed.
@@ -89,6 +89,7 @@ def identify(
     progress: Progress | None = None,
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
+    hold_out: Collection[str] = (),
 ) -> Identification: ...
 
 
@@ -101,6 +102,7 @@ def identify(
     progress: Progress | None = None,
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
+    hold_out: Collection[str] = (),
 ) -> TwoStep: ...
 
 
@@ -112,6 +114,7 @@ def identify(
     progress: Progress | None = None,
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
+    hold_out: Collection[str] = (),
 ) -> Identification | TwoStep: ...
 
 
@@ -122,6 +125,7 @@ def identify(
     progress: Progress | None = None,
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
+    hold_out: Collection[str] = (),
 ) -> Identification | TwoStep:
     """Fit a vehicle's numbers to a flight.
 
@@ -129,7 +133,8 @@ def identify(
         flight: a Flight or its folder. vehicle: a Vehicle, name or path; default the card's.
         method: "ml", maximum likelihood on the full model; "paper", its two steps.
         channels: to use; None: all that were measured. also: effects of the catalogue whose
-            parameters are free too ("gyro_bias", say), for method "ml".
+            parameters are free too ("gyro_bias", say), for method "ml". hold_out: runs that are not
+            fitted; with some, they alone are flown again.
 
     Raises:
         InputError: no such method, nothing to identify, or sensors missing that the method needs.
@@ -144,6 +149,12 @@ def identify(
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     if channels is not None:
         flight = with_channels(flight, channels)
+    held = flight.select(hold_out) if hold_out else flight
+    if hold_out:
+        fitted_on = [name for name in flight.run_names if name not in hold_out]
+        if not fitted_on:
+            raise InputError("all runs are held out: nothing is left to identify from")
+        flight = flight.select(fitted_on)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
     known = (*flight.notes, *double_counting(flight, vehicle))
     if method == "paper":
@@ -193,15 +204,16 @@ def identify(
         flight,
     )
     say("flying again")
+    again = Engine(model, [record_of(run) for run in held.runs])
     return Identification(
-        flight,
+        held,
         vehicle,
         replace(after, description=f"{vehicle.description}; identified from {where}"),
         tuple(names),
         estimate,
         noise,
-        fly_again(engine, model.bare_values, first),
-        fly_again(engine, values, noise),
+        fly_again(again, model.bare_values, first),
+        fly_again(again, values, noise),
         tuple(remarks),
         *_open(free, estimate.covariance),
         _each_run(engine, free, lin, values, colour),

@@ -9,6 +9,7 @@ import command_line
 from coax_env import report
 from coax_env.files import staged_folder, write_text
 from coax_env.identification import METHODS, identify
+from coax_env.prediction import pooled_rms
 from coax_env.two_step.method import TwoStep
 from coax_env.vehicle import vehicle_toml
 
@@ -25,6 +26,10 @@ def main() -> None:
         "--also", metavar="EFFECT,EFFECT", default="",
         help="free these effects' parameters too, gyro_bias,accel_bias for instance (method ml)",
     )  # fmt: skip
+    parser.add_argument(
+        "--hold-out", default="", metavar="RUN,RUN",
+        help="runs not to fit; they are predicted before and after instead",
+    )  # fmt: skip
     options = parser.parse_args()
 
     with command_line.progress("identification") as say:
@@ -35,6 +40,7 @@ def main() -> None:
             say,
             channels=None if options.channels is None else options.channels.split(","),
             also=[name for name in options.also.split(",") if name],
+            hold_out=[name for name in options.hold_out.split(",") if name],
         )
     command = "scripts/identify.py " + shlex.join(sys.argv[1:])
     if isinstance(result, TwoStep):
@@ -59,6 +65,10 @@ def main() -> None:
     for name in result.fitted:
         old, new = result.before[name], result.after[name]
         print(f"{name:32s} {old.value:11.5g} -> {new.value:11.5g} +- {new.std:.2g} {new.unit}")
+    if not isinstance(result, TwoStep):
+        before, after = pooled_rms(result.replay_before), pooled_rms(result.replay_after)
+        moved = ", ".join(f"{c} {before[c]:.3g} -> {after[c]:.3g}" for c in after if c in before)
+        print(f"1 s prediction error on {', '.join(result.flight.run_names)}: {moved}")
     if not isinstance(result, TwoStep) and result.undetermined:
         print("not determined by these flights:", ", ".join(result.undetermined))
         print("left open:", "; ".join(result.directions) or "each of them")

@@ -17,6 +17,7 @@ def main() -> None:
     parser = command_line.parser("study_identification", __doc__, seed=True)
     parser.add_argument("--flights", type=int, default=200, help="default: %(default)s")
     parser.add_argument("--jobs", type=int, default=-1, help="flights at once (default: all cores)")
+    parser.add_argument("--peer", action="store_true", help="AeroID on the same doublets, too")
     options = parser.parse_args()
     if options.flights < 1:
         raise InputError("a study needs at least one flight")
@@ -26,7 +27,7 @@ def main() -> None:
     require("joblib", "study")
     from joblib import Parallel, delayed
 
-    work = (delayed(labelled)(n) for n in waiting)
+    work = (delayed(labelled)(n, options.peer) for n in waiting)
     results = Parallel(n_jobs=options.jobs, return_as="generator_unordered", batch_size=1)(work)
     done = len(numbers) - len(waiting)
     try:
@@ -45,9 +46,9 @@ def path_of(folder: Path, number: int) -> Path:
     return folder / "flights" / f"{number:06d}.json"
 
 
-def labelled(number: int) -> tuple[int, dict[str, list[dict[str, Any]]]]:
+def labelled(number: int, peer: bool) -> tuple[int, dict[str, list[dict[str, Any]]]]:
     """A flight's number with its result: they come back in no order."""
-    return number, fly_and_identify(number)
+    return number, fly_and_identify(number, peer)
 
 
 def table(rows: list[dict[str, list[dict[str, Any]]]]) -> str:
@@ -55,7 +56,9 @@ def table(rows: list[dict[str, list[dict[str, Any]]]]) -> str:
     header = ["| intervals | hold the truth | of | Wilson 95 % |", "|---|---|---|---|"]
     lines = [f"{len(rows)} flights", "", *header]
     for method in METHODS:
-        every = [i for row in rows for i in row[method]]
+        every = [i for row in rows for i in row.get(method, ())]
+        if not every:
+            continue
         lines.append(line(method, every))
         for name in dict.fromkeys(i["name"] for i in every):
             lines.append(line(f"- {name}", [i for i in every if i["name"] == name]))

@@ -90,6 +90,14 @@ def test_channels_are_chosen(flight):
             identify(flight, LAMA, channels=bad)
 
 
+def test_held_out_runs_are_flown_again_and_not_fitted(flight):
+    result = identify(flight, LAMA, hold_out=["yaw_3211"])
+    assert [run.name for run in result.replay_after] == ["yaw_3211"]
+    assert "yaw_3211" not in [run.run for run in result.by_run]
+    with pytest.raises(InputError, match="all runs are held out"):
+        identify(flight, LAMA, hold_out=flight.run_names)
+
+
 def test_sensor_biases_are_fitted_on_request():
     biased = LAMA.with_effect("gyro_bias", x=0.02, y=-0.03, z=0.01)
     result = identify(simulate(biased, ("lon_3211", "hover"), seed=3), LAMA, also=["gyro_bias"])

@@ -2,26 +2,35 @@
 
 "tls": the paper's doublet, open loop, in gusts, Table V noise; coefficients of (64)-(66), the moment
 with its gyroscopic term, against what the vehicle's equations give. "ml": a vehicle drawn from the
-file's spread, maneuvers with a pilot, in gusts; the file's numbers under their priors.
+file's spread, maneuvers with a pilot, in gusts; the file's numbers under their priors. "AeroID": the
+nearest open tool's output-error fit of PEER on the doublet's rates, and ours on the same readings.
 """
 
 from typing import Any
 
 import numpy as np
 
-from coax_env import identify, load_vehicle, simulate
+from coax_env import derivative, hover_trim, identify, load_vehicle, simulate
+from coax_env.errors import require
+from coax_env.flight import Flight
+from coax_env.layout import COMMANDS, STATES
 from coax_env.simulation import Gusts
 from coax_env.two_step.method import two_step
 from coax_env.two_step.regression import Regression
+from coax_env.vehicle import Vehicle
 
-METHODS = ("tls", "ls", "ml")
+METHODS = ("tls", "ls", "ml", "ml on p, q", "AeroID on p, q")
 GUSTS = Gusts()
 ML_RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
 LEVEL = 0.95
+PEER = ("inertia_xx", "inertia_yy", "swash_to_flap", "flap_time_constant")
+Z = 1.959964
 
 
-def fly_and_identify(number: int, vehicle: str = "lama400d") -> dict[str, list[dict[str, Any]]]:
-    """method -> intervals of one flight: name, low, high, truth."""
+def fly_and_identify(
+    number: int, peer: bool = False, vehicle: str = "lama400d"
+) -> dict[str, list[dict[str, Any]]]:
+    """method -> intervals of one flight: name, low, high, truth. peer: AeroID too."""
     file = load_vehicle(vehicle)
     flight = simulate(file, "lon_doublet", sensors="paper", seed=number, gusts=GUSTS)
     result: dict[str, list[dict[str, Any]]] = {"tls": [], "ls": []}
@@ -30,19 +39,54 @@ def fly_and_identify(number: int, vehicle: str = "lama400d") -> dict[str, list[d
         for method, regression in wanted.items():
             result[method] += _intervals(regression, fit.expected, fit.mode.response)
     truth = file.draw(np.random.default_rng(number))
-    flown = simulate(truth, ML_RUNS, seed=number, gusts=GUSTS)
-    found = identify(flown, file)
-    z = 1.959964
+    found = identify(simulate(truth, ML_RUNS, seed=number, gusts=GUSTS), file)
     result["ml"] = [
-        {
-            "name": name,
-            "low": found.after[name].value - z * found.after[name].std,
-            "high": found.after[name].value + z * found.after[name].std,
-            "truth": truth[name].value,
-        }
-        for name in found.fitted
+        _about(n, found.after[n].value, found.after[n].std, truth) for n in found.fitted
     ]
+    if peer:
+        rates = identify(flight, file, channels=("p", "q"))
+        result["ml on p, q"] = [
+            _about(n, rates.after[n].value, rates.after[n].std, file) for n in PEER
+        ]
+        values, std = output_error(flight, file)
+        result["AeroID on p, q"] = [_about(n, values[n], std[n], file) for n in PEER]
     return result
+
+
+def output_error(flight: Flight, file: Vehicle) -> tuple[dict[str, float], dict[str, float]]:
+    """AeroID's default identification of PEER on p and q: values and standard errors."""
+    aeroid = require("aeroid", "study")
+    run = flight.runs[0]
+    state, _ = hover_trim(file, height=float(run.measured["h"][0]))
+    names = [name for name, _ in STATES]
+    inputs = [name for name, _ in COMMANDS]
+    vehicles: dict[tuple[float, ...], Vehicle] = {}
+
+    def dynamics(t: float, x: Any, u: Any, p: Any) -> Any:
+        key = tuple(p[n] for n in PEER)
+        if key not in vehicles:
+            vehicles[key] = file.with_values(dict(zip(PEER, key, strict=True)))
+        return derivative(x, u, vehicles[key])
+
+    model = aeroid.Model(
+        states=names,
+        controls=inputs,
+        parameters={n: file[n].value for n in PEER},
+        dynamics=dynamics,
+    )
+    channels = dict(zip(inputs, run.command.T, strict=True))
+    data = aeroid.FlightData(run.t, {**channels, "p": run.measured["p"], "q": run.measured["q"]})
+    weight = 1.0 / flight.noise["q"]
+    found = aeroid.identify(
+        model, data, list(PEER), outputs=["p", "q"], weights={"p": weight, "q": weight},
+        x0=dict(zip(names, state, strict=True)),
+    )  # fmt: skip
+    return dict(found.parameters), dict(found.stderr)
+
+
+def _about(name: str, value: float, std: float, truth: Vehicle) -> dict[str, Any]:
+    low, high = value - Z * std, value + Z * std
+    return {"name": name, "low": low, "high": high, "truth": truth[name].value}
 
 
 def _intervals(
