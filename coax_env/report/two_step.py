@@ -223,6 +223,8 @@ def _states(shown: Reconstructed, runs: Sequence[Reconstructed]) -> list[str]:
             "smoother": factor * states.smoothed[:, k],
             "integrated IMU": factor * shown.integrated[["u", "w", "theta"][[1, 2, 0].index(k)]],
         }
+        if k == 0 and "theta" in shown.raw:
+            curves["compass"] = DEGREES * shown.raw["theta"]
         panels.append((name, curves))
     height = shown.states.states[:, 3]
     residual = np.interp(
@@ -257,7 +259,14 @@ def _states(shown: Reconstructed, runs: Sequence[Reconstructed]) -> list[str]:
                 shown.t,
                 [
                     ("bias of a_z [m/s²]", {"filter": states.states[:, 4]}),
-                    ("height [m]", {"sonar": shown.raw["h"], "filter": height}),
+                    (
+                        "height [m]",
+                        {
+                            "sonar": shown.raw["h"],
+                            "filter": height,
+                            "integrated IMU": shown.integrated["h"],
+                        },
+                    ),
                     ("residual [m]", {"sonar − filter": residual}),
                 ],
                 POINTS,

@@ -185,7 +185,7 @@ def _noise_record(runs: Sequence[Run]) -> Run:
 def _reconstruct(
     run: Run, quiet: Run, vehicle: Vehicle, noise: Mapping[str, float], cutoff: float
 ) -> Reconstructed:
-    dt, t, raw = even_grid(run, (*IMU, "h"))
+    dt, t, raw = even_grid(run, (*IMU, "h", "theta"))
     quiet_dt, quiet_t, hover = even_grid(quiet, IMU)
     if quiet is run:  # its own quiet start
         hover = {c: values[quiet_t - quiet_t[0] <= QUIET + quiet_dt] for c, values in hover.items()}

@@ -3,6 +3,8 @@
 SciPy's Butterworth and short-time Fourier transform; records are on an even time grid.
 """
 
+from functools import cache
+
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import ShortTimeFFT, butter, get_window, sosfiltfilt
@@ -35,6 +37,12 @@ def even_grid(
     return dt, t, columns
 
 
+@cache
+def _butterworth(cutoff: float, rate: float) -> np.ndarray:
+    """Second-order sections."""
+    return np.asarray(butter(ORDER, cutoff, fs=rate, output="sos"))
+
+
 def low_pass(values: np.ndarray, dt: float, cutoff: float = CUTOFF) -> np.ndarray:
     """Butterworth low-pass run forwards and backwards, so without phase, along axis 0.
 
@@ -45,7 +53,7 @@ def low_pass(values: np.ndarray, dt: float, cutoff: float = CUTOFF) -> np.ndarra
         raise InputError(
             f"a low-pass at {cutoff:g} Hz needs {2 * cutoff:g} readings a second or more"
         )
-    sections = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
+    sections = _butterworth(cutoff, round(1.0 / dt, 6))
     pad = 3 * (2 * len(sections) + 1)
     if len(values) <= pad:
         raise InputError(

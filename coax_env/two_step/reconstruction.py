@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
+from coax_env.jit import compiled
+
 THETA, U, W, H, BIAS = range(5)
 START_STD = np.array([0.02, 0.05, 0.05, 0.05, 0.1])
 """Of the first state, from rest: 1 deg, 5 cm/s, the sonar's reading, 0.1 m/s2. Ours."""
@@ -49,72 +51,85 @@ def longitudinal(
         noise: std of the gyro [rad/s], the accelerometers [m/s2] and the sonar [m]. The paper gives no
             Q, R or P0: Q is the IMU's noise through the model, R the sonar's, both of Table V.
     """
-    n = len(q)
     gyro, accelerometer, echo = noise
-    inputs = np.diag([gyro**2, accelerometer**2, accelerometer**2])
     heard = sonar[np.isfinite(sonar)]
-    x = np.array([0.0, 0.0, 0.0, float(np.median(heard[:20])) if heard.size else 0.0, 0.0])
-    P = np.diag(START_STD**2)
-    predicted, filtered = np.empty((n, 5)), np.empty((n, 5))
-    P_predicted, P_filtered = np.empty((n, 5, 5)), np.empty((n, 5, 5))
-    transition = np.empty((n, 5, 5))
-    residual = np.full(n, np.nan)
-    for k in range(n):
-        predicted[k], P_predicted[k] = x, P
-        if np.isfinite(sonar[k]):
-            gain = P[:, H] / (P[H, H] + echo**2)
-            x = x + gain * (sonar[k] - x[H])
-            P = P - np.outer(gain, P[H])
-            P = 0.5 * (P + P.T)
-        filtered[k], P_filtered[k] = x, P
-        residual[k] = sonar[k] - x[H]
-        u = np.array([q[k], ax[k], az[k]])
-        after = np.array([q[min(k + 1, n - 1)], ax[min(k + 1, n - 1)], az[min(k + 1, n - 1)]])
-        middle = x + 0.5 * dt * _rates(x, u, gravity)
-        x, F, G = (
-            x + dt * _rates(middle, 0.5 * (u + after), gravity),
-            _jacobian(middle, u, gravity),
-            _input_jacobian(middle),
-        )
-        transition[k] = F = np.eye(5) + dt * F + 0.5 * dt**2 * F @ F
-        P = F @ P @ F.T + dt**2 * G @ inputs @ G.T
-    smooth, P_smooth = filtered.copy(), P_filtered.copy()
-    for k in range(n - 2, -1, -1):
-        back = np.linalg.solve(P_predicted[k + 1], transition[k] @ P_filtered[k]).T
-        smooth[k] += back @ (smooth[k + 1] - predicted[k + 1])
-        P_smooth[k] += back @ (P_smooth[k + 1] - P_predicted[k + 1]) @ back.T
-    return Longitudinal(filtered, _std(P_filtered), smooth, _std(P_smooth), residual)
-
-
-def _rates(x: np.ndarray, u: np.ndarray, g: float) -> np.ndarray:
-    q, ax, az = u
-    sin, cos = np.sin(x[THETA]), np.cos(x[THETA])
-    return np.array(
-        [
-            q,
-            ax - q * x[W] - g * sin,
-            az - x[BIAS] + q * x[U] + g * cos,
-            x[U] * sin - x[W] * cos,
-            0.0,
-        ]
+    start = np.array([0.0, 0.0, 0.0, float(np.median(heard[:20])) if heard.size else 0.0, 0.0])
+    shake = np.array([gyro, accelerometer, accelerometer]) ** 2
+    columns = [np.ascontiguousarray(column, float) for column in (q, ax, az, sonar)]
+    predicted, P_predicted, filtered, P_filtered, transition = _filter(
+        *columns, float(dt), float(gravity), shake, float(echo) ** 2, start, START_STD**2
+    )
+    smooth, P_smooth = _smooth(predicted, P_predicted, filtered, P_filtered, transition)
+    return Longitudinal(
+        filtered, _std(P_filtered), smooth, _std(P_smooth), columns[3] - filtered[:, H]
     )
 
 
-def _jacobian(x: np.ndarray, u: np.ndarray, g: float) -> np.ndarray:
-    q = u[0]
+@compiled()
+def _filter(
+    q: np.ndarray, ax: np.ndarray, az: np.ndarray, sonar: np.ndarray, dt: float, g: float,
+    shake: np.ndarray, echo: float, start: np.ndarray, spread: np.ndarray,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """Forward pass: predicted and filtered states (n, 5), covariances (n, 5, 5), transitions."""
+    n = q.size
+    x = start.copy()
+    P = np.diag(spread)
+    predicted, filtered = np.zeros((n, 5)), np.zeros((n, 5))
+    P_predicted, P_filtered = np.zeros((n, 5, 5)), np.zeros((n, 5, 5))
+    transition = np.zeros((n, 5, 5))
+    middle, slope = np.zeros(5), np.zeros(5)
+    for k in range(n):
+        predicted[k], P_predicted[k] = x, P
+        if np.isfinite(sonar[k]):
+            gain = P[:, H].copy() / (P[H, H] + echo)
+            x = x + gain * (sonar[k] - x[H])
+            P = P - np.outer(gain, P[H].copy())
+            P = 0.5 * (P + P.T)
+        filtered[k], P_filtered[k] = x, P
+        after = min(k + 1, n - 1)
+        _rates(x, q[k], ax[k], az[k], g, slope)
+        middle[:] = x + 0.5 * dt * slope
+        halfway = 0.5 * (q[k] + q[after]), 0.5 * (ax[k] + ax[after]), 0.5 * (az[k] + az[after])
+        _rates(middle, halfway[0], halfway[1], halfway[2], g, slope)
+        x = x + dt * slope
+        sin, cos = np.sin(middle[THETA]), np.cos(middle[THETA])
+        A = np.zeros((5, 5))
+        A[U, THETA], A[U, W] = -g * cos, -q[k]
+        A[W, THETA], A[W, U], A[W, BIAS] = -g * sin, q[k], -1.0
+        A[H, THETA] = middle[U] * cos + middle[W] * sin
+        A[H, U], A[H, W] = sin, -cos
+        F = np.eye(5) + dt * A + 0.5 * dt * dt * (A @ A)
+        G = np.zeros((5, 3))
+        G[THETA, 0], G[U, 0], G[W, 0] = 1.0, -middle[W], middle[U]
+        G[U, 1] = G[W, 2] = 1.0
+        transition[k] = F
+        P = F @ P @ F.T + dt * dt * ((G * shake) @ G.T)
+    return predicted, P_predicted, filtered, P_filtered, transition
+
+
+@compiled()
+def _rates(x: np.ndarray, q: float, ax: float, az: float, g: float, out: np.ndarray) -> None:
+    """(46)-(49) with (54)-(55)."""
     sin, cos = np.sin(x[THETA]), np.cos(x[THETA])
-    F = np.zeros((5, 5))
-    F[U, THETA], F[U, W] = -g * cos, -q
-    F[W, THETA], F[W, U], F[W, BIAS] = -g * sin, q, -1.0
-    F[H, THETA], F[H, U], F[H, W] = x[U] * cos + x[W] * sin, sin, -cos
-    return F
+    out[THETA] = q
+    out[U] = ax - q * x[W] - g * sin
+    out[W] = az - x[BIAS] + q * x[U] + g * cos
+    out[H] = x[U] * sin - x[W] * cos
+    out[BIAS] = 0.0
 
 
-def _input_jacobian(x: np.ndarray) -> np.ndarray:
-    G = np.zeros((5, 3))
-    G[THETA, 0], G[U, 0], G[W, 0] = 1.0, -x[W], x[U]
-    G[U, 1] = G[W, 2] = 1.0
-    return G
+@compiled()
+def _smooth(
+    predicted: np.ndarray, P_predicted: np.ndarray, filtered: np.ndarray,
+    P_filtered: np.ndarray, transition: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Backward pass of Rauch, Tung and Striebel."""
+    smooth, P_smooth = filtered.copy(), P_filtered.copy()
+    for k in range(len(filtered) - 2, -1, -1):
+        back = np.linalg.solve(P_predicted[k + 1], transition[k] @ P_filtered[k]).T.copy()
+        smooth[k] += back @ (smooth[k + 1] - predicted[k + 1])
+        P_smooth[k] += back @ (P_smooth[k + 1] - P_predicted[k + 1]) @ back.T
+    return smooth, P_smooth
 
 
 def _std(P: np.ndarray) -> np.ndarray:
