@@ -11,23 +11,25 @@ a row's errors. Filtering leaves rows dependent, so the covariance of b is the s
 M-estimator with the scores' covariance summed over lags (Newey and West 1987; for least squares that
 is the correction of Klein and Morelli 2006, ch. 5).
 
-A short record says nothing of what it remembers for as long as it lasts, and an integrated gyro
-remembers long. Where draws of the errors are at hand, the scores' covariance is that of the draws,
-times what the residuals' own is larger than the draws' over the same few lags (gusts, vibration).
+Sums over lags fail on a short record: the fit has taken from the residuals just what they remember
+longest. Where draws of the errors are at hand, the scores' covariance is that of the draws, and
+what the residuals have beyond them (gusts) counts as noise with a first-order memory, whose size and
+memory are those of largest restricted likelihood (Patterson and Thompson 1971: the fit's share is
+given back).
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import eigh, solve
+from scipy.linalg import eigh, solve, toeplitz
+from scipy.signal import lfilter
 from scipy.stats import t as student
 
 LAGS_PER_MEMORY = 4.0
 """Lags summed, per row that residuals remember."""
-LOOKED_AT = 20
-"""Draws whose covariance over few lags is compared with the residuals'."""
 ENOUGH = 3.0
 """Standard errors by which the weakest direction must stand out of its own errors for total least
 squares to be trusted: (r^2 - 1) sqrt(rows / 2), r = smin(X) / smin([X y])."""
@@ -125,15 +127,81 @@ def total_least_squares(
     bread[np.ix_(noisy, noisy)] -= level * errors[:-1, :-1]
     without_y = eigh(gram[:-1, :-1], errors[:-1, :-1], eigvals_only=True)[0]
     standing = without_y / max(level, 1e-300) - 1.0
-    shaken = None
+    meat = None
     if draws is not None:
         off = draws @ -signed  # (d, n): what the errors make of y - x b
-        moved = np.repeat(instruments[None], len(draws), axis=0)
-        moved[:, :, noisy] += draws[:, :, :-1] + off[:, :, None] * (spread[:-1] / (signed @ spread))
-        shaken = moved * off[:, :, None]
+        meat = _from_draws(draws, off, instruments, noisy, spread / float(signed @ spread))
+        meat = meat + _gusts(residual, instruments, off, list(runs) or [len(y)])
     return _finished(
-        instruments, residual, values, bread, names, runs, standing, "total least squares", shaken
+        instruments, residual, values, bread, names, runs, standing, "total least squares", meat
     )
+
+
+def _from_draws(
+    draws: np.ndarray,
+    off: np.ndarray,
+    instruments: np.ndarray,
+    noisy: np.ndarray,
+    share: np.ndarray,
+) -> np.ndarray:
+    """Covariance of the scores that the errors make, from draws of them.
+
+    The instruments at hand hold errors of their own already, which meet those drawn as a stranger's:
+    what one draw's instruments make of another's errors is taken off again.
+    """
+    own = np.zeros((len(draws), *instruments.shape))
+    own[:, :, noisy] = draws[:, :, :-1] + off[:, :, None] * share[:-1]
+    whole = np.cov(np.einsum("dnk,dn->dk", instruments + own, off).T)
+    strange = np.cov(np.einsum("dnk,dn->dk", np.roll(own, 1, axis=0), off).T)
+    whole, strange = np.atleast_2d(whole), np.atleast_2d(strange)
+    kept, axes = eigh(whole - strange, whole)
+    back = whole @ axes  # axes' whole axes = 1
+    return np.asarray(back @ np.diag(np.maximum(kept, 0.1)) @ back.T)
+
+
+def _gusts(
+    residual: np.ndarray, instruments: np.ndarray, off: np.ndarray, lengths: Sequence[int]
+) -> np.ndarray:
+    """Covariance of the scores from what shakes the residuals beyond their errors `off` (d, n)."""
+    # rows so far apart that the filter no longer ties them: gusts in between are not filtered here
+    step = max(1, math.ceil(1.3 * _memory(off[0], lengths)))
+    edges = np.concatenate([[0], np.cumsum(lengths)])
+    blocks = [np.arange(edges[k], edges[k + 1], step) for k in range(len(lengths))]
+    most = max(len(block) for block in blocks)
+    shape = _autocovariance(off, lengths, step * most)[::step]
+    size = float(residual.var())
+    levels = size * np.geomspace(0.02, 3.0, 24)
+    # beyond a quarter of a run, what is remembered cannot be told from the offset
+    memories = np.geomspace(step, max(min(lengths) / 4.0, 2.0 * step), 7)
+    best, level, memory = -math.inf, 0.0, 1.0
+    for tau in memories:
+        parts = []
+        for block in blocks:
+            lag = np.arange(len(block))
+            D = toeplitz(shape[: len(block)]) + 1e-3 * shape[0] * np.eye(len(block))
+            w, turn = eigh(toeplitz(np.exp(-step * lag / tau)), D)
+            parts.append((w, turn.T @ residual[block], turn.T @ instruments[block]))
+        for s in (0.0, *levels):
+            told = 0.0
+            A = np.zeros((instruments.shape[1],) * 2)
+            c = np.zeros(instruments.shape[1])
+            for w, y, X in parts:
+                v = 1.0 + s * w
+                told -= 0.5 * float(np.sum(np.log(v)) + np.sum(y**2 / v))
+                A += X.T @ (X / v[:, None])
+                c += X.T @ (y / v)
+            told += 0.5 * float(c @ np.linalg.lstsq(A, c, rcond=None)[0])
+            told -= 0.5 * float(np.linalg.slogdet(A)[1])
+            if told > best:
+                best, level, memory = told, s, float(tau)
+    keep = math.exp(-1.0 / memory)
+    total = np.zeros((instruments.shape[1],) * 2)
+    for start, stop in pairwise(edges):
+        part = instruments[start:stop]
+        ahead = lfilter([1.0], [1.0, -keep], part, axis=0)
+        behind = lfilter([1.0], [1.0, -keep], part[::-1], axis=0)[::-1]
+        total += part.T @ (ahead + behind - part)
+    return level * total
 
 
 def _finished(
@@ -145,19 +213,14 @@ def _finished(
     runs: Sequence[int],
     standing: float,
     method: str,
-    shaken: np.ndarray | None = None,
+    meat: np.ndarray | None = None,
 ) -> Regression:
     lengths = list(runs) or [len(residual)]
     memory = _memory(residual, lengths)
     rows = len(residual) / memory
-    lags = math.ceil(LAGS_PER_MEMORY * memory)
-    meat = _over_lags(instruments * residual[:, None], lengths, lags)
-    if shaken is not None:
-        sums = shaken.sum(axis=1)
-        few = np.mean([_spread_over_lags(s, lengths, lags) for s in shaken[:LOOKED_AT]], axis=0)
-        ratio = np.diag(meat) / few
-        larger = np.sqrt(np.maximum(0.5 * (ratio + ratio.mean()), 1.0))
-        meat = np.cov(sums.T) * np.outer(larger, larger)
+    if meat is None:
+        lags = math.ceil(LAGS_PER_MEMORY * memory)
+        meat = _over_lags(instruments * residual[:, None], lengths, lags)
     meat *= rows / max(rows - len(values), 1.0)
     inverse = solve(bread, np.eye(len(values)))
     return Regression(
@@ -176,17 +239,23 @@ def _memory(residual: np.ndarray, lengths: Sequence[int]) -> float:
 
     Squares, since what counts for a covariance is that of products (Bartlett 1946).
     """
-    most = max(2, min(lengths) // 4)
-    total = np.zeros(most)
-    for part in np.split(residual, np.cumsum(lengths)[:-1]):
-        part = part - residual.mean()
-        size = 1 << (2 * len(part) - 1).bit_length()
-        power = np.abs(np.fft.rfft(part, size)) ** 2
-        total += np.fft.irfft(power, size)[:most]
+    total = _autocovariance(residual[None], lengths, max(2, min(lengths) // 4))
     shape = total / max(total[0], 1e-300)
     small = np.flatnonzero(np.abs(shape) < 0.05)
-    end = int(small[0]) if small.size else most
+    end = int(small[0]) if small.size else len(shape)
     return float(1.0 + 2.0 * np.sum(shape[1:end] ** 2))
+
+
+def _autocovariance(values: np.ndarray, lengths: Sequence[int], lags: int) -> np.ndarray:
+    """Mean over the rows of `values` (d, n) and over runs, lags 0 .. lags - 1, biased as usual."""
+    total = np.zeros(lags)
+    for part in np.split(values, np.cumsum(lengths)[:-1], axis=1):
+        part = part - values.mean()
+        size = 1 << (2 * part.shape[1] - 1).bit_length()
+        power = np.mean(np.abs(np.fft.rfft(part, size, axis=1)) ** 2, axis=0)
+        shape = np.fft.irfft(power, size)[:lags]
+        total[: len(shape)] += shape
+    return total / values.shape[1]
 
 
 def _over_lags(scores: np.ndarray, lengths: Sequence[int], lags: int) -> np.ndarray:
@@ -198,18 +267,6 @@ def _over_lags(scores: np.ndarray, lengths: Sequence[int], lags: int) -> np.ndar
         for lag, weight in enumerate(_parzen(min(lags, len(part) - 1))[1:], 1):
             across = part[lag:].T @ part[:-lag]
             total += weight * (across + across.T)
-    return total
-
-
-def _spread_over_lags(scores: np.ndarray, lengths: Sequence[int], lags: int) -> np.ndarray:
-    """The diagonal of `_over_lags`, by the fast Fourier transform, (k,)."""
-    total = np.zeros(scores.shape[1])
-    for part in np.split(scores, np.cumsum(lengths)[:-1]):
-        size = 1 << (2 * len(part) - 1).bit_length()
-        power = np.abs(np.fft.rfft(part, size, axis=0)) ** 2
-        weights = _parzen(min(lags, len(part) - 1))
-        shape = np.fft.irfft(power, size, axis=0)[: len(weights)]
-        total += shape[0] + 2.0 * weights[1:] @ shape[1:]
     return total
 
 
