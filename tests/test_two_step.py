@@ -13,7 +13,7 @@ from scipy.stats import binom
 from coax_env import identify, load_vehicle, simulate
 from coax_env.errors import InputError
 from coax_env.files import write_text
-from coax_env.simulation import fly_all
+from coax_env.simulation import Gusts, fly_all
 from coax_env.two_step import modes
 from coax_env.two_step.modes import MODES, PHYSICS, fit_mode, fit_physics, joined, rows_of
 from coax_env.two_step.processing import (
@@ -285,6 +285,24 @@ def test_coefficients_of_the_doublet_are_those_of_the_physics():
                 beyond += int(np.sum(np.abs(z) > 3.0))
     assert beyond <= 1  # of 96
     assert misses >= 6  # the paper's form is wrong, and the std shows it
+
+
+@pytest.mark.slow
+def test_intervals_cover_in_gusts():
+    """A gust's memory is as long as a side of the doublet; least squares' intervals fall far short."""
+    inside, plain, count = 0, 0, 0
+    for seed in range(60):
+        flight = simulate(LAMA, "lon_doublet", sensors="paper", seed=seed, gusts=Gusts())
+        for fit in fits_of(flight).values():
+            regression = fit.completed or fit.total
+            truth = np.array([fit.expected[n] for n in regression.names])
+            low, high = regression.interval().T
+            inside += int(np.sum((low < truth) & (truth < high)))
+            count += len(truth)
+            low, high = fit.ordinary.interval().T
+            plain += int(np.sum((low < truth[: len(low)]) & (truth[: len(low)] < high)))
+    assert 0.91 < inside / count < 0.985, inside / count
+    assert plain / count < 0.75
 
 
 def test_the_doublet_ties_what_equation_26_ties():
