@@ -3,6 +3,7 @@
 The formulas here come from the paper (design/paper.md, design/effects.md), not from the code.
 """
 
+import gc
 import math
 import os
 import shutil
@@ -12,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba.core.caching import NullCache
+from numba.core.dispatcher import Dispatcher
 from scipy.spatial.transform import Rotation
 
 from coax_env import derivative, dynamics, effects, hover_trim, jit, load_vehicle
@@ -765,6 +768,17 @@ def test_entries_are_complete(name):
 
 
 # --- the cache of compiled code -----------------------------------------------------------------
+
+
+def test_no_two_compiled_functions_share_a_place_in_the_cache():
+    """Processes that fill a shared index at once may swap its entries: another function's code runs."""
+    places = {}
+    for thing in gc.get_objects():
+        if isinstance(thing, Dispatcher) and not isinstance(thing._cache, NullCache):
+            function = thing.py_func
+            place = (function.__module__, function.__qualname__, function.__code__.co_firstlineno)
+            assert places.setdefault(place, thing) is thing, place
+    assert len(places) > 30
 
 
 @pytest.mark.slow
