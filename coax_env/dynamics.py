@@ -198,8 +198,6 @@ def _rates_of(with_effects):
         dx[14] = forward * sin_psi + right * cos_psi
         dx[15] = -u_ * sin_theta + (v_ * sin_phi + w_ * cos_phi) * cos_theta
 
-    # numba's cache keeps one index per name, and two processes that fill it at once may swap entries
-    rates.__qualname__ = "rates_with_effects" if with_effects else "rates_bare"
     return compiled()(rates)
 
 

@@ -73,11 +73,23 @@ def _own_cache() -> Iterator[None]:
         numba.config.CACHE_DIR = before
 
 
+def _name_apart(function: Callable) -> None:
+    """Give a closure a name with its values in it.
+
+    The cache has one index per name. Closures of one name would share it, and two processes that fill
+    it at once can leave one closure's machine code under the other's key.
+    """
+    values = [cell.cell_contents for cell in function.__closure__ or ()]
+    if values and all(isinstance(value, bool | int | float | str) for value in values):
+        function.__qualname__ += "_" + "_".join(map(str, values))
+
+
 def compiled(signature: Any = None, **options: Any) -> Callable[[Callable], Any]:
     """``numba.njit`` that caches under CACHE_DIR and releases the GIL."""
     settings = {"cache": True, "nogil": True, "error_model": "numpy", **options}
 
     def decorate(function: Callable) -> Any:
+        _name_apart(function)
         with _own_cache():
             if signature is None:
                 return numba.njit(**settings)(function)
