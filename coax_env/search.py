@@ -28,7 +28,7 @@ from coax_env.engine.model import FreeParameter, Noise
 from coax_env.generic_terms import AXES
 from coax_env.heli_model import BUFFET_LEVELS, GUST_LEVELS, HeliModel
 
-EVIDENCE = 12.0
+EVIDENCE = 14.0
 """Nats a cause must be worth, Occam factor deducted."""
 TIE = 6.0
 """Alternatives within this many nats cannot be told apart."""
