@@ -52,6 +52,7 @@ def test_all_inputs_are_stirred_by_the_multisine():
         assert np.all(flown.command.std(axis=0) > 0)
 
 
+@pytest.mark.slow
 def test_what_is_learned_decides_what_is_flown():
     ground = plan_flight(LAMA, ["ground_effect"], runs=1)
     assert ground.runs[0].maneuver.name == "low_hover"
@@ -60,6 +61,7 @@ def test_what_is_learned_decides_what_is_flown():
     assert "differential" in yaw.runs[0].maneuver.injected
 
 
+@pytest.mark.slow
 def test_the_expected_std_is_what_identification_then_reports(tmp_path):
     """Promised before, kept after: fly the plan with noise and identify."""
     plan = plan_flight(LAMA, ["flap_time_constant", "swash_to_flap"], runs=3)
@@ -72,6 +74,7 @@ def test_the_expected_std_is_what_identification_then_reports(tmp_path):
         assert result.after[name].std == pytest.approx(plan.std_after[name], rel=0.5), name
 
 
+@pytest.mark.slow
 def test_the_envelope_is_kept_by_every_vehicle_of_the_spread():
     tight = Envelope(tilt=np.radians(6.0), room=3.0)
     plan = plan_flight(LAMA, runs=2, envelope=tight)

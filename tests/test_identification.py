@@ -60,6 +60,7 @@ def _engine(flight):
     return Engine(HeliModel(LAMA), [record_of(run) for run in flight.runs])
 
 
+@pytest.mark.slow
 def test_a_model_that_lacks_something_keeps_the_files_priors():
     """A delay that the file does not have must not be paid for by its inertias."""
     lagging = LAMA.with_effect("servo_delay", time=0.1)
@@ -68,6 +69,7 @@ def test_a_model_that_lacks_something_keeps_the_files_priors():
     assert any("lacks something" in remark for remark in result.remarks)
 
 
+@pytest.mark.slow
 def test_runs_of_one_vehicle_agree_and_a_strange_one_stands_out(flight):
     same = identify(flight, LAMA)
     for run in same.by_run:

@@ -253,6 +253,7 @@ def test_simulate_then_replay_then_identify(tmp_path):
     assert "Table VIII examined" in (tmp_path / "steps" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_planned_flight_is_a_flight_folder(tmp_path):
     done = script("plan_flight.py", "--runs", "2", "--learn", "inertia_yy", "--out", "plan",
                   cwd=tmp_path)  # fmt: skip

@@ -359,6 +359,7 @@ def test_a_planted_vehicle_comes_back_and_flies(tmp_path):
     env.step(env.action_space.sample())
 
 
+@pytest.mark.slow
 def test_pooled_regressions_are_one_where_the_file_is_right():
     """Mean over flights of each factor, and the scatter that its std promises."""
     z = []
