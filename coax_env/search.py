@@ -25,6 +25,7 @@ import numpy as np
 from coax_env import effects
 from coax_env.engine.fit import Engine, Linearised, RunPass, bounded_solve, objective
 from coax_env.engine.model import FreeParameter, Noise
+from coax_env.engine.whiteness import whiteness
 from coax_env.generic_terms import AXES
 from coax_env.heli_model import BUFFET_LEVELS, GUST_LEVELS, HeliModel
 
@@ -355,12 +356,15 @@ class Search:
 
         Signatures hold the gains still. What an effect does to the gains is small, and zero on average,
         but on a gusty flight it can be a standard deviation. The slope by differences of whole filter
-        passes has it in.
+        passes has it in. Coloured innovations say that the gains are not those of the true noise: then
+        that part of the slope is no more than a bias, and is left out.
         """
         state = self.settle(state, MOST_STEPS, POLISH)
         free = self.free(state.active)
         own = [f for f in free if "." in f.name]
-        for _ in range(MOST_POLISHES if own else 0):
+        judged = whiteness(self.engine.filter(state.values, state.noise), self.model.channels)
+        white = all(channel.white for channel in judged.values())
+        for _ in range(MOST_POLISHES if own and white else 0):
             _, lin = self.engine.linearise(state.values, state.noise, free)
             quadratic = Quadratic.of(lin, free, state.values)
             names = [f.name for f in free]
