@@ -3,7 +3,7 @@
 Data flow::
 
     log -> signals, "topic.field" -> (t, values)         pyulog or pymavlink, both optional
-        -> channels: the autopilot's own (CHANNELS_OF) and what the caller takes from it (TAKEN)
+        -> channels: the autopilot's own (PX4, ARDUPILOT) and what the caller takes from it (Taken)
         -> one row per IMU reading, thinned to at most ROWS a second -> Flight
 
 What an autopilot does not know is how its outputs move this machine: rotor speeds and swash tilt are
@@ -20,16 +20,16 @@ from typing import Any
 import numpy as np
 
 from coax_env.errors import InputError, require
-from coax_env.flight import Flight, Run, hold_last
+from coax_env.flight import SHORTEST_RUN, Flight, Run, hold_last
 from coax_env.layout import CHANNELS, RPM_PER_RAD_S
+from coax_env.log_units import ROTOR_COMMANDS, SWASH_COMMANDS
 
 ROWS = 100.0  # a second
-SHORTEST = 2.0  # s
 DEGREE = np.pi / 180.0
 Signal = tuple[np.ndarray, np.ndarray]
 """Times [s] and values, both (n,)."""
 
-COMMANDS = ("rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat")
+COMMANDS = (*ROTOR_COMMANDS, *SWASH_COMMANDS)
 
 PX4: dict[str, tuple[str, ...]] = {
     "p": ("vehicle_angular_velocity.xyz[0]", "sensor_combined.gyro_rad[0]"),
@@ -170,9 +170,9 @@ def _run(name: str, channels: Mapping[str, Signal], start: float, stop: float, p
 
     A row's reading is the mean of what came since the row before (angles: the last of it).
     """
-    if stop - start < SHORTEST:
+    if stop - start < SHORTEST_RUN:
         raise InputError(
-            f"{path}: a run from {start:g} to {stop:g} s is shorter than {SHORTEST:g} s"
+            f"{path}: a run from {start:g} to {stop:g} s is shorter than {SHORTEST_RUN:g} s"
         )
     clock = channels.get("p") or channels.get("ax") or channels["phi"]
     rate = (len(clock[0]) - 1) / max(clock[0][-1] - clock[0][0], 1e-9)

@@ -569,11 +569,8 @@ def fitted_vehicle(
     correlation = covariance / np.outer(scale, scale)
     correlation = 0.5 * (correlation + correlation.T)
     np.fill_diagonal(correlation, 1.0)
-    done = vehicle.with_parameters(changed)
-    flights = [*vehicle.provenance.get("flights", ()), *flight.hashes.values()]
     return replace(
-        done,
+        vehicle.with_parameters(changed).seen(flight.hashes.values()),
         correlated=tuple(f.name for f in free),
         correlation=correlation,
-        provenance={**vehicle.provenance, "flights": flights},
     )

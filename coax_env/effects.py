@@ -39,7 +39,7 @@ from coax_env import flow as F
 from coax_env import generic_terms
 from coax_env import parameters as P
 from coax_env.errors import InputError
-from coax_env.jit import compiled
+from coax_env.jit import compiled, name_apart
 from coax_env.layout import CHANNELS
 
 STAGES = ("PROPERTY", "AIR", "SWASH", "ROTOR", "LOAD", "UNLISTED", "SENSOR")
@@ -753,20 +753,22 @@ def stage_function(stage: int) -> Callable:
     """One compiled function that runs all effects of a stage in the catalogue's order."""
     entries = [e for e in GROUPS.values() if e.stage == stage]
 
-    @njit(error_model="numpy")
-    def nothing(x, f, p):
-        pass
-
-    chain = nothing
+    chain = _nothing
     for entry in reversed(entries):
-        chain = _before(entry.function, entry.index, chain)
+        chain = _before(entry, chain)
     return chain
 
 
-def _before(function: Callable, e: int, rest: Callable) -> Callable:
-    @njit(error_model="numpy")
+@njit(error_model="numpy")
+def _nothing(x, f, p):
+    pass
+
+
+def _before(entry: Effect, rest: Callable) -> Callable:
+    function, e = entry.function, entry.index
+
     def both(x, f, p):
         function(x, f, p, e)
         rest(x, f, p)
 
-    return both
+    return njit(error_model="numpy")(name_apart(both, entry.name))

@@ -60,7 +60,7 @@ class FlightPlan:
     """Result of `plan_flight`.
 
     wanted: names of the numbers to learn. std_before, std_after: of each, expected. refused: maneuvers
-    left out, and why. effects: those added to the vehicle's own numbers.
+    left out, and why. sensors: suite that is to be logged.
     """
 
     vehicle: Vehicle

@@ -18,7 +18,7 @@ from coax_env.diagnosis import double_counting, fitted_vehicle, median_step, wit
 from coax_env.effects import CATALOGUE
 from coax_env.engine.fit import Engine, Estimate, Linearised
 from coax_env.engine.model import FreeParameter, Noise
-from coax_env.engine.whiteness import whiteness
+from coax_env.engine.whiteness import is_white
 from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight
 from coax_env.heli_model import GUST_LEVELS, HeliModel, record_of, starting_noise
@@ -176,7 +176,8 @@ def identify(
     free, estimate, noise, widened = _fitted(engine, own, bare, first, say)
     if widened > 1.0:
         contradiction = "the flights contradict the file's values by far more than its std"
-        if _is_white(engine, {**model.bare_values, **estimate.values}, noise):
+        at = {**model.bare_values, **estimate.values}
+        if is_white(engine.filter(at, noise), engine.model.channels):
             remarks.append(f"{contradiction}: priors taken {widened:.1f} times as wide")
         else:
             say("the model lacks something: back to the file's priors")
@@ -275,12 +276,6 @@ def _fitted(
             best = estimate.objective
         noise = engine.fit_noise(values, noise, GUST_LEVELS, 8, ENOUGH)
     return free, estimate, noise, widened
-
-
-def _is_white(engine: Engine, values: Mapping[str, float], noise: Noise) -> bool:
-    """Whether the innovations leave nothing to explain."""
-    judged = whiteness(engine.filter(values, noise), engine.model.channels)
-    return all(channel.white for channel in judged.values())
 
 
 def _open(

@@ -73,15 +73,19 @@ def _own_cache() -> Iterator[None]:
         numba.config.CACHE_DIR = before
 
 
-def _name_apart(function: Callable) -> None:
-    """Give a closure a name with its values in it.
+def name_apart(function: Callable, *values: Any) -> Callable:
+    """Give a closure a name with its values in it, or with those given.
 
-    The cache has one index per name. Closures of one name would share it, and two processes that fill
-    it at once can leave one closure's machine code under the other's key.
+    numba tells functions apart by name and by a count of what this process has compiled so far, in the
+    cache's index as in the machine code's symbols. Closures of one name can therefore be mixed up where
+    one process loads what two have compiled, or one that was stopped half way and began again.
     """
-    values = [cell.cell_contents for cell in function.__closure__ or ()]
-    if values and all(isinstance(value, bool | int | float | str) for value in values):
+    if not values:
+        cells = [cell.cell_contents for cell in function.__closure__ or ()]
+        values = tuple(v for v in cells if isinstance(v, bool | int | float | str))
+    if values:
         function.__qualname__ += "_" + "_".join(map(str, values))
+    return function
 
 
 def compiled(signature: Any = None, **options: Any) -> Callable[[Callable], Any]:
@@ -89,7 +93,7 @@ def compiled(signature: Any = None, **options: Any) -> Callable[[Callable], Any]
     settings = {"cache": True, "nogil": True, "error_model": "numpy", **options}
 
     def decorate(function: Callable) -> Any:
-        _name_apart(function)
+        name_apart(function)
         with _own_cache():
             if signature is None:
                 return numba.njit(**settings)(function)

@@ -25,7 +25,7 @@ import numpy as np
 from coax_env import effects
 from coax_env.engine.fit import Engine, Linearised, RunPass, bounded_solve, objective
 from coax_env.engine.model import FreeParameter, Noise
-from coax_env.engine.whiteness import whiteness
+from coax_env.engine.whiteness import is_white
 from coax_env.generic_terms import AXES
 from coax_env.heli_model import BUFFET_LEVELS, GUST_LEVELS, HeliModel
 
@@ -362,9 +362,11 @@ class Search:
         state = self.settle(state, MOST_STEPS, POLISH)
         free = self.free(state.active)
         own = [f for f in free if "." in f.name]
-        judged = whiteness(self.engine.filter(state.values, state.noise), self.model.channels)
-        white = all(channel.white for channel in judged.values())
-        for _ in range(MOST_POLISHES if own and white else 0):
+        if not own:
+            return state
+        if not is_white(self.engine.filter(state.values, state.noise), self.model.channels):
+            return state
+        for _ in range(MOST_POLISHES):
             _, lin = self.engine.linearise(state.values, state.noise, free)
             quadratic = Quadratic.of(lin, free, state.values)
             names = [f.name for f in free]

@@ -126,6 +126,11 @@ class Vehicle:
             self.with_values({names[k]: v for k, v in air.items()}, "flight card") if air else self
         )
 
+    def seen(self, hashes: Iterable[str]) -> "Vehicle":
+        """A copy that remembers the files it was fitted on, by their hashes."""
+        flights = [*self.provenance.get("flights", ()), *hashes]
+        return replace(self, provenance={**self.provenance, "flights": flights})
+
     def draw(self, rng: np.random.Generator) -> "Vehicle":
         """A vehicle drawn from this one's spread; positive base parameters are log-normal."""
         flat = dict(self.parameters) | {

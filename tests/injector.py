@@ -145,7 +145,7 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
 
 OTHER_FORM = frozenset({"ground_effect.gain", "airframe_drag.area_x", "airframe_drag.area_y",
                         "airframe_drag.area_z", "wake_interference.gain",
-                        "rate_damping.coefficient", "vibration.amplitude",
+                        "rate_damping.coefficient", "vibration.amplitude", "battery_sag.rate",
                         "outside.heading_moment"})  # fmt: skip
 """Parameters whose number means something else here than in the catalogue."""
 

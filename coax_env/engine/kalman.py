@@ -50,6 +50,19 @@ def _product(A, B, out):
                     out[i, j] += weight * B[a, j]
 
 
+@compiled(types.void(STEP, _A, _A, float64, _A, _A, _A, _A, _A, _A, _M), **REORDER)
+def _differences(flow, x, u, dt, p, work, scale, base, x_probe, x_moved, out):
+    """Jacobian of a flow in the state, from its value `base` at x, into `out`."""
+    nx = x.size
+    for j in range(nx):
+        for i in range(nx):
+            x_probe[i] = x[i]
+        x_probe[j] += scale[j]
+        flow(x_probe, u, dt, p, work, x_moved)
+        for i in range(nx):
+            out[i, j] = (x_moved[i] - base[i]) / scale[j]
+
+
 @compiled(**REORDER)
 def _transition(drift, step, exact, x, u, dt, p, work, scale, x_next, x_probe, x_moved, A, AA, F):
     """Jacobian F of a step at x: the exponential of that of the drift, to third order.
@@ -57,27 +70,15 @@ def _transition(drift, step, exact, x, u, dt, p, work, scale, x_next, x_probe, x
     A step too long for that has its own Jacobian taken, by differences of `step` (x_next at x).
     """
     nx = x.size
-    drift(x, u, dt, p, work, x_moved)
-    for i in range(nx):
-        F[i, i] = x_moved[i]  # kept there until A is complete
+    base = np.zeros(nx)
+    drift(x, u, dt, p, work, base)
+    _differences(drift, x, u, dt, p, work, scale, base, x_probe, x_moved, A)
     largest = 0.0
-    for j in range(nx):
-        for i in range(nx):
-            x_probe[i] = x[i]
-        x_probe[j] += scale[j]
-        drift(x_probe, u, dt, p, work, x_moved)
-        for i in range(nx):
-            A[i, j] = (x_moved[i] - F[i, i]) / scale[j]
-            if i == j and not exact[i]:
-                largest = max(largest, abs(A[i, j]))
+    for i in range(nx):
+        if not exact[i]:
+            largest = max(largest, abs(A[i, i]))
     if largest > MOST_DECAY:
-        for j in range(nx):
-            for i in range(nx):
-                x_probe[i] = x[i]
-            x_probe[j] += scale[j]
-            step(x_probe, u, dt, p, work, x_moved)
-            for i in range(nx):
-                F[i, j] = (x_moved[i] - x_next[i]) / scale[j]
+        _differences(step, x, u, dt, p, work, scale, x_next, x_probe, x_moved, F)
         return
     # F = I + A (I + A/2 (I + A/3)), a row at a time; exact rows are I + A
     _product(A, A, AA)

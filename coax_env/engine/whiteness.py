@@ -72,3 +72,8 @@ def _judge(parts: Sequence[tuple[str, np.ndarray]]) -> Whiteness:
             worst = judged
     assert worst is not None
     return worst
+
+
+def is_white(passes: Sequence[RunPass], channels: Sequence[str]) -> bool:
+    """Whether the innovations leave nothing to explain in any channel."""
+    return all(judged.white for judged in whiteness(passes, channels).values())

@@ -21,6 +21,7 @@ from coax_env.two_step.method import PhysicalFit, Reconstructed, TwoStep
 from coax_env.two_step.modes import ModeFit
 from coax_env.two_step.processing import CUTOFF, ORDER, SEGMENT
 from coax_env.two_step.published import direction, lift_artefact, predicted, table_viii
+from coax_env.two_step.reconstruction import BIAS, THETA, H, U, W
 from coax_env.two_step.regression import MOST_INFLATION, Regression
 
 POINTS = 500
@@ -217,28 +218,29 @@ def _longest(runs: Sequence[Reconstructed]) -> Reconstructed:
 def _states(shown: Reconstructed, runs: Sequence[Reconstructed]) -> list[str]:
     states = shown.states
     panels = []
-    for name, k, factor in (("u [m/s]", 1, 1.0), ("w [m/s]", 2, 1.0), ("pitch [deg]", 0, DEGREES)):
+    for name, state, k, factor in (
+        ("u [m/s]", "u", U, 1.0),
+        ("w [m/s]", "w", W, 1.0),
+        ("pitch [deg]", "theta", THETA, DEGREES),
+    ):
         curves = {
             "filter": factor * states.states[:, k],
             "smoother": factor * states.smoothed[:, k],
-            "integrated IMU": factor * shown.integrated[["u", "w", "theta"][[1, 2, 0].index(k)]],
+            "integrated IMU": factor * shown.integrated[state],
         }
-        if k == 0 and "theta" in shown.raw:
+        if k == THETA and "theta" in shown.raw:
             curves["compass"] = DEGREES * shown.raw["theta"]
         panels.append((name, curves))
-    height = shown.states.states[:, 3]
-    residual = np.interp(
-        shown.t,
-        shown.t[np.isfinite(states.residual)],
-        states.residual[np.isfinite(states.residual)],
-    )
+    height = states.states[:, H]
+    heard = _heard(shown)
+    residual = np.interp(shown.t, shown.t[heard], states.residual[heard])
     rows = [
         [
             run.run,
-            with_std(float(run.states.states[-1, 4]), float(run.states.std[-1, 4]), "m/s²"),
+            with_std(float(run.states.states[-1, BIAS]), float(run.states.std[-1, BIAS]), "m/s²"),
             f"{float(np.nanstd(run.states.residual)):.3f} m",
             f"{100 * float(np.mean(np.abs(run.states.residual[_heard(run)]) < 0.1)):.0f} %",
-            f"{float(run.states.std[-1, 1]):.2f} m/s",
+            f"{float(run.states.std[-1, U]):.2f} m/s",
         ]
         for run in runs
     ]
@@ -258,7 +260,7 @@ def _states(shown: Reconstructed, runs: Sequence[Reconstructed]) -> list[str]:
             figures.histories(
                 shown.t,
                 [
-                    ("bias of a_z [m/s²]", {"filter": states.states[:, 4]}),
+                    ("bias of a_z [m/s²]", {"filter": states.states[:, BIAS]}),
                     (
                         "height [m]",
                         {

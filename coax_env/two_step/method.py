@@ -21,6 +21,7 @@ import numpy as np
 from coax_env.errors import InputError
 from coax_env.flight import Flight, Run
 from coax_env.heli_model import sensor_std
+from coax_env.sensors import suite
 from coax_env.two_step.modes import (
     IMU,
     MODES,
@@ -45,9 +46,9 @@ from coax_env.two_step.reconstruction import Longitudinal, longitudinal
 from coax_env.two_step.regression import Regression
 from coax_env.vehicle import Parameter, Vehicle
 
-TABLE_V = {"p": 2.0, "q": 2.0, "r": 2.0, "ax": 0.1, "ay": 0.1, "az": 0.1, "h": 0.05}
-"""Std of the sensors as the paper assumes them [deg/s, m/s2, m]; used where the card says nothing and
-the data are too few to say."""
+TABLE_V = {sensor.name: sensor.noise for sensor in suite("paper")}
+"""Std of the sensors as the paper assumes them; used where the card says nothing and the data show no
+noise at all."""
 QUIET = 1.0
 """Seconds at a run's start, before its maneuver, that serve as the noise record where no run hovers."""
 Progress = Callable[[str], None]
@@ -67,7 +68,6 @@ class Reconstructed:
     smooth: Mapping[str, np.ndarray]
     spectral: Mapping[str, np.ndarray]
     integrated: Mapping[str, np.ndarray]
-    sonar: np.ndarray
     states: Longitudinal
 
 
@@ -133,8 +133,13 @@ def two_step(
         remarks.append(f"without gyros or accelerometers, left out: {', '.join(left_out)}")
     say("filtering and reconstructing the states")
     quiet = _noise_record(usable)
+    hover = _still(quiet, cutoff)
     reconstructed = tuple(
-        _reconstruct(run, quiet, vehicle, noise, cutoff) for run in usable if "h" in run.measured
+        _reconstruct(
+            run, _still(run, cutoff, QUIET) if run is quiet else hover, vehicle, noise, cutoff
+        )
+        for run in usable
+        if "h" in run.measured
     )
     if not reconstructed:
         remarks.append("no height was logged: the states of step 1 are not reconstructed")
@@ -168,10 +173,7 @@ def two_step(
 
 
 def _noise_of(flight: Flight, channel: str) -> float:
-    found = sensor_std(flight, channel)
-    if found > 0.0:
-        return found
-    return TABLE_V.get(channel, 1.0) * (math.pi / 180.0 if channel in ("p", "q", "r") else 1.0)
+    return sensor_std(flight, channel) or TABLE_V.get(channel, 1.0)
 
 
 # --- section IV.C and step 1 --------------------------------------------------------------------------
@@ -182,19 +184,26 @@ def _noise_record(runs: Sequence[Run]) -> Run:
     return min(runs, key=lambda run: sum(stir(run, axis) / STIR[axis] for axis in STIR))
 
 
+def _still(run: Run, cutoff: float, seconds: float = math.inf) -> dict[str, np.ndarray]:
+    """The IMU of a run's first so many seconds, low-passed: what it reads while nothing is flown."""
+    dt, t, raw = even_grid(run, IMU)
+    kept = t - t[0] <= seconds + dt
+    return {c: low_pass(values[kept], dt, cutoff) for c, values in raw.items()}
+
+
 def _reconstruct(
-    run: Run, quiet: Run, vehicle: Vehicle, noise: Mapping[str, float], cutoff: float
+    run: Run,
+    still: Mapping[str, np.ndarray],
+    vehicle: Vehicle,
+    noise: Mapping[str, float],
+    cutoff: float,
 ) -> Reconstructed:
     dt, t, raw = even_grid(run, (*IMU, "h", "theta"))
-    quiet_dt, quiet_t, hover = even_grid(quiet, IMU)
-    if quiet is run:  # its own quiet start
-        hover = {c: values[quiet_t - quiet_t[0] <= QUIET + quiet_dt] for c, values in hover.items()}
     smooth = {c: low_pass(values, dt, cutoff) for c, values in raw.items()}
     spectral = {}
     for c in IMU:
-        still = low_pass(hover[c], quiet_dt, cutoff)
         try:
-            spectral[c] = spectral_amplitude_filter(smooth[c], still, dt)
+            spectral[c] = spectral_amplitude_filter(smooth[c], still[c], dt)
         except InputError:  # no noise record of a segment's length
             spectral[c] = smooth[c]
     g = vehicle["gravity"].value
@@ -206,7 +215,7 @@ def _reconstruct(
         raw["q"], raw["ax"], raw["az"], sonar, dt, g, (noise["q"], noise["az"], noise["h"])
     )
     path = integrated(smooth["q"], smooth["ax"], smooth["az"], dt, g, float(smooth["h"][0]))
-    return Reconstructed(run.name, t - t[0], raw, smooth, spectral, path, sonar, states)
+    return Reconstructed(run.name, t - t[0], raw, smooth, spectral, path, states)
 
 
 # --- the vehicle --------------------------------------------------------------------------------------
@@ -232,11 +241,9 @@ def _physical(
         found = _parameters(physics, regression, after, f"identified from {where} (two steps)")
         after = after.with_parameters(dict(zip(physics.parameters, found, strict=True)))
         fits.append(PhysicalFit(physics, regression, found))
-    flights = [*vehicle.provenance.get("flights", ()), *flight.hashes.values()]
     return tuple(fits), replace(
-        after,
+        after.seen(flight.hashes.values()),
         description=f"{vehicle.description}; identified from {where} by the paper's two steps",
-        provenance={**vehicle.provenance, "flights": flights},
     )
 
 

@@ -290,6 +290,10 @@ def _columns(
     tilted = {"T_u": T_u, "T_l": T_l, "alpha_u": alpha_u, "alpha_l": alpha_l,
               "beta_u": beta_u, "beta_l": beta_l}  # fmt: skip
     turning = momentum(tilted, vehicle)
+    moment_x, moment_y, moment_z = (
+        p[inertia] * lagrange_derivative(signals[rate], dt)
+        for inertia, rate in (("inertia_xx", "p"), ("inertia_yy", "q"), ("inertia_zz", "r"))
+    )
     return {
         "1": np.ones(len(command)),
         "delta_lon": delta_lon if delta_lon.ndim == 1 else delta_lon[:, 0],
@@ -308,18 +312,18 @@ def _columns(
         "C_X": p["mass"] * signals["ax"] / force,
         "C_Y": p["mass"] * signals["ay"] / force,
         "C_Z": -p["mass"] * signals["az"] / force,
-        "C_l": p["inertia_xx"] * _derivative(signals["p"], dt) / moment,
-        "C_m": p["inertia_yy"] * _derivative(signals["q"], dt) / moment,
-        "C_n": p["inertia_zz"] * _derivative(signals["r"], dt) / moment,
+        "C_l": moment_x / moment,
+        "C_m": moment_y / moment,
+        "C_n": moment_z / moment,
         # the same in newtons and with what ties them pooled: PHYSICS
         "weight": -p["mass"] * signals["az"],
         "lift_u": T_u * (_upright(alpha_u, beta_u) - download(vehicle)),
         "lift_l": T_l * _upright(alpha_l, beta_l),
-        "moment_z": p["inertia_zz"] * _derivative(signals["r"], dt),
+        "moment_z": moment_z,
         "against_l": -Q_l,
-        "moment_y": p["inertia_yy"] * _derivative(signals["q"], dt),
+        "moment_y": moment_y,
         "driven_y": side_moment(tilted, vehicle, "alpha_u", "alpha_l") + signals["p"] * turning,
-        "moment_x": p["inertia_xx"] * _derivative(signals["p"], dt),
+        "moment_x": moment_x,
         "driven_x": side_moment(tilted, vehicle, "beta_u", "beta_l") - signals["q"] * turning,
     }
 
@@ -329,15 +333,15 @@ def _upright(alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
     return 1.0 / np.sqrt(1.0 + np.tan(alpha) ** 2 + np.tan(beta) ** 2)
 
 
-def _derivative(values: np.ndarray, dt: float) -> np.ndarray:
-    return lagrange_derivative(values, dt)
+def _thrust_factor(vehicle: Vehicle) -> float:
+    """k_T = rho pi R^4 [kg m], of (15)-(20)."""
+    return float(vehicle["air_density"].value * math.pi * vehicle["rotor_radius"].value ** 4)
 
 
 def scales(vehicle: Vehicle, omega_u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """1/2 rho pi R^4 w^2 [N] and 1/2 rho pi R^5 w^2 [N m] with w = omega_u, (61)-(63)."""
-    radius = vehicle["rotor_radius"].value
-    force = 0.5 * vehicle["air_density"].value * math.pi * radius**4 * omega_u**2
-    return force, force * radius
+    force = 0.5 * _thrust_factor(vehicle) * omega_u**2
+    return force, force * vehicle["rotor_radius"].value
 
 
 def thrusts(
@@ -345,7 +349,7 @@ def thrusts(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """T_u, T_l [N], Q_u, Q_l [N m] of the vehicle file, (15)-(20)."""
     p = {name: parameter.value for name, parameter in vehicle.parameters.items()}
-    k_T = p["air_density"] * math.pi * p["rotor_radius"] ** 4
+    k_T = _thrust_factor(vehicle)
     k_Q = k_T * p["rotor_radius"]
     return (
         p["thrust_coefficient_upper"] * k_T * omega_u**2,
@@ -377,7 +381,7 @@ Law = Callable[[Columns, Vehicle], np.ndarray]
 
 def _speed(x: Columns, vehicle: Vehicle) -> np.ndarray:
     """Upper rotor's speed from its thrust."""
-    k_T = vehicle["air_density"].value * math.pi * vehicle["rotor_radius"].value ** 4
+    k_T = _thrust_factor(vehicle)
     return np.sqrt(x["T_u"] / (vehicle["thrust_coefficient_upper"].value * k_T))
 
 
@@ -414,7 +418,7 @@ def side_moment(x: Columns, vehicle: Vehicle, tilt_u: str, tilt_l: str) -> np.nd
 
 def momentum(x: Columns, vehicle: Vehicle) -> np.ndarray:
     """H = J_l w_l - (J_u + J_f) w_u [kg m2/s]."""
-    k_T = vehicle["air_density"].value * math.pi * vehicle["rotor_radius"].value ** 4
+    k_T = _thrust_factor(vehicle)
     omega_l = np.sqrt(x["T_l"] / (vehicle["thrust_coefficient_lower"].value * k_T))
     upper = vehicle["rotor_inertia_upper"].value + vehicle["flybar_inertia"].value
     return vehicle["rotor_inertia_lower"].value * omega_l - upper * _speed(x, vehicle)

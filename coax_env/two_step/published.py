@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coax_env.two_step.modes import Columns, download, scales, thrusts
+from coax_env.two_step.modes import download, scales, thrusts
 from coax_env.two_step.regression import least_squares
 from coax_env.vehicle import Vehicle
 
@@ -85,6 +85,6 @@ def lift_artefact(vehicle: Vehicle) -> dict[str, float]:
     force, _ = scales(vehicle, omega_u)
     weight = vehicle["mass"].value * vehicle["gravity"].value
     names = ("1", "T_l", "T_u")
-    X: Columns = {"1": np.ones(400), "T_l": T_l, "T_u": T_u}
-    fit = least_squares(np.column_stack([X[n] for n in names]), weight / force, names)
+    X = np.column_stack([np.ones(400), T_l, T_u])
+    fit = least_squares(X, weight / force, names)
     return dict(zip(names, fit.values.tolist(), strict=True))

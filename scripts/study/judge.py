@@ -17,8 +17,6 @@ TIES: tuple[frozenset[str], ...] = (
 )
 """Effects declared one finding before the study: naming either is exact."""
 
-OTHER_FORM = frozenset({"battery_sag"})
-"""Effects whose numbers are not compared: the generator's speed falls exponentially, ours linearly."""
 OWN = "coax"
 Row = Mapping[str, Any]
 
@@ -85,8 +83,7 @@ def intervals(row: Row) -> list[tuple[str, bool]]:
     result = []
     for cause in row["methods"][OWN]["causes"]:
         for name, said in cause["parameters"].items():
-            same_form = name in row["comparable"] and cause["effect"] not in OTHER_FORM
-            if cause["effect"] in row["hidden"] and same_form:
+            if cause["effect"] in row["hidden"] and name in row["comparable"]:
                 error = said["value"] - row["comparable"][name]
                 result.append((name, abs(error) <= 1.96 * said["std"]))
     return result
