@@ -329,10 +329,33 @@ STEP = types.void(_A, _A, float64, _A, _A, _A)
 MEASURE = types.void(_A, _A, _A, _A, _A)
 
 
+@compiled()
+def _heed(u, p, x):
+    """Correct a state (26,) in place by the news of the commands, u[5:9]; see closed_loop.py."""
+    if u.size == N_INPUTS:
+        return
+    gain = p[P.COMMAND_GAIN : P.N_FIXED]
+    lon, lat = u[N_INPUTS + 2], u[N_INPUTS + 3]
+    turn, lift = u[N_INPUTS] - u[N_INPUTS + 1], u[N_INPUTS] + u[N_INPUTS + 1]
+    x[3] += gain[0] * lat
+    x[4] += gain[0] * lon
+    x[23] += gain[1] * lat
+    x[24] += gain[1] * lon
+    x[20] += gain[2] * lon
+    x[21] -= gain[2] * lat
+    x[5] += gain[3] * turn
+    x[25] += gain[4] * turn
+    x[2] += gain[5] * lift
+    x[22] += gain[6] * lift
+
+
 @pointer(STEP)
 def step_pointer(x, u, dt, p, work, out):
     """`step`, in the form in which the engine takes a model."""
-    step(x, u, dt, p, work, out)
+    for i in range(N_FULL):
+        out[i] = x[i]
+    _heed(u, p, out)
+    step(out, u, dt, p, work, out)
 
 
 @pointer(MEASURE)
@@ -345,6 +368,7 @@ def measure_pointer(x, u, p, work, out):
 def drift_pointer(x, u, dt, p, work, out):
     """`drift`, in the form in which the engine takes a model."""
     drift(x, u, dt, p, work, out)
+    _heed(u, p, out)
 
 
 @compiled(types.void(_A, _A, _A, _A, _A))

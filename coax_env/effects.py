@@ -703,6 +703,8 @@ def parameter_index(name: str) -> int:
     group, _, own = name.rpartition(".")
     if not group:
         return P.GUST_MEMORY if name == "gust_memory" else list(P.BASE).index(name)
+    if name in P.COMMAND_GAINS:
+        return P.COMMAND_GAIN + list(P.COMMAND_GAINS).index(name)
     entry = GROUPS[group]
     return entry.index + [p.name for p in entry.parameters].index(own)
 
@@ -711,6 +713,7 @@ def off_vector() -> np.ndarray:
     """Parameter vector with every effect off and the base parameters NaN."""
     vector = np.full(n_parameters(), np.nan)
     vector[P.GUST_MEMORY] = 0.5
+    vector[P.COMMAND_GAIN : P.N_FIXED] = 0.0
     vector[_FIRST:] = _offs()[0]
     set_switches(vector)
     return vector

@@ -85,7 +85,7 @@ class HeliModel:
         return vector
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
-        """Commands and time since the run's start, (n, 5)."""
+        """Commands and time since the run's start, (n, 5); and the commands' news, (n, 9)."""
         u = np.empty((record.t.size, N_INPUTS))
         u[:, :TIME] = record.command
         u[:, TIME] = record.t - record.origin
@@ -93,7 +93,7 @@ class HeliModel:
         if delay > 0.0:
             for column in (2, 3):
                 u[:, column] = _mean_of_late(record.t, record.command[:, column], delay)
-        return u
+        return u if record.news is None else np.hstack([u, record.news])
 
     def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """First state from the medians of the first half second, with a wide covariance."""
