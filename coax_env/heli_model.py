@@ -5,13 +5,16 @@ interval holds two commands, replaced by their mean over it (the step is split t
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from numba import float64, types
 
 from coax_env import dynamics, effects
 from coax_env import parameters as P
 from coax_env.engine.model import FreeParameter, Noise, Record
 from coax_env.flight import Flight, Run
+from coax_env.jit import pointer
 from coax_env.layout import (
     ANGLES,
     CHANNELS,
@@ -58,14 +61,37 @@ its true noise the likelihood would be spent on what no parameter can mend.
 """
 
 
+_A = float64[::1]
+STEP = types.void(_A, _A, float64, _A, _A, _A)
+MEASURE = types.void(_A, _A, _A, _A, _A)
+
+
+@pointer(STEP)
+def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.step`, in the form in which the engine takes a model."""
+    dynamics.step(x, u, dt, p, work, out)
+
+
+@pointer(MEASURE)
+def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.measure`, in the form in which the engine takes a model."""
+    dynamics.measure(x, u, p, work, out)
+
+
+@pointer(STEP)
+def _drift(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.drift`, in the form in which the engine takes a model."""
+    dynamics.drift(x, u, dt, p, work, out)
+
+
 class HeliModel:
     """A vehicle, through the engine's protocol."""
 
     channels = CHANNELS
     wraps = np.array([c in ANGLES for c in CHANNELS])
-    step = dynamics.step_pointer
-    measure = dynamics.measure_pointer
-    drift = dynamics.drift_pointer
+    step = _step
+    measure = _measure
+    drift = _drift
     exact = np.arange(N_FULL) >= N_STATES
     work_size = dynamics.WORK_SIZE
     state_scale = np.array(
