@@ -756,7 +756,7 @@ def stage_function(stage: int) -> Callable:
     """
     entries = [e for e in GROUPS.values() if e.stage == stage]
     calls = [f"    {e.name}(x, f, p, {e.index})" for e in entries]
-    names = {e.name: e.function for e in entries}
+    names = {"__name__": __name__, **{e.name: e.function for e in entries}}
     exec("\n".join(["def run(x, f, p):", *calls, "    pass"]), names)
     names["run"].__qualname__ = f"stage_{stage}"
     return njit(error_model="numpy")(names["run"])

@@ -28,7 +28,7 @@ _kept: list[Any] = []  # cells and makers: compiled code has their addresses
 
 
 def late(function: Callable) -> Any:
-    """Make a function of arrays of doubles one that compiled code can call; see above."""
+    """Make a function of 3 or 4 arrays of doubles one that compiled code can call; see above."""
     name = name_apart(function).__qualname__
     signature = types.void(*[_ARRAY] * function.__code__.co_argcount)
     cell = ctypes.c_size_t(0)
@@ -71,8 +71,10 @@ def late(function: Callable) -> Any:
         builder.call(builder.inttoptr(builder.load(place), function), args)
         return context.get_dummy_value()
 
-    @intrinsic
-    def call(typingctx, *args):
+    def of_three(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
         return signature, emit
 
-    return call
+    def of_four(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+        return signature, emit
+
+    return intrinsic({3: of_three, 4: of_four}[len(signature.args)])  # numba takes no *args here
