@@ -3,7 +3,7 @@
 Both envs are thin shells over the same batch kernel (fleet.py); `CoaxEnv` is a fleet of one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -91,7 +91,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     - v0: first.
     """
 
-    metadata = {"render_modes": [], "render_fps": _FPS}  # noqa: RUF012 - Gymnasium's form
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": _FPS}  # noqa: RUF012
 
     def __init__(
         self,
@@ -106,8 +106,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         task: str = "hover",
         target: Any = None,
     ) -> None:
-        _check_render_mode(render_mode)
-        self.render_mode = render_mode
+        self.render_mode = _render_mode(render_mode)
         self.fleet = Fleet(
             1, vehicle, nominal, sensors, wind, gusts, randomize,
             turbulence=turbulence, task=task, target=target,
@@ -116,6 +115,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = action_space()
         self.observation_names = observation_names(self.fleet)
         self._terms = tuple(enumerate(self.fleet.task.terms))
+        self._screen = _Screen(self.fleet, render_mode)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -128,6 +128,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         elif fresh:
             self.fleet.seed(0, int(self.np_random.integers(2**63)))
         observation = self.fleet.restart(_ALL, _start_states(options, 1))[0]
+        self._screen.moved()
         info = self._told()
         if self.fleet.draws.random:
             drawn = self.fleet.drawn[0].tolist()
@@ -137,11 +138,20 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One control period of 0.01 s."""
         outcome = self.fleet.fly(np.array(action, dtype=np.float64).reshape(1, 4), _ALL)
+        self._screen.moved()
         terms = outcome.terms[0].tolist()
         info = self._told()
         info["reward_terms"] = {name: terms[k] for k, name in self._terms}
         reward = float(outcome.rewards[0])
         return outcome.observations[0], reward, bool(outcome.over[0]), False, info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The picture (540, 960, 3), uint8, in mode ``rgb_array``; ``human`` shows it, every 40 ms."""
+        return self._screen.pictures([0])[0] if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._screen.close()
 
     def _told(self) -> dict[str, Any]:
         fleet = self.fleet
@@ -185,12 +195,11 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         task: str = "hover",
         target: Any = None,
     ) -> None:
-        _check_render_mode(render_mode)
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, found {num_envs}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**CoaxEnv.metadata, "autoreset_mode": self.autoreset_mode}
-        self.render_mode = render_mode
+        self.render_mode = _render_mode(render_mode)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.fleet = Fleet(
@@ -205,6 +214,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._every = np.ones(num_envs, dtype=np.bool_)
         self._seeded = False
+        self._screen = _Screen(self.fleet, render_mode)
 
     def reset(
         self,
@@ -224,20 +234,21 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         super().reset(seed=first)
         if seed is None and not self._seeded:
             first = int(self.np_random.integers(2**62))
-        if seed is None and first is None:
-            seeds: list[int | None] = [None] * self.num_envs
-        elif first is not None:
-            seeds = [int(first) + i for i in range(self.num_envs)]
+        if first is not None:
+            seeds: list[int | None] = [int(first) + i for i in range(self.num_envs)]
         else:
-            seeds = list(seed)  # type: ignore[arg-type]
-            if len(seeds) != self.num_envs:
-                raise InputError(f"seed must be one number or {self.num_envs}, found {len(seeds)}")
+            seeds = [None] * self.num_envs if seed is None else list(seed)  # type: ignore[arg-type]
+        if len(seeds) != self.num_envs:
+            raise InputError(f"seed must be one number or {self.num_envs}, found {len(seeds)}")
         for i, row_seed in enumerate(seeds):
-            if row_seed is not None and which[i]:
+            if row_seed is None and not self._seeded:
+                row_seed = int(self.np_random.integers(2**62))
+            if row_seed is not None and (which[i] or not self._seeded):
                 self.fleet.seed(i, row_seed)
         self._seeded = True
         self._ended &= ~which
         observations = self.fleet.restart(which, _start_states(options, self.num_envs))
+        self._screen.moved()
         return observations, self._told(which) | self._vehicles(which)
 
     def step(
@@ -271,7 +282,17 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             observations[done] = fleet.restart(done)[done]
             info |= self._vehicles(done)
         info |= self._step_info(outcome.terms)
+        self._screen.moved()
         return observations, outcome.rewards, terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+        """One picture per row in mode ``rgb_array``; ``human`` shows the first row's."""
+        rows = range(self.num_envs)
+        return self._screen.pictures(rows) if self.render_mode == "rgb_array" else None
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the window, if there is one."""
+        self._screen.close()
 
     def _step_info(self, terms: np.ndarray) -> dict[str, Any]:
         named = {name: terms[:, k] for k, name in enumerate(self.fleet.task.terms)}
@@ -318,9 +339,42 @@ def observation_names(fleet: Fleet) -> tuple[str, ...]:
     return (*(s.name for s in fleet.sensors), *(f"new_{flag}" for flag in fleet.flags), *aim)
 
 
-def _check_render_mode(render_mode: str | None) -> None:
-    if render_mode is not None:
-        raise InputError(f"render_mode must be None: CoaxHeli-v0 cannot draw, not {render_mode!r}")
+def _render_mode(render_mode: str | None) -> str | None:
+    modes = CoaxEnv.metadata["render_modes"]
+    if render_mode not in (None, *modes):
+        raise InputError(f"render_mode must be None, {' or '.join(modes)}, found {render_mode!r}")
+    return render_mode
+
+
+class _Screen:
+    """Pictures of a fleet, where they are wanted; drawing is imported with the first of them."""
+
+    def __init__(self, fleet: Fleet, render_mode: str | None) -> None:
+        self._fleet, self._mode = fleet, render_mode
+        self._renderer: Any = None
+        self._traces: Any = None
+        if render_mode is not None:
+            from coax_env.rendering import Renderer, Traces
+
+            self._renderer, self._traces = Renderer(), Traces(fleet)
+
+    def moved(self) -> None:
+        """The fleet has reset or flown a row: remember it, and show it on a screen now and then."""
+        if self._mode is None:
+            return
+        from coax_env.rendering import HUMAN_EVERY
+
+        self._traces.record()
+        if self._mode == "human" and self._fleet.rows[0] % HUMAN_EVERY == 0:
+            self._renderer.show(self._traces.view(0))
+
+    def pictures(self, rows: Iterable[int]) -> tuple[np.ndarray, ...]:
+        """One picture of each row."""
+        return tuple(self._renderer.picture(self._traces.view(row)) for row in rows)
+
+    def close(self) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
 
 
 def _start_states(options: dict[str, Any] | None, count: int) -> np.ndarray | None:
