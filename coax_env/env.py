@@ -145,7 +145,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         reward = float(outcome.rewards[0])
         return outcome.observations[0], reward, bool(outcome.over[0]), False, info
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """The picture (540, 960, 3), uint8, in mode ``rgb_array``; ``human`` shows it, every 40 ms."""
         return self._screen.pictures([0])[0] if self.render_mode == "rgb_array" else None
 
@@ -285,7 +285,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._screen.moved()
         return observations, outcome.rewards, terminated, truncated, info
 
-    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[np.ndarray, ...] | None:
         """One picture per row in mode ``rgb_array``; ``human`` shows the first row's."""
         rows = range(self.num_envs)
         return self._screen.pictures(rows) if self.render_mode == "rgb_array" else None
