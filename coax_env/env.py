@@ -392,7 +392,8 @@ class _Screen:
         self._renderer: Any = None
         self._traces: Any = None
         if render_mode is not None:
-            from coax_env.rendering import Renderer, Traces
+            from coax_env.rendering import Renderer
+            from coax_env.scene import Traces
 
             self._renderer, self._traces = Renderer(), Traces(fleet)
 

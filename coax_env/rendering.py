@@ -1,14 +1,13 @@
 """Pictures of a flight: the machine from beside, the flight from above, both rotor discs, numbers.
 
 Drawn with pygame, which is imported when the first picture is made and needs no screen for
-``"rgb_array"``. Everything is drawn from a `View`, the truth at one instant, and the flight's trace.
+``"rgb_array"``. Everything is drawn from a `View` (scene.py).
 """
 
 import math
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -16,17 +15,25 @@ import numpy as np
 
 from coax_env import parameters as P
 from coax_env.errors import InputError, require
-from coax_env.fleet import DT, Fleet
+from coax_env.fleet import DT
 from coax_env.layout import RPM_PER_RAD_S
-from coax_env.tasks import TASKS
+from coax_env.scene import (
+    LOWER,
+    PICTURE,
+    STAGE,
+    UPPER,
+    Camera,
+    View,
+    body_to_world,
+    discs,
+    ellipse,
+    flybar,
+)
 
-WIDTH, HEIGHT = 960, 540  # [px] of a picture
-MODES = ("human", "rgb_array")
+WIDTH, HEIGHT = PICTURE
 HUMAN_EVERY = 4  # control periods per picture on a screen: 25 a second
 _SMOOTH = 2  # drawn so much larger, then scaled down
-_PANEL = 620  # [px] where the column of map, discs and numbers begins
 _MAP, _DISCS = (640, 20, 300, 250), (640, 280, 300, 110)  # x, y, width, height [px]
-_TRACE_EVERY, _TRACE_LENGTH = 5, 400  # rows, points: the last 20 s
 _FADE = 20  # points of the trace of one colour
 _EXAGGERATED = 3.0  # tilt of the discs in their own picture
 
@@ -34,59 +41,8 @@ _SKY_TOP, _SKY_LOW = (196, 216, 234), (236, 242, 247)
 _GROUND, _GRID, _SHADOW = (222, 226, 216), (196, 202, 190), (150, 156, 146)
 _PAPER, _INK, _FAINT = (250, 250, 248), (40, 46, 54), (140, 146, 154)
 _BODY, _BODY_EDGE, _TAIL = (70, 84, 102), (40, 50, 64), (92, 106, 124)
-_UPPER, _LOWER, _BAR = (214, 96, 50), (40, 116, 178), (120, 50, 20)
+_BAR = (120, 50, 20)
 _TRACE, _TARGET, _WIND = (90, 60, 150), (20, 140, 80), (0, 130, 160)
-
-
-@dataclass(frozen=True)
-class View:
-    """What a picture shows of one helicopter.
-
-    ``state`` full, (26,); ``params`` the parameter vector; ``air`` its velocity north east down [m/s];
-    ``target`` x y z psi, or None; ``trace`` past positions x y z, (n, 3), oldest first.
-    """
-
-    state: np.ndarray
-    params: np.ndarray
-    air: np.ndarray
-    azimuth: float
-    seconds: float
-    task: str
-    trace: np.ndarray
-    target: np.ndarray | None = None
-
-
-class Traces:
-    """Where every helicopter of a fleet has been, kept while pictures are wanted."""
-
-    def __init__(self, fleet: Fleet) -> None:
-        self._fleet = fleet
-        self._points = np.zeros((fleet.count, _TRACE_LENGTH, 3))
-        self._kept = np.zeros(fleet.count, dtype=np.int64)
-
-    def record(self) -> None:
-        """Keep the positions, every few rows; a row's new flight forgets the last."""
-        rows = self._fleet.rows
-        self._kept[rows == 0] = 0
-        due = np.flatnonzero(rows % _TRACE_EVERY == 0)
-        self._points[due, self._kept[due] % _TRACE_LENGTH] = self._fleet.x[due, 13:16]
-        self._kept[due] += 1
-
-    def view(self, row: int) -> View:
-        """What there is to see of a row now."""
-        fleet, kept = self._fleet, int(self._kept[row])
-        order = np.arange(max(kept - _TRACE_LENGTH, 0), kept) % _TRACE_LENGTH
-        state = np.nan_to_num(fleet.x[row], posinf=0.0, neginf=0.0)
-        return View(
-            state=state,
-            params=fleet.params[row if len(fleet.params) > 1 else 0],
-            air=fleet.air[row],
-            azimuth=float(fleet.azimuth[row]),
-            seconds=float(fleet.rows[row] * DT),
-            task=next(name for name, task in TASKS.items() if task is fleet.task),
-            trace=np.vstack([np.nan_to_num(self._points[row, order]), state[13:16]]),
-            target=fleet.targets[row].copy(),
-        )
 
 
 class Renderer:
@@ -145,12 +101,12 @@ class Renderer:
     def _draw(self, view: View) -> Any:
         self._sheet.fill(_PAPER)
         self._glass.fill((0, 0, 0, 0))
-        camera = _Camera(view)
+        camera = Camera(view)
         self._scenery(camera)
         self._paths(camera, view)
         self._helicopter(camera, view)
         self._sheet.blit(self._glass, (0, 0))
-        edge = (_PANEL, 0, WIDTH - _PANEL, HEIGHT)
+        edge = (STAGE, 0, WIDTH - STAGE, HEIGHT)
         self._pygame.draw.rect(self._sheet, _PAPER, [v * _SMOOTH for v in edge])
         self._wind(camera, view)
         self._scale_bar(camera)
@@ -159,14 +115,14 @@ class Renderer:
         self._numbers(view)
         return self._pygame.transform.smoothscale(self._sheet, (WIDTH, HEIGHT))
 
-    def _scenery(self, camera: "_Camera") -> None:
+    def _scenery(self, camera: "Camera") -> None:
         horizon = camera.horizon()
         for k in range(12):
             share = k / 11.0
             colour = [a + share * (b - a) for a, b in zip(_SKY_TOP, _SKY_LOW, strict=True)]
             top = horizon * k / 12.0
-            self._box(colour, 0, top, _PANEL, horizon / 12.0 + 1.0)
-        self._box(_GROUND, 0, horizon, _PANEL, HEIGHT - horizon)
+            self._box(colour, 0, top, STAGE, horizon / 12.0 + 1.0)
+        self._box(_GROUND, 0, horizon, STAGE, HEIGHT - horizon)
         north, east = np.round(camera.place[:2])
         for k in range(-12, 13):
             across = [(north + k, east - 12.0, 0.0), (north + k, east + 12.0, 0.0)]
@@ -174,7 +130,7 @@ class Renderer:
             for ends in (across, along):
                 self._line(_GRID, camera.seen_line(*ends), 1)
 
-    def _paths(self, camera: "_Camera", view: View) -> None:
+    def _paths(self, camera: "Camera", view: View) -> None:
         x, y, z = view.state[13:16]
         self._blob(_SHADOW, camera, (x, y, 0.0), 0.22)
         self._line(_SHADOW, camera.seen_line((x, y, 0.0), (x, y, z)), 1)
@@ -198,9 +154,9 @@ class Renderer:
         nose = (tx + 0.3 * math.cos(psi), ty + 0.3 * math.sin(psi), tz)
         self._line(_TARGET, camera.seen_line((tx, ty, tz), nose), 3)
 
-    def _helicopter(self, camera: "_Camera", view: View) -> None:
+    def _helicopter(self, camera: "Camera", view: View) -> None:
         p, x = view.params, view.state
-        turn, centre = _body_to_world(x[10:13]), x[13:16]
+        turn, centre = body_to_world(x[10:13]), x[13:16]
 
         def place(points: Any) -> list[tuple[float, float]]:
             return camera.seen(centre + np.atleast_2d(points) @ turn.T)
@@ -217,26 +173,26 @@ class Renderer:
         self._polyline(_TAIL, place([(-0.4 * size, 0, 0), (-2.0 * size, 0, -0.05 * size)]), 5)
         fin = [(-1.75, 0, -0.05), (-2.1, 0, -0.5), (-2.2, 0, -0.5), (-2.05, 0, 0.1)]
         self._fill(_TAIL, place(np.array(fin) * size))
-        body = _ellipse((0.75 * size, 0.0, 0.0), (0.0, 0.0, 0.42 * size), 28)
+        body = ellipse((0.75 * size, 0.0, 0.0), (0.0, 0.0, 0.42 * size), 28)
         self._fill(_BODY, place(body))
-        self._fill(_BODY, place(_ellipse((0.75 * size, 0, 0), (0, 0.34 * size, 0), 28)))
+        self._fill(_BODY, place(ellipse((0.75 * size, 0, 0), (0, 0.34 * size, 0), 28)))
         self._polyline(_BODY_EDGE, place(body), 2)
-        glass = _ellipse((0.28 * size, 0.0, 0.06 * size), (0.0, 0.0, 0.24 * size), 20)
+        glass = ellipse((0.28 * size, 0.0, 0.06 * size), (0.0, 0.0, 0.24 * size), 20)
         self._fill((176, 204, 224), place(glass + (0.4 * size, 0.0, -0.08 * size)))
         self._polyline(_INK, place([(0, 0, -0.3 * size), (0, 0, up - 0.12 * radius)]), 3)
-        for disc in _discs(view):
+        for disc in discs(view):
             hub = np.array([0.0, 0.0, low if disc.lower else up])
             rim = hub + radius * disc.rim()
             self._fill((*disc.colour, 70), place(rim), self._glass)
             self._polyline((*disc.colour, 230), place(rim), 2, self._glass)
             blades = hub + radius * disc.blades(view.azimuth)
             self._polyline((*disc.colour, 255), place(blades), 4, self._glass)
-        bar = np.array([0.0, 0.0, up - 0.12 * radius]) + 0.6 * radius * _flybar(view)
+        bar = np.array([0.0, 0.0, up - 0.12 * radius]) + 0.6 * radius * flybar(view)
         self._polyline((*_BAR, 255), place(bar), 3, self._glass)
         for end in place(bar):
             self._dot(_BAR, end, 4.0, self._glass)
 
-    def _wind(self, camera: "_Camera", view: View) -> None:
+    def _wind(self, camera: "Camera", view: View) -> None:
         north, east = view.air[:2]
         speed = math.hypot(north, east)
         if speed < 0.05:
@@ -250,7 +206,7 @@ class Renderer:
         where = camera.seen([tail])[0]
         self._write(f"wind {speed:.1f} m/s", where[0] + 8, where[1] - 26, 18, _WIND)
 
-    def _scale_bar(self, camera: "_Camera") -> None:
+    def _scale_bar(self, camera: "Camera") -> None:
         length = 0.5 * camera.pixels_per_metre()
         self._box(_INK, 20, HEIGHT - 26, length, 3)
         self._write("0.5 m at the machine; grid 1 m", 20, HEIGHT - 20, 15, _INK)
@@ -299,7 +255,7 @@ class Renderer:
         for column, name in enumerate(("from the right", "from behind")):
             middle = left + width * (0.25 + 0.5 * column)
             self._line(_FAINT, [(middle, top + 34), (middle, top + height - 22)], 1)
-            for disc in _discs(view):
+            for disc in discs(view):
                 level = top + (72 if disc.lower else 46)
                 tilt = disc.lon if column == 0 else disc.lat
                 rise = 56.0 * math.sin(np.clip(_EXAGGERATED * tilt, -1.2, 1.2))
@@ -329,7 +285,7 @@ class Renderer:
         ]  # fmt: skip
         for k, (first, one, second, two) in enumerate(lines):
             y = 404 + 27 * k
-            colours = {"upper": _UPPER, "lower": _LOWER}
+            colours = {"upper": UPPER, "lower": LOWER}
             self._write(first, 644, y + 4, 18, colours.get(first, _FAINT))
             self._write(one, 694, y, 26, _INK)
             self._write(second, 792, y + 4, 18, colours.get(second, _FAINT))
@@ -366,9 +322,9 @@ class Renderer:
         large = (spot[0] * _SMOOTH, spot[1] * _SMOOTH)
         self._pygame.draw.circle(sheet or self._sheet, colour, large, size * _SMOOTH)
 
-    def _blob(self, colour: Any, camera: "_Camera", centre: Any, radius: float) -> None:
+    def _blob(self, colour: Any, camera: "Camera", centre: Any, radius: float) -> None:
         flat = np.array(centre) + radius * np.column_stack(
-            [_ellipse((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), 24)[:, :2], np.zeros(24)]
+            [ellipse((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), 24)[:, :2], np.zeros(24)]
         )
         self._fill(colour, camera.seen(flat))
 
@@ -404,127 +360,6 @@ class Renderer:
     def _write(self, text: str, x: float, y: float, size: int, colour: Any) -> None:
         ink = self._fonts[size].render(text, True, colour)
         self._sheet.blit(ink, (x * _SMOOTH, y * _SMOOTH))
-
-
-class _Camera:
-    """Looks north-west at the machine from a little above, wherever it flies."""
-
-    distance = 2.6  # [m]
-    focus = 700.0  # [px]
-    near = 0.2  # [m]
-
-    def __init__(self, view: View) -> None:
-        self.place = view.state[13:16]
-        away = np.array([-0.80, 0.52, -0.20])
-        self.eye = self.place + self.distance * away / np.linalg.norm(away)
-        self.forward = (self.place - self.eye) / self.distance
-        right = np.cross([0.0, 0.0, 1.0], self.forward)
-        self.right = right / np.linalg.norm(right)
-        self.down = np.cross(self.forward, self.right)
-        self.middle = (_PANEL / 2.0, 0.50 * HEIGHT)
-
-    def pixels_per_metre(self) -> float:
-        """At the machine."""
-        return self.focus / self.distance
-
-    def horizon(self) -> float:
-        """Its height in the picture [px]."""
-        flat = self.forward * (1.0, 1.0, 0.0)
-        far = flat / np.linalg.norm(flat)
-        y = self.middle[1] + self.focus * (far @ self.down) / (far @ self.forward)
-        return float(np.clip(y, 0.0, HEIGHT))
-
-    def depth(self, points: Any) -> np.ndarray:
-        """How far in front of the eye world points (n, 3) are [m], shape (n,)."""
-        return (np.asarray(points, dtype=float) - self.eye) @ self.forward
-
-    def seen(self, points: Any) -> list[tuple[float, float]]:
-        """World points (n, 3) as picture points; none if one lies behind the eye."""
-        rays = np.asarray(points, dtype=float) - self.eye
-        depth = rays @ self.forward
-        if (depth < self.near).any():
-            return []
-        x = self.middle[0] + self.focus * (rays @ self.right) / depth
-        y = self.middle[1] + self.focus * (rays @ self.down) / depth
-        return list(zip(x.tolist(), y.tolist(), strict=True))
-
-    def seen_line(self, start: Any, end: Any) -> list[tuple[float, float]]:
-        """A line's two ends, cut where it passes the eye; none where all of it is behind."""
-        a, b = np.array(start, dtype=float), np.array(end, dtype=float)
-        depth_a, depth_b = (a - self.eye) @ self.forward, (b - self.eye) @ self.forward
-        if max(depth_a, depth_b) <= self.near:
-            return []
-        if depth_a < self.near:
-            a = a + (b - a) * (1.001 * self.near - depth_a) / (depth_b - depth_a)
-        elif depth_b < self.near:
-            b = b + (a - b) * (1.001 * self.near - depth_b) / (depth_a - depth_b)
-        return self.seen([a, b])
-
-
-@dataclass(frozen=True)
-class _Disc:
-    """One rotor disc, tilted back by ``lon`` and to the right by ``lat`` [rad]."""
-
-    lon: float
-    lat: float
-    lower: bool
-    colour: tuple[int, int, int]
-
-    def _plane(self) -> tuple[np.ndarray, np.ndarray]:
-        """Two unit vectors in the disc: its thrust is along [-tan lon, tan lat, -1], (13)-(14)."""
-        normal = np.array([-math.tan(self.lon), math.tan(self.lat), -1.0])
-        forward = np.cross([0.0, 1.0, 0.0], normal)
-        forward /= np.linalg.norm(forward)
-        across = np.cross(normal, forward)
-        return -forward, across / np.linalg.norm(across)
-
-    def rim(self) -> np.ndarray:
-        """Points of its edge, radius 1, body axes, (n, 3)."""
-        return _ellipse(*self._plane(), 40)
-
-    def blades(self, azimuth: float) -> np.ndarray:
-        """Tip to tip, (2, 3); the rotors turn against each other."""
-        first, second = self._plane()
-        angle = -azimuth if self.lower else azimuth
-        tip = math.cos(angle) * first + math.sin(angle) * second
-        return np.array([tip, -tip])
-
-
-def _discs(view: View) -> tuple[_Disc, _Disc]:
-    """Lower disc as the swash plate has tilted it, upper as the fly-bar has, (30)-(31)."""
-    p, x = view.params, view.state
-    lower = _Disc(float(x[6]), float(x[7]), True, _LOWER)
-    upper = _Disc(
-        float(p[P.FLYBAR_TO_ROTOR_LON] * x[8]),
-        float(p[P.FLYBAR_TO_ROTOR_LAT] * x[9]),
-        False,
-        _UPPER,
-    )
-    return lower, upper
-
-
-def _flybar(view: View) -> np.ndarray:
-    """The stabiliser bar, tip to tip, across the upper blades, (2, 3)."""
-    bar = _Disc(float(view.state[8]), float(view.state[9]), False, _BAR)
-    return bar.blades(view.azimuth + 0.5 * math.pi)
-
-
-def _ellipse(first: Any, second: Any, count: int) -> np.ndarray:
-    """Closed curve cos(t) first + sin(t) second, (count, 3)."""
-    t = np.linspace(0.0, 2.0 * math.pi, count)[:, None]
-    return np.cos(t) * np.asarray(first, dtype=float) + np.sin(t) * np.asarray(second, dtype=float)
-
-
-def _body_to_world(attitude: np.ndarray) -> np.ndarray:
-    """R_WB of roll, pitch, heading, (3, 3): v_W = R_WB v_B."""
-    (cf, ct, cp), (sf, st, sp) = np.cos(attitude), np.sin(attitude)
-    return np.array(
-        [
-            [ct * cp, sf * st * cp - cf * sp, cf * st * cp + sf * sp],
-            [ct * sp, sf * st * sp + cf * cp, cf * st * sp - sf * cp],
-            [-st, sf * ct, cf * ct],
-        ]
-    )
 
 
 def _whole(middle: float, half: float, step: float) -> tuple[int, int]:

@@ -136,6 +136,15 @@ def test_a_row_flies_as_a_single_env_through_every_reset(arguments):
     assert ends >= 6
 
 
+def test_rows_without_a_seed_of_their_own_fly_apart():
+    env = CoaxVectorEnv(3)
+    observations, _ = env.reset(seed=[7, None, None])
+    assert np.array_equal(observations[0], gymnasium.make("CoaxHeli-v0").reset(seed=7)[0])
+    assert not np.array_equal(observations[1], observations[2])
+    with pytest.raises(InputError, match="seed must be one number or 3"):
+        env.reset(seed=[1, 2])
+
+
 def test_threads_change_nothing():
     flown = []
     for threads in (1, 3):

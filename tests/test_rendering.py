@@ -9,6 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import coax_env
+from coax_env import scene
 from coax_env.env import CoaxEnv, CoaxVectorEnv
 from coax_env.errors import InputError
 
@@ -68,7 +69,7 @@ def test_each_disc_is_drawn_with_its_own_tilt():
 
 def test_a_disc_tilts_as_its_thrust():
     # (13)-(14): thrust along [-tan a, tan b, -1]; every point of the disc is square to it
-    disc = rendering._Disc(0.1, -0.2, True, (0, 0, 0))
+    disc = scene.Disc(0.1, -0.2, True, (0, 0, 0))
     thrust = np.array([-np.tan(0.1), np.tan(-0.2), -1.0])
     assert np.allclose(disc.rim() @ thrust, 0.0, atol=1e-12)
     assert np.allclose(np.linalg.norm(disc.rim(), axis=1), 1.0)
@@ -132,16 +133,18 @@ def test_the_vector_env_draws_every_row():
 @pytest.mark.skipif(importlib.util.find_spec("moviepy") is None, reason="moviepy is not installed")
 def test_record_video_writes_a_film(tmp_path):
     env = gymnasium.wrappers.RecordVideo(
-        gymnasium.make("CoaxHeli-v0", render_mode="rgb_array"), str(tmp_path), video_length=10
+        gymnasium.make("CoaxHeli-v0", render_mode="rgb_array"),
+        str(tmp_path / "film"),
+        video_length=10,
     )
     env.reset(seed=0)
     for _ in range(10):
         env.step(np.zeros(4))
     env.close()
-    assert list(tmp_path.glob("*.mp4"))
+    assert list((tmp_path / "film").glob("*.mp4"))
 
 
-def test_record_video_collects_a_picture_per_step(tmp_path):
+def test_there_is_a_picture_per_step():
     env = gymnasium.wrappers.RenderCollection(
         gymnasium.make("CoaxHeli-v0", render_mode="rgb_array"), pop_frames=False
     )
