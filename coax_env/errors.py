@@ -3,7 +3,6 @@
 import importlib
 from types import ModuleType
 
-
 LONGEST = 900
 """Characters of a message; a longer one loses its middle."""
 

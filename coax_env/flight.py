@@ -222,7 +222,9 @@ class _Card:
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise self._fail(f"[{section}] {key} should be a number, found {shown(value)}")
             if not 0.0 < value <= sys.float_info.max:
-                raise self._fail(f"[{section}] {key} should be positive and finite, found {shown(value)}")
+                raise self._fail(
+                    f"[{section}] {key} should be positive and finite, found {shown(value)}"
+                )
             if key in known:
                 numbers[key] = float(value)
             else:
@@ -240,7 +242,9 @@ class _Card:
             if isinstance(entry, str):
                 entry = {"name": entry}
             if not isinstance(entry, dict):
-                raise self._fail(f"[columns] {channel} should be {{ name, unit, scale }}, found {shown(entry)}")
+                raise self._fail(
+                    f"[columns] {channel} should be {{ name, unit, scale }}, found {shown(entry)}"
+                )
             name = self._text(entry, "name", f"[columns] {channel}", default=channel)
             unit = self._text(entry, "unit", f"[columns] {channel}", default=LOG_UNITS[channel])
             try:
@@ -320,7 +324,9 @@ class _Log:
             raise InputError(
                 f"{self.path}, line 1: numbers, no header: the first row must name the columns"
             )
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
+        reader = csv.reader(
+            io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True
+        )
         header: list[str] = []
         rows, lines = [], []
         try:

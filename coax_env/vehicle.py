@@ -250,9 +250,13 @@ def _table(content: Any, path: Path, where: str) -> dict[str, Parameter]:
         for key in ("value", "std"):
             number = entry[key]
             if isinstance(number, bool) or not isinstance(number, int | float):
-                raise InputError(f"{path}: {where}.{name}.{key} must be a number, found {shown(number)}")
+                raise InputError(
+                    f"{path}: {where}.{name}.{key} must be a number, found {shown(number)}"
+                )
             if not abs(number) <= sys.float_info.max:
-                raise InputError(f"{path}: {where}.{name}.{key} must be finite, found {shown(number)}")
+                raise InputError(
+                    f"{path}: {where}.{name}.{key} must be finite, found {shown(number)}"
+                )
         if entry["std"] < 0.0:
             raise InputError(f"{path}: {where}.{name}.std must not be negative")
         result[name] = Parameter(

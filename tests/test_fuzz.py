@@ -76,7 +76,7 @@ def hash_of(text: str) -> int:
 
 @pytest.mark.parametrize("name", FILES)
 def test_the_sound_files_are_sound(name, tmp_path, monkeypatch):
-    """What is spoilt above is accepted as it stands, so that a refusal is due to what was done to it."""
+    """What is spoilt above is accepted as it stands."""
     refused = []
     keep = fuzz_readers.refused_in_one_line
     monkeypatch.setattr(
