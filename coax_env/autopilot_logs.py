@@ -11,8 +11,10 @@ named by the caller, ``rpm_upper_cmd = actuator_outputs.output[0] * 2.1 - 1800``
 motor controllers report are found without.
 """
 
+import io
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -117,7 +119,8 @@ def import_log(
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: a log ends in {', '.join(readers)}, found {path.suffix!r}")
     read, table = readers[path.suffix.lower()]
-    signals = read(path)
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):  # the readers' own words
+        signals = read(path)
     channels = channels_of(signals, table, take or {}, path)
     begin = min(t[0] for t, _ in channels.values())
     channels = {name: (t - begin, values) for name, (t, values) in channels.items()}

@@ -22,7 +22,7 @@ import tomlkit
 
 from coax_env.errors import InputError, shown
 from coax_env.files import read_bytes, read_text, read_toml, staged_folder, write_text
-from coax_env.foreign_columns import advice, header_of
+from coax_env.foreign_columns import advice, header_of, time_advice
 from coax_env.layout import CHANNELS, RPM_PER_RAD_S
 from coax_env.log_units import LOG_UNITS, ROTOR_COMMANDS, SWASH_COMMANDS, factor_to_canonical
 from coax_env.outliers import find_outliers
@@ -298,6 +298,7 @@ class _Log:
         self.renamed: set[str] = set()
         self.data: dict[str, np.ndarray] = {}
         self.beyond = 0
+        self.time_column = "t"
         taken = set()
         for channel in LOG_UNITS:
             name, factor = columns.get(channel, (channel, 1.0))
@@ -307,6 +308,7 @@ class _Log:
                     self.renamed.add(channel)
                 values = self._numbers(by_name[name], name)
                 if channel == "t":
+                    self.time_column = name
                     self._check_times(values)
                 else:
                     beyond = np.abs(values) > BEYOND_ALL
@@ -320,7 +322,7 @@ class _Log:
     def _split(self, text: str) -> tuple[list[str], list[list[str]], list[int]]:
         """Header, rows that hold anything, and the line each row ends on."""
         first, delimiter = header_of(text)
-        if first and all(_is_finite_number(cell) for cell in first):
+        if any(first) and all(_is_finite_number(cell) for cell in first if cell):
             raise InputError(
                 f"{self.path}, line 1: numbers, no header: the first row must name the columns"
             )
@@ -364,6 +366,11 @@ class _Log:
         except ValueError:
             pass
         bad = next(k for k, cell in enumerate(cells) if cell and not _is_finite_number(cell))
+        if bad == 0 and not any(map(_is_finite_number, self.rows[0])):
+            raise InputError(
+                f"{self.path}, line {self.lines[0]}: {cells[0][:40]!r} and no number in the row: if"
+                " it holds the units, delete it, and name them in card.toml under [columns]"
+            )
         raise InputError(
             f"{self.path}, line {self.lines[bad]}, column {name!r}:"
             f" {cells[bad][:40]!r} is not a finite number{_hint(cells[bad])}"
@@ -400,9 +407,8 @@ class _Log:
             )
         if length > LONGEST_RUN or np.median(step) > SLOWEST_ROWS:
             raise InputError(
-                f"{self.path}: the run lasts {length:.3g} s with a row every {np.median(step):.3g} s:"
-                " if its time is in ms or us, say so in card.toml, under [columns]:"
-                ' t = { name = "t", unit = "us" }'
+                f"{self.path}: the run lasts {length:.3g} s with a row every {np.median(step):.3g} s;"
+                f" {time_advice(self.time_column, float(np.median(step)))}"
             )
         last = np.append(step > 0.0, True)
         repeated = int(np.count_nonzero(~last))

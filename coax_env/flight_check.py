@@ -272,6 +272,9 @@ def _sick(channels: Sequence[ChannelCheck]) -> list[str]:
 
 
 def _suspicions(flight: Flight, vehicle: Vehicle) -> list[str]:
+    if not flight.channels:
+        unread = f" (not read: {', '.join(flight.unread)})" if flight.unread else ""
+        return [f"no sensor in it{unread}: name the columns of the sensors under [columns]"]
     told = _rotor_speeds(flight, vehicle) + _weight(flight, vehicle) + _sizes(flight)
     for channel, rate, sign in RATE_OF:
         slope = _slope(flight, channel, rate)

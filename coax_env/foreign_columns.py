@@ -17,6 +17,7 @@ from coax_env.log_units import LOG_UNITS, factor_to_canonical
 DELIMITERS = ",;\t"
 MOST_SHOWN = 12
 LONGEST_NAME = 60
+SLOW_ROWS = 0.2  # s
 
 USUAL_NAMES: Mapping[str, str] = {
     "t": "t time timestamp seconds sec stamp elapsed timestart timesinceboot",
@@ -109,6 +110,15 @@ def advice(header: Iterable[str], wanted: Iterable[str]) -> str:
         f"found the columns {shown}{more}; if it has another name, say so in card.toml,"
         f" under [columns]: {example.line()}" + ("" if first else ", and likewise for the others")
     )
+
+
+def time_advice(name: str, step: float) -> str:
+    """What to write into the card where a log's rows come every so many "seconds"."""
+    for unit in ("ms", "us", "ns"):
+        if step * factor_to_canonical("t", unit) < SLOW_ROWS < step:
+            line = Guess("t", name, unit).line()
+            return f"if its time is in {unit}, say so in card.toml, under [columns]: {line}"
+    return "does its time jump? cut the log there into two files, a [[run]] each"
 
 
 def header_of(text: str) -> tuple[list[str], str]:
