@@ -11,10 +11,10 @@ named by the caller, ``rpm_upper_cmd = actuator_outputs.output[0] * 2.1 - 1800``
 motor controllers report are found without.
 """
 
-import io
+import os
 import re
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -119,7 +119,7 @@ def import_log(
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: a log ends in {', '.join(readers)}, found {path.suffix!r}")
     read, table = readers[path.suffix.lower()]
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):  # the readers' own words
+    with _silence():
         signals = read(path)
     channels = channels_of(signals, table, take or {}, path)
     begin = min(t[0] for t, _ in channels.values())
@@ -213,6 +213,22 @@ def _binned(signal: Signal, t: np.ndarray, step: float, last: bool) -> np.ndarra
     total = np.bincount(row, values, minlength=len(t))
     column[count > 0] = total[count > 0] / count[count > 0]
     return column
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Without what the readers, compiled parts included, say on stdout and stderr by themselves."""
+    saved = [os.dup(stream) for stream in (1, 2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        for stream, own in zip((1, 2), saved, strict=True):
+            os.dup2(own, stream)
+            os.close(own)
+        os.close(nowhere)
 
 
 # --- readers ------------------------------------------------------------------------------------------
