@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import effects, next_maneuver, unlisted, vibration
+from coax_env import closed_loop, effects, next_maneuver, unlisted, vibration
 from coax_env.calibration import false_alarm_rate
 from coax_env.engine.fit import Engine, RunPass, part
 from coax_env.engine.model import FreeParameter, Noise, Record
@@ -128,12 +128,16 @@ def diagnose(
     passes_before = engine.filter(bare.values, bare.noise)
     say("fitting the model's own parameters")
     refitted = search.refit_noise(search.settle(replace(bare, values=dict(bare.values))))
+    if closed_loop.listen(search, refitted):
+        refitted = search.refit_noise(search.settle(refitted))
     say("searching for causes")
     state, quadratic = search.run(
         State([], dict(refitted.values), refitted.noise, refitted.objective)
     )
     state, quadratic, terms = unlisted.explain(search, state, quadratic)
     say("weighing the causes against their look-alikes")
+    if state.active:
+        closed_loop.listen(search, state)
     state, quadratic, weights = search.prune(state)
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
@@ -418,7 +422,7 @@ def _design(
     say("designing the next maneuver")
     alternatives = []
     for name, refit in {tied: state, **ties[tied]}.items():
-        free = search.free(refit.active)
+        free = search.free_of_vehicle(refit.active)
         i = quadratic.index([f.name for f in free])
         alternatives.append(
             next_maneuver.Alternative.of(
@@ -523,9 +527,12 @@ def _extended(
 ) -> Vehicle:
     """The vehicle with the causes in it, refitted on all runs."""
     engine = Engine(model, records)
-    free = search.free(state.active)
-    estimate = engine.fit(free, state.values, state.noise, iterations=3, tolerance=0.5)
+    closed_loop.attach_news(engine, state)
+    loose = search.free(state.active)
+    estimate = engine.fit(loose, state.values, state.noise, iterations=3, tolerance=0.5)
     dt = median_step(records)
+    free = search.free_of_vehicle(state.active)
+    own = [loose.index(f) for f in free]
 
     def std(f: FreeParameter) -> float:
         colour = colours.get(f.name.partition(".")[0], 1.0)
@@ -536,7 +543,7 @@ def _extended(
         free,
         estimate.values,
         {f.name: std(f) for f in free},
-        estimate.covariance,
+        estimate.covariance[np.ix_(own, own)],
         _diagnosed(flight),
         flight,
     )
