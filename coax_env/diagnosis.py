@@ -105,7 +105,7 @@ def diagnose(
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
     remarks = list(flight.notes) + double_counting(flight, vehicle)
     model = HeliModel(vehicle)
-    candidates = _candidates(exclude, vehicle, flight)
+    candidates = namable(exclude, vehicle, flight)
     for name in hold_out or ():
         flight.run(name)
     if hold_out and set(hold_out) == set(flight.run_names):
@@ -200,7 +200,7 @@ def diagnose(
 # --- what to fit on ---------------------------------------------------------------------------------
 
 
-def _candidates(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:
+def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:
     """Effects that may be named: not excluded, not in the vehicle yet, and with their sensor aboard."""
     for name in exclude:
         if name not in effects.CATALOGUE:
