@@ -24,7 +24,6 @@ The form::
 A vehicle without an effect's group is without the effect.
 """
 
-import math
 import os
 import sys
 from collections.abc import Iterable, Mapping
