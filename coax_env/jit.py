@@ -25,8 +25,12 @@ KERNEL_SOURCES = (
     "effects.py",
     "dynamics.py",
     "sensors.py",
+    "actuators.py",
     "random_streams.py",
+    "turbulence.py",
     "hover.py",
+    "tasks.py",
+    "randomisation.py",
     "fleet.py",
     "engine/kalman.py",
 )
