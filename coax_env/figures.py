@@ -405,6 +405,36 @@ def whiteness_bars(shares: Mapping[str, tuple[float, float]], threshold: float) 
     )
 
 
+def side_by_side(
+    groups: Sequence[str],
+    values: Mapping[str, Sequence[float | None]],
+    title: str,
+    log: bool = False,
+) -> Figure:
+    """Bars of several contestants in every group; None leaves a gap.
+
+    Args:
+        values: contestant -> one value per group.
+        title: of the value axis. log: whether that is logarithmic.
+    """
+    data = [
+        {
+            "type": "bar", "name": name, "marker": {"color": WHEEL[k % len(WHEEL)]},
+            "x": list(groups), "y": list(bars),
+            "hovertemplate": "%{x}: %{y:.3g}<extra>" + name + "</extra>",
+        }
+        for k, (name, bars) in enumerate(values.items())
+    ]  # fmt: skip
+    return _figure(
+        data,
+        300,
+        barmode="group",
+        bargap=0.3,
+        hovermode="closest",
+        yaxis={"title": {"text": title}, **({"type": "log", "dtick": 1} if log else {})},
+    )
+
+
 def evidence_steps(steps: Sequence[tuple[str, float]]) -> Figure:
     """Gain in log-likelihood of each step of the search, in order from above."""
     gains = [float(gain) for _, gain in steps][::-1]

@@ -26,6 +26,7 @@ from coax_env.layout import CHANNELS, FULL_STATES, N_COMMANDS
 from coax_env.linear import sampled
 from coax_env.sensors import BASE_RATE, Sensor, is_new, slow_instruments, suite
 from coax_env.vehicle import Vehicle
+from controllers.target import TargetView
 
 DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; not the fly-bar's, from which it must be told
 FORCE_SHARE = 0.05  # std of the disturbing force, of the weight
@@ -130,7 +131,7 @@ def design_estimator(
     vehicle: Vehicle, nominal: Nominal = None, sensors: str = "onboard"
 ) -> EstimatorDesign:
     """The filter for a vehicle and a sensor suite. A pure servo delay is taken as a lag."""
-    used = [s for s in suite(sensors) if s.index != _SPEED]  # |V| has no slope at hover
+    used = [s for s in suite(sensors, vehicle) if s.index != _SPEED]  # |V| has no slope at hover
     A_flown, B_flown, C_channels, D_channels, x_trim, u_trim = sampled(delay_as_lag(vehicle), DT)
     A, B = np.eye(len(_NAMES)), np.zeros((len(_NAMES), N_COMMANDS))
     A[:_N_FULL, :_N_FULL], B[:_N_FULL] = A_flown, B_flown
@@ -199,7 +200,8 @@ def integrated_readings(design: EstimatorDesign) -> dict[str, float]:
 class Tracker:
     """The running filter, for one helicopter or many, and the integrals of some readings.
 
-    In every control period: `see` the observation, then tell what was done with `acted`.
+    In every control period: `see` the observation, then tell what was done with `acted`. Where the
+    observation has a target, all is relative to it (controllers/target.py).
     """
 
     def __init__(self, design: EstimatorDesign, count: int = 1) -> None:
@@ -211,6 +213,9 @@ class Tracker:
         self._most = _WINDUP * np.array(list(integrated.values()))
         pairs = [(names.index(a), names.index(b)) for a, b in _PAIRS if a in names]
         self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+        self._view = TargetView(design.sensors)
+        self._asked = np.zeros((count, 4))
+        self._there = np.ones(count, dtype=np.bool_)
         self._heading = names.index("psi") if "psi" in names else -1
         self.offset = design.action_trim - design.command_trim
         self._first = np.zeros(len(design.states))
@@ -245,19 +250,41 @@ class Tracker:
             what is known, (count, n + i): the estimate and the integrals.
         """
         design = self.design
+        which = self._every if which is None else which
+        observations = np.asarray(observations)
+        if self._view.aims(observations):
+            observations = self._aimed(observations, which)
         _correct(
-            self._every if which is None else which, np.asarray(observations), self._rows,
+            which, observations, self._rows,
             self._command, design.reading_places, design.flag_places, self._pairs, self._heading,
             design.reading_trim, self._C, self._D, self._first_gain, self._gains, self.state,
             self._readings,
         )  # fmt: skip
         return np.hstack([self.state, self.integrals])
 
+    def _aimed(self, observations: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Observations from the point asked for; where that has moved, the estimate moves too."""
+        seen, asked, there = self._view.seen(observations)
+        moved = np.where((self._rows > 0)[:, None], asked - self._asked, 0.0)[which]
+        heading = asked[which, 3] + seen[which, self._view.names.index("psi")]
+        cosine, sine = np.cos(heading), np.sin(heading)
+        changes = {
+            "x": cosine * moved[:, 0] + sine * moved[:, 1],
+            "y": cosine * moved[:, 1] - sine * moved[:, 0],
+            "z": moved[:, 2],
+            "psi": (moved[:, 3] + math.pi) % (2.0 * math.pi) - math.pi,
+        }
+        for name, change in changes.items():
+            if name in self.design.states:
+                self.state[which, self.design.index(name)] -= change
+        self._asked[which], self._there[which] = asked[which], there[which]
+        return seen
+
     def acted(self, actions: np.ndarray) -> None:
         """Move on by one control period under actions (count, 4)."""
         self._command = self.offset + self.design.action_scale * actions
         _predict(self._command, self._A, self._B, self.state)
-        self.integrals += DT * self._readings[:, self._integrated]
+        self.integrals += DT * self._readings[:, self._integrated] * self._there[:, None]
         np.clip(self.integrals, -self._most, self._most, out=self.integrals)
         self._rows += 1
 

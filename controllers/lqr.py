@@ -7,6 +7,7 @@ velocity stands for it: the machine then holds still, and its place drifts.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,8 @@ from controllers.estimator import (
     design_estimator,
     integrated_readings,
 )
+from controllers.loading import FORMAT, VERSION
 
-FORMAT = "coax-controller"
-VERSION = 1
 INPUT_NAMES = ("rotor_upper", "rotor_lower", "swash_lon", "swash_lat")
 
 
@@ -103,27 +103,38 @@ class LQG:
         )
 
 
-def design(vehicle: str | Vehicle, nominal: Nominal = None, sensors: str = "onboard") -> LQG:
+BRISK = {"position": 0.5, "speed": 1.0}
+"""Limits [m, m/s] that make a design go to its target sooner than hover.LIMITS do."""
+
+
+def design(
+    vehicle: str | Vehicle,
+    nominal: Nominal = None,
+    sensors: str = "onboard",
+    limits: Mapping[str, float] | None = None,
+) -> LQG:
     """Design a hover controller on a vehicle.
 
     Args:
         vehicle: what the design is made on: shipped name, path or Vehicle.
         nominal: whose trim centres the action, as in the env.
         sensors: the suite it will be given.
+        limits: errors that count 1 in the cost, where not hover.LIMITS, such as BRISK.
     """
     import control
 
     vehicle = load_vehicle(vehicle)
     estimator = design_estimator(vehicle, nominal, sensors)
-    A, B, Q, R = regulator_problem(estimator)
+    A, B, Q, R = regulator_problem(estimator, limits)
     gain, cost_to_go, _ = control.dlqr(A, B, Q, R)
     return LQG(vehicle.name, estimator, np.asarray(gain), np.asarray(cost_to_go))
 
 
 def regulator_problem(
-    estimator: EstimatorDesign,
+    estimator: EstimatorDesign, limits: Mapping[str, float] | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """A, B, Q, R of the regulator: states and integrals, actions, `hover.cost` per period."""
+    limits = hover.LIMITS | dict(limits or {})
     integrated = integrated_readings(estimator)
     n = len(estimator.states)
     A, B = np.eye(n + len(integrated)), np.zeros((n + len(integrated), 4))
@@ -138,8 +149,8 @@ def regulator_problem(
     for error, names in errors.items():
         for name in set(names.split()) & set(estimator.states):
             at = estimator.index(name)
-            Q[at, at] += hover.COST_WEIGHTS[error] / hover.LIMITS[error] ** 2
-    R = np.eye(4) * hover.COST_WEIGHTS["effort"] / hover.LIMITS["effort"] ** 2
+            Q[at, at] += hover.COST_WEIGHTS[error] / limits[error] ** 2
+    R = np.eye(4) * hover.COST_WEIGHTS["effort"] / limits["effort"] ** 2
     return A, B, Q, R
 
 

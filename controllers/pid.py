@@ -22,9 +22,9 @@ from coax_env.files import write_json
 from coax_env.fleet import DT, Nominal, action_map
 from coax_env.sensors import suite
 from coax_env.vehicle import Vehicle, load_vehicle
+from controllers.loading import FORMAT, VERSION
+from controllers.target import TargetView
 
-FORMAT = "coax-pid"
-VERSION = 1
 _NEEDED = ("p", "q", "r", "phi", "theta", "psi", "h", "vn", "ve", "vd")
 _PLACE = ("pn", "pe")
 
@@ -66,6 +66,7 @@ class PID:
         missing = [name for name in _NEEDED if name not in names]
         if missing:
             raise InputError(f"pid needs {', '.join(missing)}, which sensors {self.suite!r} lack")
+        self._view = TargetView(self.suite)
         self._at = {name: names.index(name) for name in (*_NEEDED, *_PLACE) if name in names}
         self.reset()
 
@@ -89,10 +90,13 @@ class PID:
         batch = np.atleast_2d(observation).astype(float)
         if len(self._sums) != len(batch):
             self.reset(len(batch))
-        actions = np.clip(self._actions(batch), -1.0, 1.0).astype(np.float32)
+        there = np.ones(len(batch), dtype=bool)
+        if self._view.aims(batch):
+            batch, _, there = self._view.seen(batch)
+        actions = np.clip(self._actions(batch, there), -1.0, 1.0).astype(np.float32)
         return actions if np.ndim(observation) == 2 else actions[0]
 
-    def _actions(self, batch: np.ndarray) -> np.ndarray:
+    def _actions(self, batch: np.ndarray, there: np.ndarray) -> np.ndarray:
         g, y = self.gains, {name: batch[:, at] for name, at in self._at.items()}
         measured = np.column_stack([*_turned(y["vn"], y["ve"], y["psi"]), y["vd"]])
         if self._smooth is None:
@@ -102,12 +106,13 @@ class PID:
         ask_forward = ask_right = np.zeros(len(batch))
         if "pn" in y:
             ask = -g.place * np.column_stack([y["pn"], y["pe"]])
-            ask *= np.minimum(1.0, g.fastest / np.maximum(np.linalg.norm(ask, axis=1), 1e-9))[:, None]
+            length = np.maximum(np.linalg.norm(ask, axis=1), 1e-9)
+            ask *= np.minimum(1.0, g.fastest / length)[:, None]
             ask_forward, ask_right = _turned(ask[:, 0], ask[:, 1], y["psi"])
         height = hover.HEIGHT - y["h"]
         heading = -((y["psi"] + math.pi) % (2.0 * math.pi) - math.pi)
         ahead, aside = ask_forward - forward, ask_right - right
-        self._sums += DT * np.column_stack([ahead, aside, height, heading])
+        self._sums += DT * there[:, None] * np.column_stack([ahead, aside, height, heading])
         most = np.array([g.steepest / g.speed_sum] * 2 + [0.5 / g.height_sum, 0.5 / g.heading_sum])
         np.clip(self._sums, -most, most, out=self._sums)
         pitch = -(g.speed * ahead + g.speed_sum * self._sums[:, 0])
@@ -140,6 +145,14 @@ class PID:
     def save(self, path: str | Path) -> Path:
         """Write controller.json."""
         return write_json(path, self.to_dict())
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> "PID":
+        """From a JSON file."""
+        arrays = (np.array(content[key], dtype=float) for key in ("action_trim", "action_scale"))
+        return cls(
+            str(content["vehicle"]), str(content["sensors"]), *arrays, Gains(**content["gains"])
+        )
 
 
 def design(vehicle: str | Vehicle, nominal: Nominal = None, sensors: str = "onboard") -> PID:

@@ -94,7 +94,9 @@ class Policy:
         if self.eyes is None or self.eyes.count != len(batch):
             self.reset(len(batch))
         assert self.eyes is not None
-        actions = np.clip(self.network(self.eyes.features(self.eyes.see(batch))), -1.0, 1.0).astype(np.float32)
+        actions = np.clip(self.network(self.eyes.features(self.eyes.see(batch))), -1.0, 1.0).astype(
+            np.float32
+        )
         self.eyes.acted(actions)
         return actions if np.ndim(observation) == 2 else actions[0]
 
