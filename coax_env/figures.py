@@ -144,7 +144,7 @@ def histories(
             "yanchor": "bottom", "bgcolor": "rgba(0,0,0,0)",
         }  # fmt: skip
         for k, (name, values) in enumerate(curves.items()):
-            line = {"color": WHEEL[k % len(WHEEL)], "width": 1.7, "dash": DASHES[k % 3]}
+            line = {"color": colours[k % len(colours)], "width": 1.7, "dash": DASHES[k % 3]}
             data.append(
                 _curve(
                     t[::every],
@@ -410,6 +410,7 @@ def side_by_side(
     values: Mapping[str, Sequence[float | None]],
     title: str,
     log: bool = False,
+    colours: Sequence[str] = WHEEL,
 ) -> Figure:
     """Bars of several contestants in every group; None leaves a gap.
 
@@ -419,7 +420,7 @@ def side_by_side(
     """
     data = [
         {
-            "type": "bar", "name": name, "marker": {"color": WHEEL[k % len(WHEEL)]},
+            "type": "bar", "name": name, "marker": {"color": colours[k % len(colours)]},
             "x": list(groups), "y": list(bars),
             "hovertemplate": "%{x}: %{y:.3g}<extra>" + name + "</extra>",
         }
@@ -498,7 +499,7 @@ def repeatability(
         percent = [100.0 / abs(joint[n][0]) for n in told]
         dots = {
             "type": "scatter", "mode": "markers", "name": run,
-            "marker": {"color": WHEEL[k % len(WHEEL)], "size": 6, "symbol": k // len(WHEEL)},
+            "marker": {"color": colours[k % len(colours)], "size": 6, "symbol": k // len(WHEEL)},
             "x": [(found[n][0] - joint[n][0]) * p for n, p in zip(told, percent, strict=True)],
             "y": [place[n] + aside for n in told],
             "error_x": {

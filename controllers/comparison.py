@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 from coax_env import figures
@@ -103,16 +102,16 @@ def compare(
             if progress:
                 progress(f"{condition.name}: {name}")
             controller = make(vehicle, None, condition.sensors, condition.aims)
-            fly = partial(
-                evaluate_spread if condition.spread else evaluate,
-                controller, condition.vehicle, seconds=seconds, seed=seed, **condition.arguments,
-            )  # fmt: skip
             if controller is None:
                 row[name] = None
             elif condition.spread:
-                row[name] = fly(vehicles=vehicles, episodes=max(episodes // 5, 1))
+                row[name] = evaluate_spread(
+                    controller, condition.vehicle, vehicles, max(episodes // 5, 1), seconds, seed
+                )
             else:
-                row[name] = fly(episodes=episodes)
+                row[name] = evaluate(
+                    controller, condition.vehicle, episodes, seconds, seed, **condition.arguments
+                )
     return {"vehicle": vehicle.name, "episodes": episodes, "seed": seed, "conditions": found}
 
 

@@ -9,6 +9,7 @@ from coax_env import figures, hover
 from coax_env.env import CoaxVectorEnv
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from coax_env.vehicle import Vehicle
+from controllers.loading import Controller
 from controllers.lqr import LQG, Margins
 
 MARGIN_HEADER = ("input", "gain down", "gain up", "phase", "least distance", "at")
@@ -73,7 +74,7 @@ def disk_in_words(disk: float) -> tuple[str, str]:
 
 
 def step_response(
-    controller: LQG, vehicle: Vehicle, seconds: float = 8.0
+    controller: Controller, vehicle: Vehicle, seconds: float = 8.0
 ) -> tuple[np.ndarray, list[tuple[str, dict[str, np.ndarray]]]]:
     """True states of one flight from START on noisy sensors: time (n,) and panels of curves."""
     from coax_env.layout import N_STATES, STATES

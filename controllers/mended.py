@@ -35,6 +35,7 @@ MANEUVERS = (
     "side_run", "lon_doublet", "lat_doublet", "heading_turn", "differential_rpm",
 )  # fmt: skip
 MODELS = ("bare", "mended")
+COLOURS = (figures.BEFORE, figures.AFTER)
 ROW_HEADER = HEADER[1:]
 
 
@@ -117,8 +118,8 @@ def models_page(
     scores, gains = content["scores"], content["cost_ratio"]
     words = " and ".join(f"{k.upper()} **{g:.1f} times** less" for k, g in gains.items())
     lead = [
-        f"Designed on the mended model instead of the bare one, controllers of the same machine "
-        f"cost {words} in flight.",
+        f"Designed on the mended model instead of the bare one, the same machine flies better: "
+        f"{words} cost.",
         f"Hidden in it: {', '.join(content['hidden'])}; named by the diagnosis: "
         f"{', '.join(content['found']) or 'nothing'}.",
     ]
@@ -127,9 +128,10 @@ def models_page(
     heading = {m: [scores[f"{k} {m}"]["heading_rms_deg"] for k in kinds] for m in MODELS}
     parts = [
         Section("What it is worth", [
-            figure(figures.side_by_side([k.upper() for k in kinds], bars, "cost per step")),
+            figure(figures.side_by_side([k.upper() for k in kinds], bars, "cost per step",
+                                        colours=COLOURS)),
             figure(figures.side_by_side([k.upper() for k in kinds], heading,
-                                        "heading rms [deg]")),
+                                        "heading rms [deg]", colours=COLOURS)),
             table(ROW_HEADER, rows(content), "On the true machine, from the same seeds"),
         ]),
         Section("One flight of each", [

@@ -149,10 +149,11 @@ class PID:
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> "PID":
         """From a JSON file."""
-        arrays = (np.array(content[key], dtype=float) for key in ("action_trim", "action_scale"))
-        return cls(
-            str(content["vehicle"]), str(content["sensors"]), *arrays, Gains(**content["gains"])
+        trim, scale = (
+            np.array(content[key], dtype=float) for key in ("action_trim", "action_scale")
         )
+        gains = Gains(**content["gains"])
+        return cls(str(content["vehicle"]), str(content["sensors"]), trim, scale, gains)
 
 
 def design(vehicle: str | Vehicle, nominal: Nominal = None, sensors: str = "onboard") -> PID:

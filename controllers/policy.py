@@ -17,6 +17,7 @@ import json
 import os
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,17 +34,21 @@ WEIGHTS = "weights.npz"
 SHIPPED = Path(__file__).parent / "policies" / "hover.zip"
 """Trained on lama400d, default sensors; the command that made it is in its description."""
 
-ACTIVATIONS = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0.0)}
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, 0.0),
+}
 _LARGEST = 16 * 2**20  # bytes of a member that is read; ours have some 200 kB
 _FEATURE_LIMIT = 10.0
 
 FEATURE_SCALES = {
-    "u": 0.5, "v": 0.5, "w": 0.5, "p": 0.3, "q": 0.3, "r": 0.3,
+    "u": 0.1, "v": 0.1, "w": 0.1, "p": 0.3, "q": 0.3, "r": 0.3,
     "alpha_l": 0.05, "beta_l": 0.05, "alpha_f": 0.05, "beta_f": 0.05,
-    "phi": 0.1, "theta": 0.1, "psi": 0.3, "x": 1.0, "y": 1.0, "z": 0.2,
+    "phi": 0.05, "theta": 0.05, "psi": 0.05, "x": 1.0, "y": 1.0, "z": 0.1,
     "swash_lon": 0.1, "swash_lat": 0.1,
 }  # fmt: skip
-"""Size of an estimate that becomes 1 for the policy; the rest by the filter's own figures."""
+"""Size of an estimate that becomes 1 for the policy, near what a good hover leaves; the rest by the
+filter's own figures. Coarser ones take several times longer to learn from."""
 
 
 @dataclass
@@ -145,7 +150,7 @@ def save_policy(
         training: a zip file of Stable-Baselines3, whose members join the plain ones.
     """
     path = Path(path)
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for k, (weight, bias) in enumerate(network.layers):
         arrays[f"weight_{k}"], arrays[f"bias_{k}"] = weight, bias
     weights, buffer = io.BytesIO(), io.BytesIO(training)
