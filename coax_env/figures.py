@@ -144,7 +144,7 @@ def histories(
             "yanchor": "bottom", "bgcolor": "rgba(0,0,0,0)",
         }  # fmt: skip
         for k, (name, values) in enumerate(curves.items()):
-            line = {"color": colours[k % len(colours)], "width": 1.7, "dash": DASHES[k % 3]}
+            line = {"color": WHEEL[k % len(WHEEL)], "width": 1.7, "dash": DASHES[k % 3]}
             data.append(
                 _curve(
                     t[::every],
@@ -499,7 +499,7 @@ def repeatability(
         percent = [100.0 / abs(joint[n][0]) for n in told]
         dots = {
             "type": "scatter", "mode": "markers", "name": run,
-            "marker": {"color": colours[k % len(colours)], "size": 6, "symbol": k // len(WHEEL)},
+            "marker": {"color": WHEEL[k % len(WHEEL)], "size": 6, "symbol": k // len(WHEEL)},
             "x": [(found[n][0] - joint[n][0]) * p for n, p in zip(told, percent, strict=True)],
             "y": [place[n] + aside for n in told],
             "error_x": {
