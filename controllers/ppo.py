@@ -184,7 +184,7 @@ def train(
         resume: a policy.zip to go on from. Its training members are pickles, which can run
             anything: only from those you trust.
         progress: called after every rollout with the steps so far and the mean episode's figures.
-        tensorboard: folder for TensorBoard's logs.
+        tensorboard: folder for TensorBoard's logs; its package is the extra ``tensorboard``.
         command_line: what made the policy, for its description.
         env_arguments: further ones of CoaxVectorEnv, such as ``randomize="posterior"``.
 
@@ -193,6 +193,8 @@ def train(
     """
     callbacks = require("stable_baselines3.common.callbacks", "rl")
     torch = require("torch", "rl")
+    if tensorboard:
+        require("torch.utils.tensorboard", "tensorboard")
     if steps < 1:
         raise InputError(f"steps must be at least 1, found {steps}")
     path = make_folder(out) / "policy.zip"

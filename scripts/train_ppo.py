@@ -46,7 +46,7 @@ def main() -> None:
         path = ppo.train(
             vehicle, options.out, round(options.steps), options.seed, options.nominal,
             options.sensors, options.resume, progress, options.tensorboard,
-            command_line="scripts/train_ppo.py " + shlex.join(sys.argv[1:]), **more,
+            command_line=shlex.join(["scripts/train_ppo.py", *sys.argv[1:]]), **more,
         )  # fmt: skip
     score = evaluate(load_controller(path), vehicle, episodes=100, seed=10_000 + options.seed)
     write_json(options.out / "score.json", score)

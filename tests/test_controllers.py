@@ -558,14 +558,52 @@ def test_ppo_trains_saves_resumes_and_is_judged(tmp_path, monkeypatch):
     monkeypatch.setitem(ppo.SETTINGS, "n_envs", 16)
     monkeypatch.setitem(ppo.SETTINGS, "batch_size", 256)
     seen = []
-    path = ppo.train(LAMA, tmp_path, steps=2048, seed=1, progress=lambda n, _: seen.append(n))
+    path = ppo.train(LAMA, tmp_path, steps=4096, seed=1, progress=lambda n, _: seen.append(n))
     again = ppo.train(LAMA, tmp_path / "more", steps=1024, resume=path)
-    assert seen == [1024, 2048]
+    assert seen == [2048, 4096]
     score = evaluate(load_controller(again), LAMA, episodes=2, seconds=4.0)
     assert set(score) >= CONTRACT_KEYS and score["controller"] == "ppo"
     one = load_controller(path)
     env = gymnasium.make("CoaxHeli-v0")
     assert one.act(env.reset(seed=0)[0]).shape == (4,)
+
+
+@pytest.mark.slow
+def test_a_held_action_earns_the_sum_of_its_periods_and_ends_in_its_own_flight():
+    pytest.importorskip("stable_baselines3")
+    from controllers.ppo import hover_vec_env
+
+    design = design_estimator(LAMA)
+    held, each = (hover_vec_env(LAMA, design, 2, episode_s=0.1, hold=k) for k in (4, 1))
+    for env in (held, each):
+        env.seed(3)
+        env.reset()
+    action = np.array([[0.1, 0.1, 0.05, 0.0], [0.0, 0.0, 0.0, 0.1]], np.float32)
+    for flown in (4, 4, 2):  # a flight of ten periods ends within the third action
+        _, rewards, done, infos = held.step(action)
+        singles = [each.step(action) for _ in range(flown)]
+        assert rewards == pytest.approx(np.sum([r for _, r, *_ in singles], axis=0), rel=1e-5)
+        assert done.all() == (flown == 2)
+    for i in range(2):
+        assert infos[i]["episode"]["l"] == 10
+        last = singles[-1][3][i]["terminal_observation"]
+        assert infos[i]["terminal_observation"] == pytest.approx(last, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_the_plain_arrays_are_stable_baselines_policy(tmp_path, monkeypatch):
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    from controllers import ppo
+
+    monkeypatch.setitem(ppo.SETTINGS, "n_envs", 16)
+    path = ppo.train(LAMA, tmp_path, steps=2048)
+    model = stable_baselines3.PPO.load(path, device="cpu")
+    features = np.random.default_rng(0).normal(size=(7, 33)).astype(np.float32)
+    expected = model.policy.predict(features, deterministic=True)[0]
+    found = np.clip(policy.load_policy(path).network(features), -1.0, 1.0)
+    assert found == pytest.approx(expected, abs=1e-5)
+    with pytest.raises(InputError, match="plain arrays only"):
+        ppo.train(LAMA, tmp_path / "more", steps=512, resume=policy.SHIPPED)
 
 
 @pytest.mark.slow
