@@ -234,9 +234,12 @@ class Tracker:
     def see(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
         """Take in observations (count, n_obs), only in the rows of a mask where one is given.
 
+        A reading that is no finite number tells nothing, and changes nothing.
+
         Returns:
             what is known, (count, n + i): the estimate and the integrals.
         """
+        observations = without_holes(self.design, observations, self.state, self._command)
         if which is None:
             self.state, self._readings = self._corrected(
                 observations, self.state, self._command, self._rows
@@ -285,6 +288,34 @@ class Tracker:
         at = rows == 0
         state[at] += innovation[at] @ design.first_gain.T
         return state, y
+
+
+def without_holes(
+    design: EstimatorDesign, observations: np.ndarray, state: np.ndarray, command: np.ndarray
+) -> np.ndarray:
+    """Observations with the expected reading where one is not a finite number, (count, n_obs).
+
+    Args:
+        state, command: deviations from trim, (count, n) and (count, 4).
+    """
+    read = observations[:, design.reading_places]
+    hole = ~np.isfinite(read)
+    if not hole.any():
+        return observations
+    names = design.readings
+    expected = state @ design.C.T + command @ design.D.T + design.reading_trim
+    if "psi" in names:
+        heading = names.index("psi")
+        psi = np.where(hole[:, heading], expected[:, heading], read[:, heading])
+        cosine, sine = np.cos(psi), np.sin(psi)
+        for a, b in ((names.index(a), names.index(b)) for a, b in _PAIRS if a in names):
+            forward, right = expected[:, a].copy(), expected[:, b].copy()
+            expected[:, a] = cosine * forward - sine * right
+            expected[:, b] = sine * forward + cosine * right
+            hole[:, a] = hole[:, b] = hole[:, a] | hole[:, b]
+    filled = np.array(observations, dtype=float)
+    filled[:, design.reading_places] = np.where(hole, expected, read)
+    return filled
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:
