@@ -4,6 +4,10 @@ import ast
 import runpy
 import sys
 from pathlib import Path
+from typing import NoReturn
+
+import coax_env
+from coax_env.errors import InputError
 
 FOLDER = Path(__file__).resolve().parent
 VERBS = (
@@ -13,26 +17,28 @@ VERBS = (
 """Scripts that need nothing but the package; studies and benchmark also need its sources."""
 
 
-def main() -> None:
+def main() -> NoReturn:
+    if str(FOLDER) not in sys.path:
+        sys.path.insert(0, str(FOLDER))
+    import command_line
+
+    command_line.called_as_verb = True
+    command_line.run(dispatch)
+
+
+def dispatch() -> None:
+    """Run the verb's script with the words behind it."""
     words = sys.argv[1:]
     if not words or words[0] in ("-h", "--help"):
         print(usage())
         return
     if words[0] == "--version":
-        from coax_env import __version__
-
-        print(f"coax {__version__}")
+        print(f"coax {coax_env.__version__}")
         return
     verb = words[0].replace("-", "_")
     if verb not in VERBS:
-        print(f"error: no verb {words[0]!r}; there are {', '.join(VERBS)}", file=sys.stderr)
-        sys.exit(2)
-    if str(FOLDER) not in sys.path:
-        sys.path.insert(0, str(FOLDER))
+        raise InputError(f"no verb {words[0]!r}; there are {', '.join(VERBS)}")
     sys.argv = [f"coax {verb}", *words[1:]]
-    import command_line
-
-    command_line.called_as_verb = True
     runpy.run_path(str(FOLDER / f"{verb}.py"), run_name="__main__")
 
 
