@@ -26,6 +26,7 @@ import numpy as np
 from coax_env import parameters as P
 from coax_env.engine.fit import Engine, RunPass
 from coax_env.engine.model import FreeParameter
+from coax_env.engine.whiteness import is_white
 from coax_env.search import TIE, Search, State
 
 CLIP = 2.0
@@ -47,23 +48,22 @@ _TAKEN = (_TILTS, _TILTS, _TILTS, _TURN, _TURN, _LIFT, _LIFT)
 def listen(search: Search, state: State) -> bool:
     """Fit the gains of the commands' news, where that is worth more than TIE. Changes `state`.
 
-    Called again, it takes the news and the priors of the model as it now stands.
+    Only where the innovations are white: what a model gets wrong follows the commands too, and news
+    would explain it away.
 
     Returns:
         whether the gains are fitted from now on.
     """
-    again = any(f.name in P.COMMAND_GAINS for f in search.base)
-    search.tighten(P.COMMAND_GAINS)
     passes = _passes(search.engine, state)
+    if not is_white(passes, search.model.channels):
+        return False
     _attach(search.engine, passes)
     gains = _gains(passes, [r.news for r in search.engine.records])
     search.loosen(gains)
     trial = replace(state, values={**dict.fromkeys(P.COMMAND_GAINS, 0.0), **state.values})
     trial = search.settle(trial)
-    if again or state.objective - trial.objective > TIE:
-        if not again:
-            gained = state.objective - trial.objective
-            search.say(f"the commands know of the gusts: {gained:.1f} nats")
+    if state.objective - trial.objective > TIE:
+        search.say(f"the commands know of the gusts: {state.objective - trial.objective:.1f} nats")
         state.values, state.objective = trial.values, trial.objective
         return True
     search.tighten(P.COMMAND_GAINS)

@@ -128,16 +128,13 @@ def diagnose(
     passes_before = engine.filter(bare.values, bare.noise)
     say("fitting the model's own parameters")
     refitted = search.refit_noise(search.settle(replace(bare, values=dict(bare.values))))
-    if closed_loop.listen(search, refitted):
-        refitted = search.refit_noise(search.settle(refitted))
     say("searching for causes")
     state, quadratic = search.run(
         State([], dict(refitted.values), refitted.noise, refitted.objective)
     )
     state, quadratic, terms = unlisted.explain(search, state, quadratic)
     say("weighing the causes against their look-alikes")
-    if state.active:
-        closed_loop.listen(search, state)
+    closed_loop.listen(search, state)
     state, quadratic, weights = search.prune(state)
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
@@ -527,7 +524,8 @@ def _extended(
 ) -> Vehicle:
     """The vehicle with the causes in it, refitted on all runs."""
     engine = Engine(model, records)
-    closed_loop.attach_news(engine, state)
+    if any(record.news is not None for record in search.engine.records):
+        closed_loop.attach_news(engine, state)
     loose = search.free(state.active)
     estimate = engine.fit(loose, state.values, state.noise, iterations=3, tolerance=0.5)
     dt = median_step(records)

@@ -68,6 +68,9 @@ GUST_REFERENCE = {
     GUST_INERTIA_ZZ: INERTIA_ZZ,
 }
 
+AIR_DOWN = GUST_MEMORY + 1
+"""Velocity of the air downwards [m/s], beside the effect `wind`: zero but in turbulence.py's air."""
+
 COMMAND_GAINS = {
     "command_gain.rate_xy": "rad/s per rad",
     "command_gain.moment_xy": "N m per rad",
@@ -78,7 +81,7 @@ COMMAND_GAINS = {
     "command_gain.force_z": "N per rad/s",
 }
 """How the filter's state answers what a command gives away (closed_loop.py); zero in a simulation."""
-COMMAND_GAIN = GUST_MEMORY + 1
+COMMAND_GAIN = AIR_DOWN + 1
 
 N_FIXED = COMMAND_GAIN + len(COMMAND_GAINS)
 # after it: one switch per stage, then the effects' parameters
