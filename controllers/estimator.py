@@ -246,6 +246,8 @@ class Tracker:
     def see(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
         """Take in observations (count, n_obs), only in the rows of a mask where one is given.
 
+        A reading that is no finite number tells nothing, and changes nothing.
+
         Returns:
             what is known, (count, n + i): the estimate and the integrals.
         """
@@ -321,18 +323,23 @@ def _correct(
         y, x = readings[i], state[i]
         for k in range(m):
             y[k] = observations[i, places[k]]
+        expected[:] = 0.0
+        _add_product(C_by_state, x, expected)
+        _add_product(D_by_command, command[i], expected)
         if heading >= 0:
+            if not math.isfinite(y[heading]):
+                y[heading] = expected[heading] + trim[heading]
             cosine, sine = math.cos(y[heading]), math.sin(y[heading])
             for j in range(len(pairs)):
                 north, east = y[pairs[j, 0]], y[pairs[j, 1]]
                 y[pairs[j, 0]] = cosine * north + sine * east
                 y[pairs[j, 1]] = cosine * east - sine * north
-        expected[:] = 0.0
-        _add_product(C_by_state, x, expected)
-        _add_product(D_by_command, command[i], expected)
         gain = first_gain[0] if rows[i] == 0 else gains[rows[i] % len(gains)]
         for k in range(m):
             y[k] -= trim[k]
+            if not math.isfinite(y[k]):  # a reading that is no number tells nothing
+                y[k] = expected[k]
+                continue
             if k == heading:
                 y[k] = _wrapped(y[k])
             if flags[k] >= 0 and observations[i, flags[k]] <= 0.5:

@@ -42,7 +42,7 @@ def draft(folder: Path, vehicle: str) -> None:
     print(f"{card}: look at every line")
     for guess in guessed:
         print(f"  guessed: {guess.line()}")
-    print(f"next: scripts/check_flight.py {folder}")
+    print(command_line.as_called(f"next: scripts/check_flight.py {folder}"))
 
 
 def show(found: "FlightCheck") -> None:
@@ -82,7 +82,7 @@ def show(found: "FlightCheck") -> None:
     command_line.print_columns(rows)
     if found.undetermined:
         print("stay open:", "; ".join(found.directions) or ", ".join(found.undetermined))
-    print("\nnext:", found.next_step)
+    print("\nnext:", command_line.as_called(found.next_step))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +16,8 @@ from coax_env.errors import InputError
 
 BAD_INPUT = 2
 INTERRUPTED = 130
+called_as_verb = False
+"""Whether `coax diagnose` was called, and not scripts/diagnose.py (coax.py sets it)."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -26,7 +29,7 @@ class Parser(argparse.ArgumentParser):
 
 def parser(name: str, description: str, *, seed: bool = False) -> Parser:
     """A parser with ``--out`` (default ``runs/NAME``) and, where chance plays, ``--seed``."""
-    result = Parser(prog=f"scripts/{name}.py", description=description)
+    result = Parser(prog=as_called(f"scripts/{name}.py"), description=description)
     result.add_argument(
         "--out", type=Path, default=Path("runs") / name, metavar="DIR",
         help="folder for the results (default: %(default)s)",
@@ -34,6 +37,13 @@ def parser(name: str, description: str, *, seed: bool = False) -> Parser:
     if seed:
         result.add_argument("--seed", type=int, default=0, help="of chance (default: 0)")
     return result
+
+
+def as_called(text: str) -> str:
+    """Text that names scripts, with `coax diagnose` for `scripts/diagnose.py` where that was called."""
+    if not called_as_verb:
+        return text
+    return re.sub(r"\bscripts/(\w+)\.py", r"coax \1", text)
 
 
 def print_columns(rows: Sequence[Sequence[str]]) -> None:
@@ -70,7 +80,7 @@ def run(main: Callable[[], None]) -> NoReturn:
     try:
         main()
     except InputError as error:
-        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        print("error:", as_called(str(error)), file=sys.stderr)
         sys.exit(BAD_INPUT)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

@@ -12,6 +12,7 @@ from time import monotonic
 import command_line
 import diagnose as diagnose_script
 
+import coax_env
 from coax_env import plain_words
 from coax_env.diagnosis import Diagnosis, diagnose
 from coax_env.files import write_json
@@ -20,9 +21,9 @@ from coax_env.vehicle import Vehicle, load_vehicle
 from controllers import lqr
 from controllers.evaluation import evaluate
 
-ROOT = Path(__file__).resolve().parent.parent
-BUNDLED = ROOT / "coax_env" / "flights" / "windy"
-REAL = ROOT.parent / "shared" / "flights" / "skybotix_coax"
+PACKAGE = Path(coax_env.__file__).resolve().parent
+BUNDLED = PACKAGE / "flights" / "windy"
+REAL = PACKAGE.parent.parent / "shared" / "flights" / "skybotix_coax"
 
 
 def main() -> None:

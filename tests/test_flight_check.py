@@ -222,3 +222,21 @@ def test_what_a_guess_knows_and_what_it_leaves():
         "t": ("TimeUS", "us"), "phi": ("Roll (deg)", "deg"), "p": ("GyrX", "rad/s"),
         "r": ("wz", "rad/s"), "ax": ("accX_mss", "m/s2"), "rpm_upper": ("rpm1", "rev/min"),
     }  # fmt: skip
+
+
+def test_the_script_says_it_in_tables(tmp_path, monkeypatch, capsys):
+    import importlib
+
+    script = importlib.import_module("check_flight")
+    folder = write_flight(flown("hover"), tmp_path / "flight")
+    monkeypatch.setattr(
+        "sys.argv", ["check_flight.py", str(folder), "--out", str(tmp_path / "out")]
+    )
+    script.main()
+    said = capsys.readouterr().out
+    written = json.loads((tmp_path / "out" / "check.json").read_text())
+    assert f"next: {written['next_step']}" in said
+    assert {e["effect"] for e in written["effects"]} >= {"wind", "motor_lag"}
+    for effect in written["effects"]:
+        assert f"\n{effect['effect']} " in said and effect["verdict"] in said
+    assert "not measured: pn pe v" in said
