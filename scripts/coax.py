@@ -48,7 +48,7 @@ def usage() -> str:
     for verb in VERBS:
         text = (FOLDER / f"{verb}.py").read_text(encoding="utf-8")
         summary = (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
-        lines.append(f"  {verb:13s} {summary}")
+        lines.append(f"  {verb:14s} {summary}")
     return "\n".join(lines)
 
 
