@@ -12,7 +12,7 @@ from coax_env.errors import InputError
 FOLDER = Path(__file__).resolve().parent
 VERBS = (
     "demo", "simulate", "import_log", "check_flight", "replay", "diagnose", "identify",
-    "plan_flight", "design_lqr", "train_ppo", "evaluate",
+    "plan_flight", "design_lqr", "train_ppo", "evaluate", "compare_models",
 )  # fmt: skip
 """Scripts that need nothing but the package; studies and benchmark also need its sources."""
 
@@ -48,7 +48,7 @@ def usage() -> str:
     for verb in VERBS:
         text = (FOLDER / f"{verb}.py").read_text(encoding="utf-8")
         summary = (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
-        lines.append(f"  {verb:13s} {summary}")
+        lines.append(f"  {verb:14s} {summary}")
     return "\n".join(lines)
 
 

@@ -59,7 +59,7 @@ def place(name: str) -> int:
 
 def spoilt(name: str, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """The observations of the sound flight with one reading changed while it is at fault."""
-    observations = flown()[0].astype(float).copy()
+    observations = flown()[0].copy()
     observations[FAULT, place(name)] = change(observations[FAULT, place(name)])
     return observations
 
@@ -93,33 +93,33 @@ def test_the_estimate_stays_finite_and_forgets(name, fault):
 
 
 def test_a_missing_reading_is_one_that_is_not_new():
-    """For a sensor with a flag it is the same, to the last digit, as no flag."""
+    """For a sensor with a flag it is the same, to single precision, as no flag."""
     column = design().readings.index("h")
     flag = int(design().flag_places[column])
     assert flag >= 0
-    unflagged = flown()[0].astype(float).copy()
+    unflagged = flown()[0].copy()
     unflagged[FAULT, flag] = 0.0
     n = len(design().states)
     missing = tracked(spoilt("h", FAULTS["missing"]))[:, :n]
-    np.testing.assert_allclose(missing, tracked(unflagged)[:, :n], rtol=1e-9, atol=1e-12)
+    assert (np.abs(missing - tracked(unflagged)[:, :n]) < 1e-3 * design().spread).all()
 
 
 def test_nothing_but_holes_is_the_models_own_prediction():
-    observations = flown()[0].astype(float).copy()
+    observations = flown()[0].copy()
     observations[FAULT, design().reading_places] = np.nan
     state = tracked(observations)[:, : len(design().states)]
     offset = design().action_trim - design().command_trim
     for row in range(FAULT.start, FAULT.stop - 1):
         command = offset + design().action_scale * flown()[1][row]
         expected = design().A @ state[row] + design().B @ command
-        np.testing.assert_allclose(state[row + 1], expected, rtol=1e-7, atol=1e-10)
+        assert (np.abs(state[row + 1] - expected) < 1e-2 * design().spread).all()
 
 
 def test_holes_in_one_helicopter_are_not_its_neighbours():
     observations, actions = flown()
     both, alone = Tracker(design(), 2), Tracker(design(), 1)
     for k in range(120):
-        pair = np.repeat(observations[k][None].astype(float), 2, axis=0)
+        pair = np.repeat(observations[k][None], 2, axis=0)
         if k > 40:
             pair[0, design().reading_places] = np.nan
         seen = both.see(pair)[1]
