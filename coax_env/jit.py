@@ -23,6 +23,7 @@ KERNEL_SOURCES = (
     "parameters.py",
     "generic_terms.py",
     "effects.py",
+    "lanes.py",
     "dynamics.py",
     "sensors.py",
     "random_streams.py",
