@@ -172,12 +172,13 @@ def n_parameters() -> int:
 
 @cache
 def _offs() -> tuple[np.ndarray, np.ndarray]:
-    """Off-values of all effects' parameters, and the switch each one throws (-1: a shape), (k,)."""
+    """Off-values of all effects' parameters, (k,), and which switch each one throws, (k, stages)."""
     every = [(p, e.stage) for e in GROUPS.values() for p in e.parameters]
-    return (
-        np.array([p.off for p, _ in every]),
-        np.array([-1 if p.shape else stage for p, stage in every]),
-    )
+    throws = [
+        [not p.shape and stage == switch for switch in range(P.N_FIXED, _FIRST)]
+        for p, stage in every
+    ]
+    return np.array([p.off for p, _ in every]), np.array(throws, dtype=float)
 
 
 # --- properties -----------------------------------------------------------------------------------
@@ -321,13 +322,22 @@ def battery_sag(x, f, p, e):
     source="V_a = V - R^T w; acts only through a drag or blow-back",
 )
 def wind(x, f, p, e):
-    """Steady wind: the air's velocity towards north and east."""
+    """Steady wind: the air's velocity towards north and east (turbulence adds to it in the env)."""
     north, east = p[e], p[e + 1]
     forward = north * f[F.COS_PSI] + east * f[F.SIN_PSI]
     right = -north * f[F.SIN_PSI] + east * f[F.COS_PSI]
-    f[F.AIR_U] -= f[F.COS_THETA] * forward
-    f[F.AIR_V] -= f[F.SIN_PHI] * f[F.SIN_THETA] * forward + f[F.COS_PHI] * right
-    f[F.AIR_W] -= f[F.COS_PHI] * f[F.SIN_THETA] * forward - f[F.SIN_PHI] * right
+    down = p[P.AIR_DOWN]
+    f[F.AIR_U] -= f[F.COS_THETA] * forward - f[F.SIN_THETA] * down
+    f[F.AIR_V] -= (
+        f[F.SIN_PHI] * f[F.SIN_THETA] * forward
+        + f[F.COS_PHI] * right
+        + f[F.SIN_PHI] * f[F.COS_THETA] * down
+    )
+    f[F.AIR_W] -= (
+        f[F.COS_PHI] * f[F.SIN_THETA] * forward
+        - f[F.SIN_PHI] * right
+        + f[F.COS_PHI] * f[F.COS_THETA] * down
+    )
 
 
 # --- swash plate ----------------------------------------------------------------------------------
@@ -711,6 +721,7 @@ def off_vector() -> np.ndarray:
     """Parameter vector with every effect off and the base parameters NaN."""
     vector = np.full(n_parameters(), np.nan)
     vector[P.GUST_MEMORY] = 0.5
+    vector[P.AIR_DOWN] = 0.0
     vector[_FIRST:] = _offs()[0]
     set_switches(vector)
     return vector
@@ -728,11 +739,12 @@ def pack(values: Mapping[str, float]) -> np.ndarray:
 
 
 def set_switches(vector: np.ndarray) -> None:
-    """Switch on, in place, the stages that have an effect away from its off-value."""
-    vector[P.N_FIXED : _FIRST] = 0.0
-    off, switch = _offs()
-    thrown = switch[(vector[_FIRST:] != off) & (switch >= 0)]
-    vector[thrown] = 1.0
+    """Switch on, in place, the stages that have an effect away from its off-value.
+
+    Of one parameter vector, or of many at once, shape (..., n_parameters()).
+    """
+    off, throws = _offs()
+    vector[..., P.N_FIXED : _FIRST] = (vector[..., _FIRST:] != off) @ throws > 0.0
 
 
 def completed(effect_name: str, table: Mapping[str, Any], make: Callable) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 Both envs are thin shells over the same batch kernel (fleet.py); `CoaxEnv` is a fleet of one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -12,15 +12,14 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from coax_env import hover
+from coax_env import hover, tasks
 from coax_env.errors import InputError
 from coax_env.fleet import Fleet, Nominal
 from coax_env.layout import N_FULL, N_STATES
-from coax_env.sensors import Sensor
+from coax_env.randomisation import Randomize
 from coax_env.vehicle import Vehicle
 
 _FPS = round(1.0 / hover.CONTROL_PERIOD)
-_TERMS = tuple(enumerate(hover.REWARD_TERMS))
 _ALL = np.ones(1, dtype=np.bool_)
 
 
@@ -101,15 +100,22 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         sensors: str = "onboard",
         wind: float | Sequence[float] | None = None,
         gusts: tuple[float, float] | None = None,
-        randomize: str | None = None,
+        randomize: Randomize = None,
         render_mode: str | None = None,
+        turbulence: float | str | None = None,
+        task: str = "hover",
+        target: Any = None,
     ) -> None:
         _check_render_mode(render_mode)
         self.render_mode = render_mode
-        self.fleet = Fleet(1, vehicle, nominal, sensors, wind, gusts, randomize)
-        self.observation_space = observation_space(self.fleet.sensors, self.fleet.flags)
+        self.fleet = Fleet(
+            1, vehicle, nominal, sensors, wind, gusts, randomize,
+            turbulence=turbulence, task=task, target=target,
+        )  # fmt: skip
+        self.observation_space = observation_space(self.fleet)
         self.action_space = action_space()
-        self.observation_names = observation_names(self.fleet.sensors, self.fleet.flags)
+        self.observation_names = observation_names(self.fleet)
+        self._terms = tuple(enumerate(self.fleet.task.terms))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -122,21 +128,29 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         elif fresh:
             self.fleet.seed(0, int(self.np_random.integers(2**63)))
         observation = self.fleet.restart(_ALL, _start_states(options, 1))[0]
-        info: dict[str, Any] = {"state": self.fleet.x[0].copy()}
-        if self.fleet.randomize:
-            info["vehicle"] = self.fleet.flown[0].values()
+        info = self._told()
+        if self.fleet.draws.random:
+            drawn = self.fleet.drawn[0].tolist()
+            info["vehicle"] = dict(zip(self.fleet.draws.names, drawn, strict=True))
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One control period of 0.01 s."""
         outcome = self.fleet.fly(np.array(action, dtype=np.float64).reshape(1, 4), _ALL)
         terms = outcome.terms[0].tolist()
-        info = {
-            "state": self.fleet.x[0].copy(),
-            "reward_terms": {name: terms[k] for k, name in _TERMS},
-        }
+        info = self._told()
+        info["reward_terms"] = {name: terms[k] for k, name in self._terms}
         reward = float(outcome.rewards[0])
         return outcome.observations[0], reward, bool(outcome.over[0]), False, info
+
+    def _told(self) -> dict[str, Any]:
+        fleet = self.fleet
+        info: dict[str, Any] = {"state": fleet.x[0].copy()}
+        if fleet.task.aims:
+            info["target"] = fleet.targets[0].copy()
+        if fleet.task.moves_on:
+            info["reached"] = int(fleet.progress[0, tasks.REACHED])
+        return info
 
 
 class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -162,11 +176,14 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         sensors: str = "onboard",
         wind: float | Sequence[float] | None = None,
         gusts: tuple[float, float] | None = None,
-        randomize: str | None = None,
+        randomize: Randomize = None,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
+        turbulence: float | str | None = None,
+        task: str = "hover",
+        target: Any = None,
     ) -> None:
         _check_render_mode(render_mode)
         if num_envs < 1:
@@ -176,12 +193,15 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
-        self.fleet = Fleet(num_envs, vehicle, nominal, sensors, wind, gusts, randomize, threads)
-        self.single_observation_space = observation_space(self.fleet.sensors, self.fleet.flags)
+        self.fleet = Fleet(
+            num_envs, vehicle, nominal, sensors, wind, gusts, randomize, threads,
+            turbulence, task, target,
+        )  # fmt: skip
+        self.single_observation_space = observation_space(self.fleet)
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_names = observation_names(self.fleet.sensors, self.fleet.flags)
+        self.observation_names = observation_names(self.fleet)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._every = np.ones(num_envs, dtype=np.bool_)
         self._seeded = False
@@ -218,7 +238,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._seeded = True
         self._ended &= ~which
         observations = self.fleet.restart(which, _start_states(options, self.num_envs))
-        return observations, self._reset_info(which)
+        return observations, self._told(which) | self._vehicles(which)
 
     def step(
         self, actions: np.ndarray
@@ -239,6 +259,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             if waiting:
                 fresh = fleet.restart(ended)
                 observations[ended] = fresh[ended]
+                info |= self._vehicles(ended)
             self._ended = done
         elif self.autoreset_mode == AutoresetMode.DISABLED:
             terminated = terminated | ended
@@ -248,20 +269,37 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             info["final_info"] = self._step_info(outcome.terms)
             info["_final_obs"] = info["_final_info"] = done
             observations[done] = fleet.restart(done)[done]
+            info |= self._vehicles(done)
         info |= self._step_info(outcome.terms)
         return observations, outcome.rewards, terminated, truncated, info
 
     def _step_info(self, terms: np.ndarray) -> dict[str, Any]:
-        every = np.ones(self.num_envs, dtype=np.bool_)
-        by_name: dict[str, np.ndarray] = {name: terms[:, k] for k, name in _TERMS}
-        by_name |= {f"_{name}": every for name in hover.REWARD_TERMS}
-        return {
-            "state": self.fleet.x.copy(), "_state": every,
-            "reward_terms": by_name, "_reward_terms": every,
-        }  # fmt: skip
+        named = {name: terms[:, k] for k, name in enumerate(self.fleet.task.terms)}
+        every = self._every.copy()
+        return self._told(every) | {"reward_terms": _masked(named, every), "_reward_terms": every}
 
-    def _reset_info(self, which: np.ndarray) -> dict[str, Any]:
-        return {"state": self.fleet.x.copy(), "_state": which.copy()}
+    def _told(self, which: np.ndarray) -> dict[str, Any]:
+        fleet = self.fleet
+        info: dict[str, np.ndarray] = {"state": fleet.x.copy()}
+        if fleet.task.aims:
+            info["target"] = fleet.targets.copy()
+        if fleet.task.moves_on:
+            info["reached"] = fleet.progress[:, tasks.REACHED].copy()
+        return _masked(info, which.copy())
+
+    def _vehicles(self, which: np.ndarray) -> dict[str, Any]:
+        """What the rows of a mask drew, where vehicles are drawn."""
+        draws = self.fleet.draws
+        if not draws.random:
+            return {}
+        drawn, which = self.fleet.drawn.copy(), which.copy()
+        named = {name: drawn[:, k] for k, name in enumerate(draws.names)}
+        return {"vehicle": _masked(named, which), "_vehicle": which}
+
+
+def _masked(info: Mapping[str, np.ndarray], which: np.ndarray) -> dict[str, Any]:
+    """Gymnasium's form of a batch's info: with every key, which rows have it."""
+    return {**info, **{f"_{name}": which for name in info}}
 
 
 def action_space() -> Box:
@@ -269,16 +307,15 @@ def action_space() -> Box:
     return Box(-1.0, 1.0, (4,), np.float32)
 
 
-def observation_space(sensors: Sequence[Sensor], flags: Sequence[str]) -> Box:
-    """Readings within their sensors' bounds, then one flag per slow instrument."""
-    low = [s.low for s in sensors] + [0.0] * len(flags)
-    high = [s.high for s in sensors] + [1.0] * len(flags)
-    return Box(np.array(low, dtype=np.float32), np.array(high, dtype=np.float32), dtype=np.float32)
+def observation_space(fleet: Fleet) -> Box:
+    """Readings within their sensors' bounds, one flag per slow instrument, the way to the target."""
+    return Box(fleet.low.astype(np.float32), fleet.high.astype(np.float32), dtype=np.float32)
 
 
-def observation_names(sensors: Sequence[Sensor], flags: Sequence[str]) -> tuple[str, ...]:
-    """Name of every entry of the observation: readings, then ``new_INSTRUMENT`` flags."""
-    return (*(s.name for s in sensors), *(f"new_{flag}" for flag in flags))
+def observation_names(fleet: Fleet) -> tuple[str, ...]:
+    """Name of every entry of the observation: readings, ``new_INSTRUMENT`` flags, tasks.AIM."""
+    aim = [name for name, *_ in tasks.AIM] if fleet.task.aims else []
+    return (*(s.name for s in fleet.sensors), *(f"new_{flag}" for flag in fleet.flags), *aim)
 
 
 def _check_render_mode(render_mode: str | None) -> None:

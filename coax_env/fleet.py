@@ -2,10 +2,11 @@
 
 A fleet is a set of arrays with one row per helicopter. One control period of a row reads::
 
-    command -> fly (dynamics.step) -> sense (dynamics.measure, sensors.py) -> judge (hover.py)
+    command (actuators.py) -> air (turbulence.py) -> fly (dynamics.step) -> judge (hover.py, tasks.py)
+        -> sense (dynamics.measure, sensors.py)
 
 Rows know nothing of each other: each has its own random stream, so a row flies the same in a fleet
-of any size. Nothing here runs Python code per row but drawing a vehicle (`randomize`).
+of any size. Nothing here runs Python code per row but drawing from a vehicle's spread (`randomize`).
 """
 
 import math
@@ -19,14 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import effects, hover
+from coax_env import effects, hover, tasks
 from coax_env import parameters as P
+from coax_env.actuators import limit, limits
 from coax_env.dynamics import WORK_SIZE, hover_trim, measure, step
 from coax_env.errors import InputError
 from coax_env.jit import compiled
 from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
-from coax_env.random_streams import COUNTER, stream_key, two_normals, uniform
+from coax_env.random_streams import stream_key, two_normals, uniform
+from coax_env.randomisation import Draws, Randomize
 from coax_env.sensors import Sensor, is_new, shake, slow_instruments, suite
+from coax_env.turbulence import N_EDDIES, settle, stir, wind_at_6m
 from coax_env.vehicle import SHIPPED, Vehicle, load_vehicle
 
 DT = hover.CONTROL_PERIOD
@@ -38,7 +42,9 @@ Nominal = str | Path | Vehicle | tuple[Any, Any] | None
 ROWS_PER_THREAD = 256  # fewer are not worth a thread
 
 # columns of the sensor table the kernel reads
-_INDEX, _NOISE, _RATE, _LOW, _HIGH, _WRAPS, _FLAG = range(7)
+(
+    _INDEX, _NOISE, _RATE, _LOW, _HIGH, _WRAPS, _FLAG, _LATE, _DROPOUT, _INSTRUMENT, _BIAS, _BIAS_STD
+) = range(12)  # fmt: skip
 _DELAY = effects.parameter_index("servo_delay.time")
 _VIBRATION = effects.parameter_index("vibration.amplitude")
 _WIND_NORTH = effects.parameter_index("wind.north")
@@ -68,21 +74,33 @@ def _advance(x, u, p, swash, at, work):
 
 
 @compiled()
-def _sense(x, u, p, row, azimuth, sensors, stream, held, readings, work, out):
-    """New readings where they are due, into `held` (float64) and as an observation into `out`."""
+def _sense(
+    x, u, p, row, azimuth, sensors, bias, target, places, height_sign,
+    stream, past, held, readings, work, out,
+):  # fmt: skip
+    """New readings where they are due, into `held` (float64) and as an observation into `out`.
+
+    `held`: readings, flags, and the way to the target where `places` (4,) says what it is made of.
+    `past` (slots, n_sensors): ring of what the sensors would show without delay; no slots: none has.
+    """
     measure(x, u, p, work, readings)
     if p[_VIBRATION] != 0.0:
         shake(readings, azimuth, p[_VIBRATION])
     n = len(sensors)
-    for k in range(n, len(held)):
+    slots = len(past)
+    aim = len(held) - len(places)
+    for k in range(n, aim):
         held[k] = 0.0
     spare = 0.0
     has_spare = False
+    chance = 1.0
+    drawn = -1.0
     for k in range(n):
-        due = is_new(row, sensors[k, _RATE])
-        if due:
-            index = int(sensors[k, _INDEX])
-            value = readings[index] if index < N_CHANNELS else x[index - N_CHANNELS]
+        index = int(sensors[k, _INDEX])
+        value = readings[index] if index < N_CHANNELS else x[index - N_CHANNELS]
+        if slots > 0:
+            value = _late(value, past, row, k, sensors[k, _LATE])
+        if is_new(row, sensors[k, _RATE]):
             if sensors[k, _NOISE] > 0.0:
                 if has_spare:
                     noise = spare
@@ -90,15 +108,38 @@ def _sense(x, u, p, row, azimuth, sensors, stream, held, readings, work, out):
                     noise, spare = two_normals(stream)
                 has_spare = not has_spare
                 value += sensors[k, _NOISE] * noise
+            value += bias[k]
             if sensors[k, _WRAPS] != 0.0:
                 value -= 2.0 * math.pi * math.floor((value + math.pi) / (2.0 * math.pi))
-            if math.isfinite(value):
-                held[k] = min(max(value, sensors[k, _LOW]), sensors[k, _HIGH])
-            flag = int(sensors[k, _FLAG])
-            if flag >= 0:
-                held[flag] = 1.0
+            if sensors[k, _DROPOUT] > 0.0 and sensors[k, _INSTRUMENT] != drawn:
+                chance = uniform(stream, 0.0, 1.0)
+                drawn = sensors[k, _INSTRUMENT]
+            if row == 0 or sensors[k, _DROPOUT] <= 0.0 or chance >= sensors[k, _DROPOUT]:
+                if math.isfinite(value):
+                    held[k] = min(max(value, sensors[k, _LOW]), sensors[k, _HIGH])
+                flag = int(sensors[k, _FLAG])
+                if flag >= 0:
+                    held[flag] = 1.0
+    if len(places) > 0:
+        tasks.point(held, places, height_sign, target, held[aim:])
     for k in range(len(held)):
         out[k] = held[k]
+
+
+@compiled()
+def _late(value, past, row, k, late):
+    """Keep a value in the ring of column `k`, and return the one of `late` rows before, between rows
+    by a straight line. Before the first row all was as in it."""
+    slots = len(past)
+    if row == 0:
+        for slot in range(slots):
+            past[slot, k] = value
+    past[row % slots, k] = value
+    whole = int(late)
+    rest = late - whole
+    newer = past[(row - whole) % slots, k]
+    older = past[(row - whole - 1) % slots, k]
+    return newer + rest * (older - newer)
 
 
 @compiled()
@@ -115,14 +156,28 @@ def _blow(x, p, gust, stream):
 
 
 @compiled()
+def _stir(x, p, stream, eddies, breeze, wind, air):
+    """Turbulence for the coming period, along and across the steady wind `breeze` (2,), into `p`."""
+    stir(stream, eddies, -x[15], wind, DT, air)
+    speed = math.sqrt(breeze[0] * breeze[0] + breeze[1] * breeze[1])
+    north = breeze[0] / speed if speed > 0.0 else 1.0
+    east = breeze[1] / speed if speed > 0.0 else 0.0
+    p[_WIND_NORTH] = breeze[0] + north * air[0] - east * air[1]
+    p[_WIND_NORTH + 1] = breeze[1] + east * air[0] + north * air[1]
+    p[P.AIR_DOWN] = air[2]
+
+
+@compiled()
 def _fly_rows(
-    first, last, active, actions, trim, scale, params, sensors, gust,
-    x, u, rows, azimuth, streams, swash, held,
+    first, last, active, actions, trim, scale, params, kinds, sensors, limits, gust, turbulence,
+    weights, scales, places, height_sign, course, box, dwell,
+    x, u, rows, azimuth, streams, swash, asked, bias, past, eddies, breeze, targets, progress, held,
     observations, rewards, terms, over,
 ):  # fmt: skip
     """One control period of the active rows first..last-1. See Fleet for the arrays."""
     work = np.empty(WORK_SIZE)
     readings = np.empty(N_CHANNELS)
+    air = np.empty(3)
     many = len(params) > 1
     for i in range(first, last):
         if not active[i]:
@@ -130,32 +185,42 @@ def _fly_rows(
                 observations[i, k] = held[i, k]
             continue
         p = params[i] if many else params[0]
+        kind = kinds[i]
         for k in range(4):
             a = actions[i, k]
             actions[i, k] = a = -1.0 if a < -1.0 else (1.0 if a > 1.0 else a)  # NaN stays
             u[i, k] = trim[k] + scale[k] * a
+        limit(u[i], asked[i], limits[kind], DT)
         slots = swash.shape[1]
         at = rows[i] % slots
         swash[i, at, 0], swash[i, at, 1] = u[i, 2], u[i, 3]
         u[i, TIME] = rows[i] * DT
         if gust[0] > 0.0 or gust[1] > 0.0:
             _blow(x[i], p, gust, streams[i])
+        if turbulence > 0.0:
+            _stir(x[i], p, streams[i], eddies[i], breeze[i], turbulence, air)
         _advance(x[i], u[i], p, swash[i], at, work)
         rows[i] += 1
         azimuth[i] = (azimuth[i] + DT * x[i, 16]) % (2.0 * math.pi)
         u[i, TIME] = rows[i] * DT
-        _sense(
-            x[i], u[i], p, rows[i], azimuth[i], sensors, streams[i], held[i], readings, work,
-            observations[i],
-        )  # fmt: skip
-        rewards[i] = hover.reward(x[i], actions[i], terms[i])
+        rewards[i] = hover.reward(x[i], actions[i], targets[i], weights, scales, terms[i])
         over[i] = hover.is_over(x[i])
+        if dwell > 0 and tasks.arrive(x[i], targets[i], dwell, progress[i], course):
+            terms[i, hover.N_TERMS] = weights[hover.N_TERMS]
+            rewards[i] += weights[hover.N_TERMS]
+            tasks.aim(streams[i], course, box, progress[i, tasks.REACHED], targets[i])
+        _sense(
+            x[i], u[i], p, rows[i], azimuth[i], sensors[kind], bias[i], targets[i],
+            places, height_sign, streams[i], past[i], held[i], readings, work, observations[i],
+        )  # fmt: skip
 
 
 @compiled()
 def _restart_rows(
-    which, keep_state, trim, params, sensors, wind_speed,
-    x, u, rows, azimuth, streams, swash, held, observations,
+    which, keep_state, trim, params, kinds, sensors, limits, wind_speed, turbulence,
+    places, height_sign, course, box,
+    x, u, rows, azimuth, streams, swash, asked, bias, past, eddies, breeze, targets, progress, held,
+    observations,
 ):  # fmt: skip
     """New flights for the rows of the mask `which`; with `keep_state` from what stands in `x`."""
     work = np.empty(WORK_SIZE)
@@ -169,20 +234,31 @@ def _restart_rows(
             params[i, _WIND_NORTH] += wind_speed * math.cos(angle)
             params[i, _WIND_NORTH + 1] += wind_speed * math.sin(angle)
         p = params[i] if many else params[0]
+        table = sensors[kinds[i]]
+        for k in range(len(table)):
+            bias[i, k] = table[k, _BIAS]
+            if table[k, _BIAS_STD] > 0.0:
+                bias[i, k] += table[k, _BIAS_STD] * two_normals(streams[i])[0]
         if not keep_state:
             hover.start(streams[i], trim, x[i])
+        if turbulence > 0.0:
+            breeze[i, 0], breeze[i, 1] = p[_WIND_NORTH], p[_WIND_NORTH + 1]
+            settle(streams[i], eddies[i])
+        progress[i, tasks.WITHIN] = progress[i, tasks.REACHED] = 0
+        tasks.aim(streams[i], course, box, 0, targets[i])
         for k in range(4):
-            u[i, k] = trim[k]
+            u[i, k] = asked[i, k] = trim[k]
+        limit(u[i], asked[i], limits[kinds[i]], DT)
         u[i, TIME] = 0.0
         rows[i] = 0
         azimuth[i] = 0.0
         for k in range(swash.shape[1]):
-            swash[i, k, 0], swash[i, k, 1] = trim[2], trim[3]
+            swash[i, k, 0], swash[i, k, 1] = u[i, 2], u[i, 3]
         for k in range(held.shape[1]):
             held[i, k] = 0.0
         _sense(
-            x[i], u[i], p, 0, azimuth[i], sensors, streams[i], held[i], readings, work,
-            observations[i],
+            x[i], u[i], p, 0, azimuth[i], table, bias[i], targets[i],
+            places, height_sign, streams[i], past[i], held[i], readings, work, observations[i],
         )  # fmt: skip
 
 
@@ -192,7 +268,7 @@ class Outcome:
 
     observations: np.ndarray  # (n, n_obs) float32
     rewards: np.ndarray  # (n,)
-    terms: np.ndarray  # (n, N_TERMS), weighted
+    terms: np.ndarray  # (n, number of the task's reward terms), weighted
     over: np.ndarray  # (n,) bool
 
 
@@ -203,8 +279,15 @@ class Fleet:
         x: full states, shape (count, 26). u: commands in force and time, (count, 5).
         rows: control periods flown, (count,). azimuth: of the upper rotor, (count,) rad.
         streams: key and counter, (count, 2) uint64.
-        params: parameter vectors, (count or 1, n). held: readings held, (count, n_obs).
+        params: parameter vectors, (count or 1, n). held: readings held, (count, n_observed).
         trim, scale: command = trim + scale * action, each (4,), of the nominal vehicle.
+        targets: x y z psi in force, (count, 4). progress: see tasks.WITHIN, tasks.REACHED, (count, 2).
+        drawn: the numbers drawn for each row, `draws.names`, (count, n_names).
+        kinds: which of `draws.vehicles` each row flies, (count,): rows of the tables of sensors,
+        (m, n_sensors, 12), and of limits, (m, 3, 4).
+        asked: last commands after their limits, (count, 4). swash: ring of swash commands,
+        (count, slots, 2). past: ring of readings, (count, slots, n_sensors). bias: (count,
+        n_sensors). eddies: of turbulence, and breeze, the steady wind, (count, 5), (count, 2).
     """
 
     def __init__(
@@ -215,39 +298,66 @@ class Fleet:
         sensors: str = "onboard",
         wind: float | Sequence[float] | None = None,
         gusts: tuple[float, float] | None = None,
-        randomize: str | None = None,
+        randomize: Randomize = None,
         threads: int | None = None,
+        turbulence: float | str | None = None,
+        task: str = "hover",
+        target: Any = None,
     ) -> None:
-        if randomize not in (None, "posterior"):
-            raise InputError(f"randomize must be None or 'posterior', found {randomize!r}")
         self.vehicle = load_vehicle(vehicle)
-        self.sensors = suite(sensors)
-        self.randomize = randomize
+        self.draws = Draws(self.vehicle, randomize)
         self.trim, self.scale = action_map(self.vehicle, nominal)
+        self._set_task(task, target, sensors)
+        suites = [suite(sensors, flown) for flown in self.draws.vehicles]
+        self.sensors = suites[0]
         self.flags = slow_instruments(self.sensors)
-        self.n_observed = len(self.sensors) + len(self.flags)
-        self._table = _sensor_table(self.sensors, self.flags)
-        steady, self._wind_speed = _wind(wind)
+        self.low, self.high = _bounds(suites, self.flags, len(self._places))
+        self.n_observed = len(self.low)
+        self._table = np.array([_sensor_table(s, self.flags) for s in suites])
+        self._limits = np.array([limits(flown) for flown in self.draws.vehicles])
+        self._steady, self._wind_speed = _wind(wind)
+        self._turbulence = wind_at_6m(turbulence)
         self._gust = np.array(gusts if gusts is not None else (0.0, 0.0), dtype=float)
         if self._gust.shape != (2,) or not (self._gust >= 0.0).all():
             raise InputError("gusts must be (force std in N, moment std in N m), both >= 0")
-        self._steady = steady
-        own = randomize is not None or self._wind_speed > 0.0
-        self.flown = [self.vehicle] * count if randomize else []
-        self.params = np.tile(self._vector(self.vehicle), (count if own else 1, 1))
-        self._base = self.params.copy()
-        delayed = self.params[0, _DELAY] > 0.0 or randomize is not None
-        slots = 2 + math.ceil(0.3 / DT) if delayed and "servo_delay" in self.vehicle.effects else 1
+        self.count = count
+        self._own = self.draws.random or self._wind_speed > 0.0 or self._turbulence > 0.0
+        self._base = np.tile(self._in_wind(self.vehicle.vector), (count if self._own else 1, 1))
+        self.params = self._base.copy()
+        self.drawn = np.zeros((count, len(self.draws.names)))
+        self.kinds = np.zeros(count, dtype=np.int64)
+        self._allocate()
+        most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        self._threads = max(1, min(threads or most or 1, count // ROWS_PER_THREAD))
+
+    def _set_task(self, task: str, target: Any, sensors: str) -> None:
+        self.task = tasks.task(task)
+        self._weights = np.array(list(self.task.weights.values()))
+        self._scales = np.array([1.0, *self.task.scales.values()])
+        self._course, self._box = tasks.course(task, target), tasks.box(task)
+        self._dwell = tasks.dwell_rows(task)
+        self._places = tasks.places(task, suite(sensors))
+        self._height_sign = tasks.height_sign(task, suite(sensors))
+
+    def _allocate(self) -> None:
+        """The arrays of one row per helicopter; rings and the like only where something needs them."""
+        count, width = self.count, len(self.sensors)
+        delay = self.draws.most("servo_delay.time")
+        late = self._table[:, :, _LATE].max()
+        windy = count if self._turbulence > 0.0 else 1
         self.x = np.zeros((count, N_FULL))
         self.u = np.zeros((count, N_INPUTS))
         self.rows = np.zeros(count, dtype=np.int64)
         self.azimuth = np.zeros(count)
         self.streams = np.zeros((count, 2), dtype=np.uint64)
-        self.swash = np.zeros((count, slots, 2))
+        self.targets = np.zeros((count, 4))
+        self.progress = np.zeros((count, 2), dtype=np.int64)
+        self.asked = np.zeros((count, 4))
+        self.swash = np.zeros((count, 2 + math.ceil(delay / DT) if delay > 0.0 else 1, 2))
+        self.past = np.zeros((count, 2 + math.ceil(late) if late > 0.0 else 0, width))
+        self.bias = np.zeros((count, width))
+        self.eddies, self.breeze = np.zeros((windy, N_EDDIES)), np.zeros((windy, 2))
         self.held = np.zeros((count, self.n_observed))
-        self.count = count
-        most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        self._threads = max(1, min(threads or most or 1, count // ROWS_PER_THREAD))
 
     def seed(self, row: int, seed: int) -> None:
         """Give a row the stream of a seed, from its beginning."""
@@ -260,12 +370,14 @@ class Fleet:
             which: bool, shape (count,).
             states: paper or full states to start from, (count, 16 or 26); random when None.
         """
-        if self.randomize:
-            for i in np.flatnonzero(which):
-                self.flown[i] = self.vehicle.draw(np.random.default_rng(self.streams[i]))
-                self.streams[i, COUNTER] += np.uint64(1)
-                self._base[i] = self._vector(self.flown[i])
-        if len(self.params) > 1 or self.randomize or self._wind_speed > 0.0:
+        if self.draws.random:
+            streams = self.streams[which]
+            self.drawn[which], self.kinds[which] = self.draws.draw(streams)
+            self.streams[which] = streams
+            self._base[which] = self._in_wind(
+                self.draws.vectors(self.drawn[which], self.kinds[which])
+            )
+        if self._own:
             self.params[which] = self._base[which]
         if states is not None:
             x = np.zeros((self.count, N_FULL))
@@ -274,8 +386,11 @@ class Fleet:
             self.x[which] = x[which]
         observations = self.held.astype(np.float32)
         _restart_rows(
-            which, states is not None, self.trim, self.params, self._table, self._wind_speed,
-            self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.held,
+            which, states is not None, self.trim, self.params, self.kinds, self._table, self._limits,
+            self._wind_speed, self._turbulence,
+            self._places, self._height_sign, self._course, self._box,
+            self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked, self.bias,
+            self.past, self.eddies, self.breeze, self.targets, self.progress, self.held,
             observations,
         )  # fmt: skip
         return observations
@@ -286,14 +401,18 @@ class Fleet:
         outcome = Outcome(
             np.empty((n, self.n_observed), dtype=np.float32),
             np.zeros(n),
-            np.zeros((n, hover.N_TERMS)),
+            np.zeros((n, len(self._weights))),
             np.zeros(n, dtype=np.bool_),
         )
 
         def rows(first: int, last: int) -> None:
             _fly_rows(
-                first, last, active, actions, self.trim, self.scale, self.params, self._table,
-                self._gust, self.x, self.u, self.rows, self.azimuth, self.streams, self.swash,
+                first, last, active, actions, self.trim, self.scale, self.params, self.kinds,
+                self._table, self._limits, self._gust, self._turbulence,
+                self._weights, self._scales, self._places, self._height_sign, self._course, self._box,
+                self._dwell,
+                self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked,
+                self.bias, self.past, self.eddies, self.breeze, self.targets, self.progress,
                 self.held, outcome.observations, outcome.rewards, outcome.terms, outcome.over,
             )  # fmt: skip
 
@@ -303,13 +422,21 @@ class Fleet:
             _in_threads(rows, n, self._threads)
         return outcome
 
-    def _vector(self, vehicle: Vehicle) -> np.ndarray:
-        vector = vehicle.vector.copy()
-        vector[_WIND_NORTH : _WIND_NORTH + 2] += self._steady
-        effects.set_switches(vector)
-        if self._wind_speed > 0.0:
-            vector[effects.AIR] = 1.0
-        return vector
+    @property
+    def air(self) -> np.ndarray:
+        """Velocity of the air north, east and down [m/s], (count, 3); a vehicle without drag or
+        blow-back does not feel it."""
+        columns = self.params[:, [_WIND_NORTH, _WIND_NORTH + 1, P.AIR_DOWN]]
+        return np.broadcast_to(columns, (self.count, 3))
+
+    def _in_wind(self, vectors: np.ndarray) -> np.ndarray:
+        """Parameter vectors (..., n) with the env's steady wind added, and its stage switched on."""
+        vectors = vectors.copy()
+        vectors[..., _WIND_NORTH : _WIND_NORTH + 2] += self._steady
+        effects.set_switches(vectors)
+        if self._wind_speed > 0.0 or self._turbulence > 0.0:
+            vectors[..., effects.AIR] = 1.0
+        return vectors
 
 
 def nominal_for(vehicle: Vehicle) -> Vehicle:
@@ -331,16 +458,31 @@ def action_map(vehicle: Vehicle, nominal: Nominal = None) -> tuple[np.ndarray, n
 
 
 def _sensor_table(sensors: Sequence[Sensor], flags: Sequence[str]) -> np.ndarray:
+    instruments = [s.instrument for s in sensors]
     return np.array(
         [
             [
                 s.index, s.noise, s.rate, s.low, s.high, float(s.wraps),
                 len(sensors) + flags.index(s.instrument) if s.instrument in flags else -1,
+                s.delay / DT, s.dropout, instruments.index(s.instrument), s.bias, s.bias_std,
             ]
             for s in sensors
         ],
         dtype=float,
     )  # fmt: skip
+
+
+def _bounds(
+    suites: Sequence[Sequence[Sensor]], flags: Sequence[str], aim: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the observation, (n_observed,) each, that hold for every suite flown."""
+    far = [bound for *_, bound in tasks.AIM[:aim]]
+    low = np.min([[s.low for s in sensors] for sensors in suites], axis=0)
+    high = np.max([[s.high for s in sensors] for sensors in suites], axis=0)
+    return (
+        np.concatenate([low, np.zeros(len(flags)), np.negative(far)]),
+        np.concatenate([high, np.ones(len(flags)), far]),
+    )
 
 
 def _wind(wind: float | Sequence[float] | None) -> tuple[np.ndarray, float]:

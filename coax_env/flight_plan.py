@@ -105,7 +105,7 @@ def plan_flight(
     vehicle = load_vehicle(vehicle)
     model = HeliModel(vehicle)
     free, wanted = _to_learn(model, learn)
-    suite = log_suite(sensors)
+    suite = log_suite(sensors, vehicle)
     rates = {s.name: s.rate for s in suite}
     noise = _air(starting_noise(Flight(vehicle.name, ()), vehicle), gusts)
     noise = replace(noise, reading={s.name: max(s.noise, LEAST_READING_STD[s.name]) for s in suite})
@@ -227,7 +227,7 @@ def _uncertainty(known: np.ndarray, index: np.ndarray) -> float:
 def write_plan(plan: FlightPlan, folder: str | Path) -> Path:
     """The plan as a folder to fly from: a flight folder with the simulated pilot's commands, and for
     each run ``asked_N.csv`` with what to hold and what to add."""
-    suite = log_suite(plan.sensors)
+    suite = log_suite(plan.sensors, plan.vehicle)
     runs = []
     for k, planned in enumerate(plan.runs, 1):
         flown, option = planned.flown, planned.maneuver

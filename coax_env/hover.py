@@ -1,5 +1,7 @@
 """The hover task: stay at 1.5 m over the start, heading north. Start, end, reward and cost.
 
+Reward and cost can be taken about another target: the other tasks (tasks.py) do.
+
 Controllers are compared by a quadratic cost: squared errors in units of LIMITS, the success
 conditions of contract.md. The reward has a term 1/(1 + |error|/scale) per error, in (0, 1]: sharp
 at the goal, and with a slope far from it, so that a policy can be learnt from nothing.
@@ -66,8 +68,6 @@ FARTHEST = 25.0  # [m]
 FASTEST = 15.0  # [m/s]
 STEEPEST = 60.0 * _DEGREE
 
-_WEIGHTS = np.array(list(REWARD_WEIGHTS.values()))
-_SCALES = np.array([1.0, *REWARD_SCALES.values()])
 _LIMITS = np.array(list(LIMITS.values()))
 _COST_WEIGHTS = np.array(list(COST_WEIGHTS.values()))
 _COS_STEEPEST = math.cos(STEEPEST)
@@ -92,16 +92,18 @@ def start(stream, command, x):
 
 
 @compiled()
-def reward(x, action, terms):
+def reward(x, action, target, weights, scales, terms):
     """Sum of the weighted reward terms at a full state (26,) after an action (4,).
 
-    The weighted terms go into `terms` (N_TERMS,); all are zero where the state is not finite.
+    `target` is x y z psi, (4,); `weights` and `scales`, (N_TERMS,), are in REWARD_TERMS' order. The
+    weighted terms go into `terms` (N_TERMS,); all are zero where the state is not finite.
     """
-    heading = x[12] - 2.0 * math.pi * math.floor((x[12] + math.pi) / (2.0 * math.pi))
+    north, east, turn = x[13] - target[0], x[14] - target[1], x[12] - target[3]
+    heading = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
     squares = (
         0.0,  # alive
-        (x[15] + HEIGHT) ** 2,
-        x[13] * x[13] + x[14] * x[14],
+        (x[15] - target[2]) ** 2,
+        north * north + east * east,
         x[0] * x[0] + x[1] * x[1] + x[2] * x[2],
         heading * heading,
         x[3] * x[3] + x[4] * x[4] + x[5] * x[5],
@@ -109,7 +111,7 @@ def reward(x, action, terms):
     )
     total = 0.0
     for k in range(N_TERMS):
-        terms[k] = _WEIGHTS[k] / (1.0 + math.sqrt(squares[k]) / _SCALES[k])
+        terms[k] = weights[k] / (1.0 + math.sqrt(squares[k]) / scales[k])
         total += terms[k]
     if not math.isfinite(total):
         total = 0.0
@@ -136,20 +138,22 @@ def is_over(x):
     return False
 
 
-def cost(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def cost(states: np.ndarray, actions: np.ndarray, targets: np.ndarray | None = None) -> np.ndarray:
     """Quadratic cost of every step: COST_WEIGHTS times the squared errors in units of LIMITS.
 
     Args:
         states: full or paper states, shape (..., >=16). actions: shape (..., 4).
+        targets: x y z psi, shape (..., 4); None: hover's.
 
     Returns:
         shape (...).
     """
-    heading = (states[..., 12] + math.pi) % (2.0 * math.pi) - math.pi
+    goal = np.array([0.0, 0.0, -HEIGHT, 0.0]) if targets is None else targets
+    heading = (states[..., 12] - goal[..., 3] + math.pi) % (2.0 * math.pi) - math.pi
     squares = np.stack(
         [
-            (states[..., 15] + HEIGHT) ** 2,
-            (states[..., 13:15] ** 2).sum(-1),
+            (states[..., 15] - goal[..., 2]) ** 2,
+            ((states[..., 13:15] - goal[..., 0:2]) ** 2).sum(-1),
             (states[..., 0:3] ** 2).sum(-1),
             heading**2,
             (states[..., 3:6] ** 2).sum(-1),

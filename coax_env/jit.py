@@ -26,8 +26,12 @@ KERNEL_SOURCES = (
     "lanes.py",
     "dynamics.py",
     "sensors.py",
+    "actuators.py",
     "random_streams.py",
+    "turbulence.py",
     "hover.py",
+    "tasks.py",
+    "randomisation.py",
     "fleet.py",
     "engine/kalman.py",
 )

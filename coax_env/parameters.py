@@ -68,4 +68,7 @@ GUST_REFERENCE = {
     GUST_INERTIA_ZZ: INERTIA_ZZ,
 }
 
-N_FIXED = GUST_MEMORY + 1  # after it: one switch per stage, then the effects' parameters
+AIR_DOWN = GUST_MEMORY + 1
+"""Velocity of the air downwards [m/s], beside the effect `wind`: zero but in turbulence.py's air."""
+
+N_FIXED = AIR_DOWN + 1  # after it: one switch per stage, then the effects' parameters

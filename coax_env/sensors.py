@@ -1,15 +1,20 @@
 """Sensors: which channels are measured, how well, how often, and within which bounds.
 
 One table of suites serves the env, simulated flight folders and the controllers' estimator. True
-readings come from `dynamics.measure`, eq. (45), sensor effects included; here they get noise, a
-rate and limits. Sources: Table V (noise), Table VI (ranges), contract.md (the rest).
+readings come from `dynamics.measure`, eq. (45), sensor effects included; here they get delay, noise,
+bias, a rate, limits and lost samples. Sources: Table V (noise), Table VI (ranges), contract.md (the
+rest). A vehicle file may have its own numbers for a channel (`NUMBERS`); they take the place of the
+suites', in all suites but ``state``, which is exact.
 
 A channel slower than the 100 Hz of the control loop holds its last value, and its instrument has a
-flag in the observation that says whether it is new in this row.
+flag in the observation that says whether it is new in this row. Which instruments have a flag is the
+suite's alone: observations have one layout whatever flies.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,10 +22,19 @@ from coax_env.errors import InputError
 from coax_env.jit import compiled
 from coax_env.layout import ACTUATOR_STATES, CHANNEL_UNITS, CHANNELS, N_CHANNELS, STATES
 
+if TYPE_CHECKING:
+    from coax_env.vehicle import Vehicle
+
 BASE_RATE = 100.0  # [Hz] of the control loop and of the paper's log
 
 _DEGREE = math.pi / 180.0
 _FREE_FALLS = 6.0 * 9.80665  # Table VI: accelerometers of 6 g
+LONGEST_DELAY = 1.0  # [s]
+
+NUMBERS = {
+    "noise": "", "bias": "", "low": "", "high": "", "rate": "Hz", "delay": "s", "dropout": "1",
+}  # fmt: skip
+"""What a vehicle file may say of a channel, and in which unit; an empty one is the channel's own."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +44,10 @@ class Sensor:
     ``name`` is a channel of layout.CHANNELS or, in the suite ``state``, a state's; ``noise`` the
     std of white noise, ``low`` and ``high`` the bounds, all in ``unit``; ``rate`` in Hz; ``index``
     its place in the row of readings followed by the full state, from which the env picks.
+
+    ``bias`` is added to every reading, and ``bias_std`` is the std of a further one that each flight
+    draws; readings show what was ``delay`` seconds ago; of the samples due, the share ``dropout`` is
+    lost, for the channels of one instrument together. ``flagged``: see `slow_instruments`.
     """
 
     name: str
@@ -40,6 +58,11 @@ class Sensor:
     high: float
     unit: str
     index: int
+    flagged: bool = False
+    bias: float = 0.0
+    bias_std: float = 0.0
+    delay: float = 0.0
+    dropout: float = 0.0
 
     @property
     def wraps(self) -> bool:
@@ -51,9 +74,12 @@ def _sensors(
     instrument: str, names: str, noise: float, rate: float, low: float, high: float
 ) -> tuple[Sensor, ...]:
     return tuple(
-        Sensor(n, instrument, noise, rate, low, high, CHANNEL_UNITS[n], CHANNELS.index(n))
+        Sensor(
+            n, instrument, noise, rate, low, high, CHANNEL_UNITS[n], CHANNELS.index(n),
+            flagged=rate < BASE_RATE,
+        )
         for n in names.split()
-    )
+    )  # fmt: skip
 
 
 _GYROS = _sensors("gyros", "p q r", 2.0 * _DEGREE, 100.0, -500.0 * _DEGREE, 500.0 * _DEGREE)
@@ -106,21 +132,49 @@ EXACT_LOG = tuple(
 """Every canonical channel without noise: what ``state`` means for a flight folder."""
 
 
-def suite(name: str) -> tuple[Sensor, ...]:
-    """The sensors of a suite by name."""
+def suite(name: str, vehicle: "Vehicle | None" = None) -> tuple[Sensor, ...]:
+    """The sensors of a suite by name, with the numbers that a vehicle's file has of its own."""
     if name not in SUITES:
         raise InputError(f"no sensor suite {name!r}: choose one of {', '.join(SUITES)}")
-    return SUITES[name]
+    if vehicle is None or name == "state":
+        return SUITES[name]
+    return tuple(_as_in_file(sensor, vehicle) for sensor in SUITES[name])
 
 
-def log_suite(name: str) -> tuple[Sensor, ...]:
+def _as_in_file(sensor: Sensor, vehicle: "Vehicle") -> Sensor:
+    table = vehicle.sensors.get(sensor.name, {})
+    numbers: dict[str, Any] = {key: parameter.value for key, parameter in table.items()}
+    if "bias" in table:
+        numbers["bias_std"] = table["bias"].std
+    sensor = replace(sensor, **numbers)
+    if sensor.low >= sensor.high:
+        raise InputError(
+            f"vehicle {vehicle.name!r}: sensors.{sensor.name}: low {sensor.low:g} is not below "
+            f"high {sensor.high:g}"
+        )
+    return sensor
+
+
+def number_fault(key: str, value: float) -> str:
+    """Why a value cannot stand for one of NUMBERS, in a few words; empty where it can."""
+    wanted: Mapping[str, tuple[bool, str]] = {
+        "noise": (value >= 0.0, "not be negative"),
+        "rate": (value > 0.0, "be positive"),
+        "delay": (0.0 <= value <= LONGEST_DELAY, f"be in 0 .. {LONGEST_DELAY:g} s"),
+        "dropout": (0.0 <= value < 1.0, "be at least 0 and less than 1"),
+    }
+    fine, words = wanted.get(key, (True, ""))
+    return "" if fine else words
+
+
+def log_suite(name: str, vehicle: "Vehicle | None" = None) -> tuple[Sensor, ...]:
     """The suite as a flight folder can hold it: canonical channels only."""
-    return EXACT_LOG if name == "state" else suite(name)
+    return EXACT_LOG if name == "state" else suite(name, vehicle)
 
 
 def slow_instruments(sensors: tuple[Sensor, ...]) -> tuple[str, ...]:
-    """Instruments slower than the control loop, in order: those that have a flag."""
-    return tuple(dict.fromkeys(s.instrument for s in sensors if s.rate < BASE_RATE))
+    """Instruments that their suite has slower than the control loop, in order: those with a flag."""
+    return tuple(dict.fromkeys(s.instrument for s in sensors if s.flagged))
 
 
 _ACCELEROMETER = CHANNELS.index("ax")
@@ -152,7 +206,7 @@ def is_new(row: int, rate: float) -> bool:
 def log_readings(
     truth: np.ndarray, time: np.ndarray, sensors: tuple[Sensor, ...], rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Noisy log of true readings; NaN where a sensor has no new sample.
+    """Noisy log of true readings; NaN where a sensor has no new sample, or has lost it.
 
     Args:
         truth: readings of every canonical channel, shape (n, 18).
@@ -163,11 +217,22 @@ def log_readings(
         channel -> shape (n,), in the channel's unit.
     """
     result = {}
+    chances: dict[str, np.ndarray] = {}
     for sensor in sensors:
-        values = truth[:, sensor.index] + sensor.noise * rng.standard_normal(len(time))
+        seen = truth[:, sensor.index]
+        if sensor.delay > 0.0:
+            seen = np.interp(time - sensor.delay, time, seen)
+        values = seen + sensor.noise * rng.standard_normal(len(time)) + sensor.bias
+        if sensor.bias_std > 0.0:
+            values += sensor.bias_std * rng.standard_normal()
         if sensor.wraps:
             values = (values + math.pi) % (2.0 * math.pi) - math.pi
         samples = np.floor(time * sensor.rate + 1e-6)
         old = np.diff(samples, prepend=samples[:1] - 1.0) <= 0.0
+        if sensor.dropout > 0.0:
+            if sensor.instrument not in chances:
+                chances[sensor.instrument] = rng.random(len(time))
+                chances[sensor.instrument][:1] = 1.0  # a run's first reading is never lost
+            old |= chances[sensor.instrument] < sensor.dropout
         result[sensor.name] = np.where(old, np.nan, np.clip(values, sensor.low, sensor.high))
     return result

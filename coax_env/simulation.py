@@ -12,6 +12,7 @@ import numpy as np
 
 from coax_env import dynamics, effects
 from coax_env import parameters as P
+from coax_env.actuators import limit, limits
 from coax_env.errors import InputError
 from coax_env.flight import SHORTEST_RUN, Flight, Run
 from coax_env.layout import (
@@ -92,9 +93,9 @@ def fly(
     """
     vehicle = load_vehicle(vehicle)
     plan = maneuver(plan)
-    flown = plan.closed_loop if closed_loop is None else closed_loop
+    piloted = plan.closed_loop if closed_loop is None else closed_loop
     rng = np.random.default_rng(seed)
-    pilot = Pilot(vehicle, plan.height, tremor) if flown else None
+    pilot = Pilot(vehicle, plan.height, tremor) if piloted else None
     start, trim = dynamics.hover_trim(vehicle, plan.height)
 
     t = np.arange(round(plan.duration / dt) + 1) * dt
@@ -111,7 +112,7 @@ def fly(
     x = dynamics.full_state(start, trim, vehicle)
     if gusting:
         x[20:26] = level * rng.standard_normal(6)
-    delay = _SwashDelay(values, trim, dt)
+    delay, within, last = _SwashDelay(values, trim, dt), limits(vehicle), trim.copy()
     work = np.zeros(dynamics.WORK_SIZE)
     states, commands = np.empty((len(t), N_FULL)), np.empty((len(t), 4))
     readings = np.empty((len(t), N_CHANNELS))
@@ -123,7 +124,9 @@ def fly(
             command += pilot.correction(x, asked[k], asked_rate[k], dt, rng)
             command[:2] = np.maximum(command[:2], 0.0)
         commands[k] = command
-        pieces = delay.pieces(command)
+        possible = command.copy()
+        limit(possible, last, within, dt)
+        pieces = delay.pieces(possible)
         dynamics.measure(x, dynamics.kernel_input(pieces[0][1], time), values, work, readings[k])
         shake(readings[k], azimuth, vibration)
         states[k] = x
@@ -195,17 +198,19 @@ def simulate(
         vehicle: what `load_vehicle` takes; its effects are flown.
         maneuvers: names of `maneuvers.MANEUVERS`, or maneuvers; one run each.
         sensors: suite of `sensors.SUITES`; ``state`` logs every channel, exactly.
-        noise: whether readings are noisy; rates and limits stay.
+        noise: whether chance plays in the readings: noise, drawn bias and lost samples. Rates,
+            limits and delays stay.
         seed: of noise, tremor and gusts; the same seed gives the same flight.
 
     Raises:
         InputError: as `fly`.
     """
-    suite = log_suite(sensors)
+    vehicle = load_vehicle(vehicle)
+    suite = log_suite(sensors, vehicle)
     tracks = fly_all(
         vehicle, maneuvers, seed=seed, closed_loop=closed_loop, gusts=gusts, tremor=tremor, dt=dt
     )
-    return log_flight(load_vehicle(vehicle), tracks, suite, noise=noise, seed=seed)
+    return log_flight(vehicle, tracks, suite, noise=noise, seed=seed)
 
 
 def fly_all(
@@ -238,7 +243,7 @@ def log_flight(
 ) -> Flight:
     """Tracks as a flight folder holds them, seen through sensors."""
     if not noise:
-        suite = [replace(sensor, noise=0.0) for sensor in suite]
+        suite = [replace(sensor, noise=0.0, bias_std=0.0, dropout=0.0) for sensor in suite]
     runs = [
         _log_run(track, suite, np.random.default_rng(readings))
         for track, (_, readings) in zip(tracks, _chances(seed, len(tracks)), strict=True)

@@ -8,6 +8,13 @@ The form::
     mass = { value = 0.8, std = 0.008, unit = "kg", source = "Table I" }
     [effects.ground_effect]
     gain = { value = 0.1, std = 0.02, unit = "1", source = "..." }
+    [sensors.h]                          # optional: what differs from the sensor suite's numbers
+    noise = { value = 0.03, std = 0.0, unit = "m", source = "..." }
+    bias = { value = 0.0, std = 0.02, unit = "m", source = "..." }  # std: drawn for every flight
+    delay = { value = 0.08, std = 0.0, unit = "s", source = "..." }
+    dropout = { value = 0.05, std = 0.0, unit = "1", source = "..." }  # also: rate, low, high
+    [actuators]                          # optional: travel, speed range, rates (actuators.py)
+    swash_travel = { value = 0.25, std = 0.0, unit = "rad", source = "..." }
     [covariance]                         # optional: parameters identified together
     names = ["mass", "ground_effect.gain"]
     correlation = [[1.0, 0.2], [0.2, 1.0]]
@@ -27,8 +34,9 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import effects, parameters
+from coax_env import actuators, effects, parameters, sensors
 from coax_env.errors import InputError
+from coax_env.layout import CHANNEL_UNITS
 
 SHIPPED = Path(__file__).parent / "vehicles"
 
@@ -44,6 +52,29 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Spread:
+    """From what a vehicle's numbers are drawn; positive base parameters are log-normal."""
+
+    names: tuple[str, ...]
+    value: np.ndarray
+    std: np.ndarray
+    lognormal: np.ndarray  # bool
+    correlated: np.ndarray  # places of the jointly identified ones
+    factor: np.ndarray  # Cholesky factor of their correlation
+
+    def at(self, z: np.ndarray) -> np.ndarray:
+        """Numbers at independent standard normal ones, both of shape (..., n)."""
+        z = np.array(z)
+        if len(self.correlated):
+            joint = z[..., self.correlated]  # summed row by row: alike in a batch of any size
+            z[..., self.correlated] = (joint[..., None, :] * self.factor).sum(axis=-1)
+        ratio = np.where(self.lognormal, self.std / np.where(self.lognormal, self.value, 1.0), 0.0)
+        spread = np.log1p(ratio**2)
+        logarithmic = self.value * np.exp(np.sqrt(spread) * z - spread / 2.0)
+        return np.where(self.lognormal, logarithmic, self.value + self.std * z)
+
+
+@dataclass(frozen=True)
 class Vehicle:
     """Numbers of one machine. Immutable; `with_values` and `with_effect` give changed copies."""
 
@@ -54,6 +85,8 @@ class Vehicle:
     correlated: tuple[str, ...] = ()
     correlation: np.ndarray | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    sensors: Mapping[str, Mapping[str, Parameter]] = field(default_factory=dict)
+    actuators: Mapping[str, Parameter] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Parameter:
         """The parameter called ``"mass"`` or ``"ground_effect.gain"``."""
@@ -112,6 +145,28 @@ class Vehicle:
         }
         return self.with_parameters(table)
 
+    def with_sensor(self, channel: str, *, bias_std: float = 0.0, **values: float) -> "Vehicle":
+        """A copy with numbers of its own for a channel, for instance ``"h", dropout=0.1``."""
+        table = dict(self.sensors.get(channel, {}))
+        if bias_std and "bias" not in values:
+            values["bias"] = table["bias"].value if "bias" in table else 0.0
+        for key, value in values.items():
+            if channel not in CHANNEL_UNITS or key not in sensors.NUMBERS:
+                raise KeyError(f"sensors have no {channel}.{key}")
+            unit = sensors.NUMBERS[key] or CHANNEL_UNITS[channel]
+            std = bias_std if key == "bias" else 0.0
+            table[key] = Parameter(float(value), std, unit, "set by hand")
+        return replace(self, sensors={**self.sensors, channel: table})
+
+    def with_actuators(self, **values: float) -> "Vehicle":
+        """A copy with limits of its actuators, for instance ``swash_travel=0.25`` (actuators.py)."""
+        table = dict(self.actuators)
+        for name, value in values.items():
+            if name not in actuators.NUMBERS:
+                raise KeyError(f"actuators have no limit {name!r}")
+            table[name] = Parameter(float(value), 0.0, actuators.NUMBERS[name], "set by hand")
+        return replace(self, actuators=table)
+
     def without_effects(self) -> "Vehicle":
         """The bare model."""
         keep = [name for name in self.correlated if "." not in name]
@@ -131,28 +186,35 @@ class Vehicle:
         flights = [*self.provenance.get("flights", ()), *hashes]
         return replace(self, provenance={**self.provenance, "flights": flights})
 
-    def draw(self, rng: np.random.Generator) -> "Vehicle":
-        """A vehicle drawn from this one's spread; positive base parameters are log-normal."""
+    def spread(self) -> Spread:
+        """The distribution of this vehicle's numbers, in the order of `values`."""
         flat = dict(self.parameters) | {
             f"{g}.{n}": p for g, table in self.effects.items() for n, p in table.items()
         }
-        names = list(flat)
-        z = rng.standard_normal(len(names))
-        if self.correlation is not None:
-            index = [names.index(name) for name in self.correlated]
-            z[index] = np.linalg.cholesky(self.correlation) @ z[index]
-        drawn = {}
-        for name, parameter, standard in zip(names, flat.values(), z, strict=True):
-            if parameter.std > 0.0:
-                drawn[name] = _draw_one(parameter, standard, positive="." not in name)
+        names = tuple(flat)
+        value = np.array([p.value for p in flat.values()])
+        joint = self.correlated if self.correlation is not None else ()
+        return Spread(
+            names=names,
+            value=value,
+            std=np.array([p.std for p in flat.values()]),
+            lognormal=np.array(["." not in name for name in names]) & (value > 0.0),
+            correlated=np.array([names.index(name) for name in joint], dtype=int),
+            factor=np.empty((0, 0))
+            if self.correlation is None
+            else np.linalg.cholesky(self.correlation),
+        )
+
+    def draw(self, rng: np.random.Generator) -> "Vehicle":
+        """A vehicle drawn from this one's spread; positive base parameters are log-normal."""
+        spread = self.spread()
+        values = spread.at(rng.standard_normal(len(spread.names)))
+        drawn = {
+            name: value
+            for name, value, std in zip(spread.names, values, spread.std, strict=True)
+            if std > 0.0
+        }
         return self.with_values(drawn, "drawn from the vehicle's spread")
-
-
-def _draw_one(parameter: Parameter, standard: float, positive: bool) -> float:
-    if not positive or parameter.value <= 0.0:
-        return parameter.value + parameter.std * standard
-    spread = math.log1p((parameter.std / parameter.value) ** 2)
-    return parameter.value * math.exp(math.sqrt(spread) * standard - spread / 2.0)
 
 
 def shipped_vehicles() -> list[str]:
@@ -222,6 +284,8 @@ def _vehicle_from(document: dict[str, Any], path: Path) -> Vehicle:
         correlated=names,
         correlation=correlation,
         provenance=document.get("provenance", {}),
+        sensors=_sensors(document.get("sensors", {}), path),
+        actuators=_actuators(document.get("actuators", {}), path),
     )
     flat = vehicle.values()
     for name in names:
@@ -262,6 +326,47 @@ def _table(content: Any, path: Path, where: str) -> dict[str, Parameter]:
     return result
 
 
+def _sensors(content: Any, path: Path) -> dict[str, dict[str, Parameter]]:
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: [sensors] must hold one table per channel")
+    result = {}
+    for channel, entries in content.items():
+        where = f"sensors.{channel}"
+        if channel not in CHANNEL_UNITS:
+            raise InputError(f"{path}: {where} is not a channel")
+        table = _table(entries, path, where)
+        for key, parameter in table.items():
+            if key not in sensors.NUMBERS:
+                known = ", ".join(sensors.NUMBERS)
+                raise InputError(f"{path}: {where}.{key} is none of {known}")
+            unit = sensors.NUMBERS[key] or CHANNEL_UNITS[channel]
+            _check_unit(parameter, unit, path, f"{where}.{key}")
+            fault = sensors.number_fault(key, parameter.value)
+            if fault:
+                raise InputError(f"{path}: {where}.{key} must {fault}, found {parameter.value:g}")
+        if "low" in table and "high" in table and table["low"].value >= table["high"].value:
+            raise InputError(f"{path}: {where}.low must be below {where}.high")
+        result[channel] = table
+    return result
+
+
+def _actuators(content: Any, path: Path) -> dict[str, Parameter]:
+    table = _table(content, path, "actuators")
+    for name, parameter in table.items():
+        if name not in actuators.NUMBERS:
+            known = ", ".join(actuators.NUMBERS)
+            raise InputError(f"{path}: actuators.{name} is none of {known}")
+        _check_unit(parameter, actuators.NUMBERS[name], path, f"actuators.{name}")
+        if parameter.value <= 0.0:
+            raise InputError(
+                f"{path}: actuators.{name} must be positive, found {parameter.value:g}"
+            )
+    slowest, fastest = table.get("rotor_speed_lowest"), table.get("rotor_speed_highest")
+    if slowest and fastest and slowest.value >= fastest.value:
+        raise InputError(f"{path}: actuators.rotor_speed_lowest must be below rotor_speed_highest")
+    return table
+
+
 def _check_unit(parameter: Parameter, unit: str, path: Path, where: str) -> None:
     if parameter.unit != unit:
         raise InputError(f"{path}: {where} must be in {unit!r}, found {parameter.unit!r}")
@@ -299,6 +404,13 @@ def vehicle_toml(vehicle: Vehicle) -> str:
         for effect, table in vehicle.effects.items():
             groups[effect] = _toml_table(table.items())
         document["effects"] = groups
+    if vehicle.sensors:
+        channels = tomlkit.table(is_super_table=True)
+        for channel, numbers in vehicle.sensors.items():
+            channels[channel] = _toml_table(numbers.items())
+        document["sensors"] = channels
+    if vehicle.actuators:
+        document["actuators"] = _toml_table(vehicle.actuators.items())
     if vehicle.correlation is not None and len(vehicle.correlated):
         covariance = tomlkit.table()
         covariance["names"] = list(vehicle.correlated)

@@ -33,7 +33,7 @@ def main() -> None:
     vehicle = load_vehicle(options.vehicle)
     names = list(MANEUVERS) if options.maneuver == "all" else options.maneuver.split(",")
     gusts = Gusts() if options.gusts else None
-    suite = log_suite(options.sensors)
+    suite = log_suite(options.sensors, vehicle)
     tracks = fly_all(vehicle, names, seed=options.seed, gusts=gusts)
     flight = log_flight(vehicle, tracks, suite, noise=not options.no_noise, seed=options.seed)
     papers = names == ["lon_doublet"] and vehicle.name == "lama400d" and not vehicle.effects

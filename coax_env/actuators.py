@@ -1,0 +1,56 @@
+"""What the actuators cannot do: travel of the swash plate, range of rotor speeds, and their rates.
+
+A vehicle file may have these numbers; without them nothing is limited. They act on the command, once
+a control period, before the lags and delays of the catalogue's effects.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coax_env.jit import compiled
+from coax_env.layout import N_COMMANDS
+
+if TYPE_CHECKING:
+    from coax_env.vehicle import Vehicle
+
+NUMBERS = {
+    "swash_travel": "rad",  # each way, per axis
+    "swash_rate": "rad/s",
+    "rotor_speed_lowest": "rad/s",
+    "rotor_speed_highest": "rad/s",
+    "rotor_acceleration": "rad/s2",
+}
+"""Name and unit of the limits a vehicle file may have; all are positive."""
+
+LOWEST, HIGHEST, FASTEST = range(3)
+"""Rows of the array of limits: of each command the lowest, the highest, and the rate per second."""
+
+
+def limits(vehicle: "Vehicle") -> np.ndarray:
+    """Limits of the four commands, shape (3, 4); infinite where the vehicle file has none."""
+    found = np.empty((3, N_COMMANDS))
+    number = {name: parameter.value for name, parameter in vehicle.actuators.items()}
+    found[LOWEST, :2] = number.get("rotor_speed_lowest", -np.inf)
+    found[HIGHEST, :2] = number.get("rotor_speed_highest", np.inf)
+    found[FASTEST, :2] = number.get("rotor_acceleration", np.inf)
+    found[LOWEST, 2:] = -number.get("swash_travel", np.inf)
+    found[HIGHEST, 2:] = number.get("swash_travel", np.inf)
+    found[FASTEST, 2:] = number.get("swash_rate", np.inf)
+    return found
+
+
+@compiled()
+def limit(command, before, limits, dt):
+    """Hold a command (4,), in place, within the limits (3, 4), coming from the one `before`.
+
+    The limited command is kept in `before` (4,). A command that is not a number stays so.
+    """
+    for k in range(N_COMMANDS):
+        most = limits[FASTEST, k] * dt
+        value = command[k]
+        value = before[k] + most if value > before[k] + most else value
+        value = before[k] - most if value < before[k] - most else value
+        value = limits[LOWEST, k] if value < limits[LOWEST, k] else value
+        value = limits[HIGHEST, k] if value > limits[HIGHEST, k] else value
+        command[k] = before[k] = value

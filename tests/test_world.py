@@ -1,0 +1,625 @@
+"""The world of CoaxHeli-v0: sensors and actuators of the file, turbulence, tasks, drawn vehicles."""
+
+import math
+import warnings
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from scipy.signal import welch
+
+import coax_env
+from coax_env import dynamics, effects, hover, tasks
+from coax_env.actuators import limit, limits
+from coax_env.env import CoaxEnv, CoaxVectorEnv
+from coax_env.errors import InputError
+from coax_env.fleet import DT
+from coax_env.layout import CHANNELS
+from coax_env.random_streams import stream_key
+from coax_env.sensors import SUITES, log_suite, suite
+from coax_env.simulation import _SwashDelay, fly
+from coax_env.turbulence import FOOT, SEVERITIES, dryden, settle, spectrum, stir
+from coax_env.vehicle import load_vehicle, vehicle_toml
+
+LAMA = load_vehicle("lama400d")
+DRAGGED = LAMA.with_effect("rotor_drag", coefficient=4e-4)
+EYED = (
+    LAMA.with_sensor("h", dropout=0.2, delay=0.085, bias_std=0.05)
+    .with_sensor("p", bias=0.01, noise=0.0)
+    .with_sensor("psi", rate=10.0)
+)
+TRIM = dynamics.hover_trim(LAMA)
+
+
+def actions(seed: int, *shape: int, size: float = 0.4) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-size, size, shape).astype(np.float32)
+
+
+def held_still(env: CoaxEnv, rows: int) -> tuple[list[str], np.ndarray]:
+    """Names and observations of a helicopter that is put back to hover before every row."""
+    observations = [env.reset(seed=1, options={"state": TRIM[0]})[0]]
+    for _ in range(rows - 1):
+        observations.append(env.step(np.zeros(4))[0])
+        env.fleet.x[0, :16] = TRIM[0]
+    return list(env.observation_names), np.array(observations)
+
+
+# --- sensors of the vehicle file --------------------------------------------------------------------
+
+
+def test_a_file_keeps_what_its_sensors_and_actuators_are(tmp_path):
+    given = EYED.with_actuators(swash_travel=0.2, rotor_acceleration=300.0)
+    path = tmp_path / "eyed.toml"
+    path.write_text(vehicle_toml(given))
+    found = load_vehicle(path)
+    assert found.sensors == given.sensors and found.actuators == given.actuators
+    assert found.sensors["h"]["bias"].std == 0.05 and found.sensors["h"]["bias"].unit == "m"
+    assert found.without_effects().sensors == given.sensors
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (
+            '[sensors.radar]\nnoise = {value=1, std=0, unit="m", source=""}',
+            "radar is not a channel",
+        ),
+        ('[sensors.h]\ncolour = {value=1, std=0, unit="m", source=""}', "colour is none of"),
+        ('[sensors.h]\nnoise = {value=1, std=0, unit="cm", source=""}', "must be in 'm'"),
+        ('[sensors.h]\nnoise = {value=-1, std=0, unit="m", source=""}', "not be negative"),
+        ('[sensors.h]\nrate = {value=0, std=0, unit="Hz", source=""}', "be positive"),
+        ('[sensors.h]\ndropout = {value=1, std=0, unit="1", source=""}', "less than 1"),
+        ('[sensors.h]\ndelay = {value=3, std=0, unit="s", source=""}', "0 .. 1 s"),
+        ('[sensors.h]\nnoise = {value=1, std=0, unit="m"}', "has no source"),
+        ("[sensors]\nh = 3", "sensors.h] is missing or not a table"),
+        ('[actuators]\nmuscle = {value=1, std=0, unit="m", source=""}', "muscle is none of"),
+        ('[actuators]\nswash_travel = {value=0, std=0, unit="rad", source=""}', "be positive"),
+        ('[actuators]\nswash_rate = {value=1, std=0, unit="rad", source=""}', "in 'rad/s'"),
+    ],
+)
+def test_a_wrong_sensor_or_actuator_is_named_in_one_line(tmp_path, lines, said):
+    path = tmp_path / "wrong.toml"
+    path.write_text(vehicle_toml(LAMA) + "\n" + lines + "\n")
+    with pytest.raises(InputError) as error:
+        load_vehicle(path)
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_crossed_bounds_are_an_error_where_the_sensor_is_used():
+    with pytest.raises(InputError, match=r"sensors\.h: low 7 is not below high 6\.5"):
+        suite("onboard", LAMA.with_sensor("h", low=7.0))
+
+
+def test_exact_suites_stay_exact():
+    assert suite("state", EYED) == SUITES["state"]
+    assert log_suite("state", EYED) == log_suite("state")
+
+
+def test_lost_echoes_hold_the_reading_and_are_not_new():
+    names, rows = held_still(CoaxEnv(LAMA.with_sensor("h", dropout=0.3)), 4000)
+    new, h = rows[:, names.index("new_sonar")] > 0.5, rows[:, names.index("h")]
+    due = np.arange(4000) % 5 == 0
+    assert not new[~due].any()
+    share, n = 1.0 - new[due].mean(), due.sum()
+    assert abs(share - 0.3) < 4.0 * math.sqrt(0.3 * 0.7 / n)
+    held = np.flatnonzero(~new)
+    assert np.array_equal(h[held], h[held - 1])
+    assert (h[new][1:] != h[new][:-1]).all()
+
+
+def test_channels_of_one_instrument_are_lost_together():
+    vehicle = LAMA
+    for channel in ("vn", "ve", "vd"):
+        vehicle = vehicle.with_sensor(channel, dropout=0.5)
+    names, rows = held_still(CoaxEnv(vehicle), 600)
+    moved = np.array([np.diff(rows[:, names.index(c)]) != 0.0 for c in ("vn", "ve", "vd")])
+    assert (moved[0] == moved[1]).all() and (moved[0] == moved[2]).all()
+    assert np.array_equal(moved[0], rows[1:, names.index("new_velocity")] > 0.5)
+    flight = coax_env.simulate(vehicle, "hover", seed=1)
+    lost = np.array([np.isnan(flight.runs[0].measured[c]) for c in ("vn", "ve", "vd")])
+    assert (lost == lost[0]).all()
+    fresh = (~lost[0]).sum() / (len(lost[0]) / 10)
+    assert fresh == pytest.approx(0.5, abs=0.2)
+
+
+def test_a_delayed_reading_is_the_earlier_truth():
+    delay = 0.035
+    vehicle = LAMA.with_sensor("q", delay=delay, noise=0.0)
+    env = CoaxEnv(vehicle)
+    env.reset(seed=3)
+    truth, seen = [], []
+    for action in actions(0, 60, 4):
+        observation, *_, info = env.step(action)
+        truth.append(info["state"][4])
+        seen.append(observation[env.observation_names.index("q")])
+    t = np.arange(60) * DT
+    expected = np.interp(t - delay, t, truth)
+    assert np.allclose(seen[4:], expected[4:], atol=1e-6)
+    assert np.abs(np.array(seen) - truth).max() > 0.01
+
+
+def test_a_flights_bias_is_drawn_once_with_its_std():
+    env = CoaxVectorEnv(2000, LAMA.with_sensor("h", bias_std=0.1, noise=0.0, bias=0.2))
+    place = env.observation_names.index("h")
+    first = env.reset(seed=0, options={"state": TRIM[0]})[0][:, place] - 1.5
+    assert first.mean() == pytest.approx(0.2, abs=4 * 0.1 / math.sqrt(2000))
+    assert first.std() == pytest.approx(0.1, rel=0.07)
+    for _ in range(5):
+        *_, info = (step := env.step(np.zeros((2000, 4))))
+    later = step[0][:, place] + info["state"][:, 15]
+    assert np.allclose(later, first, atol=1e-5)
+
+
+def test_the_sonar_reads_within_its_range_only():
+    env = CoaxEnv(LAMA.with_sensor("h", high=2.0))
+    place = env.observation_names.index("h")
+    for height, reads in ((0.08, 0.15), (3.0, 2.0)):
+        state = np.array(TRIM[0])
+        state[15] = -height
+        assert env.reset(seed=0, options={"state": state})[0][place] == pytest.approx(
+            reads, abs=0.1
+        )
+    assert env.observation_space.high[place] == 2.0
+
+
+def test_a_flight_folder_is_seen_by_the_same_tables():
+    truth = fly(LAMA, "hover")
+    log = coax_env.simulate(
+        LAMA.with_sensor("h", dropout=0.25, delay=0.1, bias=0.3), "hover", tremor=0.0
+    ).runs[0]
+    fresh = np.isfinite(log.measured["h"])
+    assert fresh[0]
+    assert fresh.sum() == pytest.approx(0.75 * 20.0 * log.t[-1], rel=0.2)
+    assert np.nanmean(log.measured["h"]) == pytest.approx(1.8, abs=0.03)
+    clean = coax_env.simulate(
+        LAMA.with_sensor("q", delay=0.05, dropout=0.5), "lon_doublet", noise=False
+    ).runs[0]
+    track = fly(LAMA, "lon_doublet")
+    late = np.interp(track.t - 0.05, track.t, track.reading("q"))
+    assert np.allclose(clean.measured["q"], late, atol=1e-12)
+    assert np.isfinite(truth.readings).all()
+
+
+def test_the_layout_of_observations_is_the_suites_whatever_the_file_says():
+    assert CoaxEnv(EYED).observation_names == CoaxEnv(LAMA).observation_names
+
+
+# --- actuators --------------------------------------------------------------------------------------
+
+
+def test_commands_stay_within_travel_range_and_rate():
+    table = limits(LAMA.with_actuators(swash_travel=0.1, swash_rate=2.0, rotor_speed_highest=300.0))
+    before = np.zeros(4)
+    asked = np.array([400.0, -5.0, 0.5, -0.5])
+    command = asked.copy()
+    limit(command, before, table, 0.01)
+    assert np.allclose(command, [300.0, -5.0, 0.02, -0.02])
+    for _ in range(20):
+        command = asked.copy()
+        limit(command, before, table, 0.01)
+    assert np.allclose(command, [300.0, -5.0, 0.1, -0.1]) and np.array_equal(command, before)
+    command = np.array([np.nan, 1.0, 0.0, 0.0])
+    limit(command, before, table, 0.01)
+    assert np.isnan(command[0])
+
+
+def test_limits_fly_in_the_env_and_in_simulated_flights():
+    slow = LAMA.with_actuators(swash_rate=0.5, swash_travel=0.05)
+    env = CoaxEnv(slow, sensors="state")
+    env.reset(seed=0)
+    tilts = [env.step(np.array([0, 0, 1.0, 0]))[4]["state"][18] for _ in range(15)]
+    assert np.allclose(tilts, np.minimum(0.005 * np.arange(1, 16), 0.05))
+    free, held = fly(LAMA, "lon_doublet"), fly(slow, "lon_doublet")
+    assert np.array_equal(free.command, held.command)  # what was asked for
+    assert np.abs(held.state[:, 18]).max() == pytest.approx(0.05)
+    assert np.abs(np.diff(held.state[:, 18])).max() <= 0.005 + 1e-12
+    assert np.abs(free.state[:, 18]).max() > 0.08
+
+
+# --- every effect flies -----------------------------------------------------------------------------
+
+
+def usual(effect: str) -> coax_env.Vehicle:
+    """A vehicle that feels every effect, with this one at its usual size."""
+    base = LAMA.with_effect("rotor_drag", coefficient=2e-4) if effect == "wind" else LAMA
+    entry = effects.CATALOGUE[effect]
+    return base.with_effect(effect, **{p.name: p.off + p.usual for p in entry.parameters})
+
+
+@pytest.mark.parametrize("effect", effects.CATALOGUE)
+def test_every_effect_flies_in_the_env_as_in_the_scalar_simulation(effect):
+    vehicle = usual(effect)
+    bare = vehicle.without_effects()
+    sharp = dict.fromkeys(("p", "q", "r", "ax", "ay", "az", "phi", "theta", "psi", "h"), 0.0)
+    flown = []
+    for machine in (vehicle, bare):
+        for channel in sharp:
+            machine = machine.with_sensor(channel, noise=0.0)
+        env = CoaxEnv(machine, nominal=LAMA)
+        env.reset(seed=4)
+        start = env.fleet.x[0].copy()
+        start[15] = -0.4
+        start[2], start[5] = 0.3, 0.5
+        first = env.reset(seed=4, options={"state": start})[0]
+        rows = [env.step(a) for a in actions(2, 100, 4, size=0.3)]
+        flown.append(
+            (np.array([r[4]["state"] for r in rows]), np.array([r[0] for r in rows]), first)
+        )
+    (states, observations, _), (bare_states, bare_observations, _) = flown
+    assert not (
+        np.array_equal(states, bare_states) and np.array_equal(observations, bare_observations)
+    )
+    x, work = start.copy(), np.zeros(dynamics.WORK_SIZE)
+    delay = _SwashDelay(vehicle.vector, env.fleet.trim, DT)
+    readings = np.empty(len(CHANNELS))
+    rates = [CHANNELS.index(c) for c in ("p", "q", "r")]
+    seen = [env.observation_names.index(c) for c in ("p", "q", "r")]
+    for row, action in enumerate(actions(2, 100, 4, size=0.3)):
+        command = env.fleet.trim + env.fleet.scale * action.astype(float)
+        begin = row * DT
+        for seconds, held in delay.pieces(command):
+            dynamics.step(x, dynamics.kernel_input(held, begin), seconds, vehicle.vector, work, x)
+            begin += seconds
+        assert np.allclose(states[row], x, rtol=1e-9, atol=1e-12)
+        now = dynamics.kernel_input(held, (row + 1) * DT)
+        dynamics.measure(x, now, vehicle.vector, work, readings)
+        assert np.allclose(observations[row, seen], readings[rates], atol=1e-5)
+
+
+# --- turbulence -------------------------------------------------------------------------------------
+
+
+def eddies_of(seed: int, rows: int, height: float, wind: float) -> np.ndarray:
+    stream = np.array([stream_key(np.uint64(seed)), 0], dtype=np.uint64)
+    state, air, history = np.zeros(5), np.zeros(3), np.empty((rows, 3))
+    settle(stream, state)
+    for row in range(rows):
+        stir(stream, state, height, wind, DT, air)
+        history[row] = air
+    return history
+
+
+def test_intensities_and_lengths_are_the_standards():
+    sigma, sigma_w, tau, tau_w = dryden(100 * FOOT, 10.0)
+    shape = 0.177 + 0.0823
+    assert sigma_w == pytest.approx(1.0) and sigma == pytest.approx(shape**-0.4)
+    assert tau / tau_w == pytest.approx(shape**-1.2)
+    assert dryden(1.0, 5.0) == dryden(10 * FOOT, 5.0)
+    top = dryden(1000 * FOOT, 10.0)  # at 1000 ft turbulence is isotropic: L_u = L_w, sigma alike
+    assert top[0] == pytest.approx(top[1]) and top[2] == pytest.approx(top[3])
+    assert dryden(20 * FOOT, 8.0)[3] * 8.0 == pytest.approx(20 * FOOT)  # L_w = h, V = W at 6 m
+    assert SEVERITIES["light"] == pytest.approx(7.717, abs=1e-3)
+
+
+def test_turbulence_starts_and_stays_at_its_variance():
+    sigma, sigma_w, *_ = dryden(2.0, 3.0)
+    wanted = np.array([sigma, sigma, sigma_w])
+    for rows in (1, 150):
+        ends = np.array([eddies_of(seed, rows, 2.0, 3.0)[-1] for seed in range(1500)])
+        assert np.allclose(ends.std(axis=0) / wanted, 1.0, atol=0.08)
+        assert np.abs(ends.mean(axis=0) / wanted).max() < 0.12
+        assert np.abs(np.corrcoef(ends.T) - np.eye(3)).max() < 0.1
+
+
+def test_turbulence_has_drydens_spectrum():
+    history = eddies_of(1, 300_000, 1.5, 4.0)
+    sigma, sigma_w, tau, tau_w = dryden(1.5, 4.0)
+    for axis, (s, t) in enumerate(((sigma, tau), (sigma, tau), (sigma_w, tau_w))):
+        f, power = welch(history[:, axis], 1.0 / DT, nperseg=16384)
+        for low, high in ((0.03, 0.15), (0.15, 1.0), (1.0, 8.0)):
+            band = (f > low) & (f < high)
+            assert np.mean(power[band] / spectrum(f[band], s, t, axis == 0)) == pytest.approx(
+                1.0, abs=0.12
+            )
+    area = np.trapezoid(spectrum(f := np.linspace(0.0, 400.0, 2_000_000), 1.0, 0.5, False), f)
+    assert area == pytest.approx(1.0, abs=0.01)
+
+
+def test_turbulence_acts_through_drag_and_not_on_a_bare_vehicle():
+    flown = {}
+    for name, vehicle in (("bare", LAMA), ("dragged", DRAGGED)):
+        for turbulence in (None, 6.0):
+            env = CoaxEnv(vehicle, turbulence=turbulence, sensors="state")
+            state = env.reset(seed=2, options={"state": TRIM[0]})[1]["state"]
+            for _ in range(100):
+                state = env.step(np.zeros(4))[4]["state"]
+            flown[name, turbulence] = state
+    assert np.array_equal(flown["bare", None], flown["bare", 6.0])
+    assert np.abs(flown["dragged", 6.0] - flown["dragged", None])[:3].max() > 0.05
+
+
+def test_turbulence_rides_on_the_steady_wind():
+    env = CoaxVectorEnv(300, DRAGGED, wind=(0.0, 5.0), turbulence=5.0)
+    env.reset(seed=0)
+    air = []
+    for _ in range(40):
+        env.step(np.zeros((300, 4)))
+        air.append(env.fleet.air)
+    sigma, sigma_w, *_ = dryden(1.5, 5.0)
+    assert np.allclose(np.mean(air, axis=(0, 1)), [0.0, 5.0, 0.0], atol=4 * sigma / math.sqrt(300))
+    assert np.allclose(np.std(air[0], axis=0), [sigma, sigma, sigma_w], rtol=0.15)
+    up = np.corrcoef(env.fleet.air[:, 2], env.fleet.x[:, 2])[0, 1]
+    assert abs(up) < 0.2  # rotor drag lies in the rotor's plane
+
+
+def test_a_downdraught_pushes_a_vehicle_that_has_axial_damping():
+    vehicle = LAMA.with_effect("axial_damping", coefficient=0.1)
+    values = vehicle.vector.copy()
+    values[effects.AIR] = 1.0
+    values[effects.P.AIR_DOWN] = 1.0
+    x = dynamics.full_state(*TRIM, LAMA)
+    work, out = np.zeros(dynamics.WORK_SIZE), np.empty(26)
+    dynamics.step(x, dynamics.kernel_input(TRIM[1]), 0.01, values, work, out)
+    assert out[2] == pytest.approx(0.1 * 9.804 * 0.01, rel=0.02)  # thrust times 1 + k (w - 1)
+
+
+# --- tasks ------------------------------------------------------------------------------------------
+
+AIMED = [(task, sensors) for task in ("position", "waypoints") for sensors in ("mocap", "state")]
+
+
+@pytest.mark.parametrize(("task", "sensors"), AIMED)
+def test_check_env_passes_for_every_task_without_a_warning(task, sensors):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gymnasium.make("CoaxHeli-v0", task=task, sensors=sensors).unwrapped)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"task": "race"}, {"task": "position"}, {"task": "waypoints", "sensors": "paper"},
+        {"target": (0.0, 0.0, 1.0, 0.0)}, {"turbulence": "hurricane"}, {"turbulence": -1.0},
+        {"task": "position", "sensors": "state", "target": [(0, 0, 1, 0), (1, 0, 1, 0)]},
+        {"task": "waypoints", "sensors": "state", "target": [(0, 0, 1)]},
+        {"task": "waypoints", "sensors": "state", "target": (0, 0, 99.0, 0)},
+        {"task": "waypoints", "sensors": "state", "target": "home"},
+        {"randomize": {"weight": (1.0, 2.0)}}, {"randomize": {"mass": (2.0, 1.0)}},
+        {"randomize": {"mass": (0.0, 1.0)}}, {"randomize": {"mass": 1.0}},
+        {"randomize": {"motor_lag.upper": (0.0, 9.0)}}, {"randomize": {"wind.up": (0.0, 1.0)}},
+        {"randomize": []}, {"randomize": ["zeppelin"]}, {"randomize": 3},
+    ],
+)  # fmt: skip
+def test_a_wrong_world_is_named_in_one_line(wrong):
+    with pytest.raises(InputError) as error:
+        CoaxEnv(**wrong)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("task", tasks.TASKS)
+def test_rewards_are_the_sum_of_their_named_terms(task):
+    env = CoaxEnv(task=task, sensors="state")
+    env.reset(seed=0)
+    weights = tasks.TASKS[task].weights
+    assert sum(w for name, w in weights.items() if name != "reached") == pytest.approx(1.0)
+    for action in actions(5, 20, 4):
+        _, reward, _, _, info = env.step(action)
+        assert reward == pytest.approx(sum(info["reward_terms"].values()))
+        assert tuple(info["reward_terms"]) == tuple(weights)
+        assert 0.0 < reward < 1.0
+
+
+def test_the_observation_points_to_the_target():
+    env = CoaxEnv(task="position", sensors="state", target=(2.0, 1.0, 2.0, 0.5))
+    state = np.array(TRIM[0])
+    state[12], state[13], state[14] = 0.3, 1.0, 1.0  # one metre south of it, heading 0.3
+    observation, info = env.reset(seed=0, options={"state": state})
+    way = dict(zip(env.observation_names, observation, strict=True))
+    assert way["target_forward"] == pytest.approx(math.cos(0.3), abs=1e-6)
+    assert way["target_right"] == pytest.approx(-math.sin(0.3), abs=1e-6)
+    assert way["target_up"] == pytest.approx(0.5, abs=1e-6)
+    assert way["heading_error"] == pytest.approx(0.2, abs=1e-6)
+    assert np.allclose(info["target"], [2.0, 1.0, -2.0, 0.5])
+
+
+def test_the_way_to_the_target_is_made_of_readings_not_of_truth():
+    blind = LAMA.with_sensor("pn", bias=0.5).with_sensor("h", bias=0.2, noise=0.0)
+    env = CoaxEnv(blind, sensors="mocap", task="position", target=(1.0, 0.0, 1.5, 0.0))
+    observation, _ = env.reset(seed=0, options={"state": TRIM[0]})
+    way = dict(zip(env.observation_names, observation, strict=True))
+    assert way["target_forward"] == pytest.approx(0.5, abs=0.03)
+    assert way["target_up"] == pytest.approx(-0.2, abs=1e-5)
+
+
+def test_holding_the_target_is_worth_the_most_and_counts_as_success():
+    target = (0.5, -0.5, 1.2, 0.4)
+    env = CoaxEnv(task="position", sensors="state", target=target)
+    goal = np.array(TRIM[0])
+    goal[12:16] = 0.4, 0.5, -0.5, -1.2
+    env.reset(seed=0, options={"state": goal})
+    assert env.step(np.zeros(4))[1] == pytest.approx(1.0, abs=2e-3)
+    steps = 600
+    still, aims = np.tile(goal, (steps, 1)), np.tile((0.5, -0.5, -1.2, 0.4), (steps, 1))
+    assert tasks.succeeded("position", still, aims, steps)
+    assert not tasks.succeeded("position", still[:-1], aims[:-1], steps)
+    for place, error in ((15, 0.11), (12, 0.2), (0, 0.26), (13, 2.1)):
+        off = still.copy()
+        off[:, place] += error
+        assert not tasks.succeeded("position", off, aims, steps)
+        early = np.vstack([off[:300], still[300:]])  # the first three seconds do not count
+        assert tasks.succeeded("position", early, aims, steps)
+
+
+def test_waypoints_move_on_after_a_dwell_within_radius_and_heading():
+    course = [(0.2, 0.0, 1.5, 0.1), (1.0, 0.0, 1.5, 0.0), (0.0, 1.0, 1.5, 0.0)]
+    env = CoaxEnv(task="waypoints", sensors="state", target=course)
+    env.reset(seed=0, options={"state": TRIM[0]})
+    rewards, targets, reached = [], [], []
+    for _ in range(60):
+        observation, *_, info = env.step(np.zeros(4))
+        env.fleet.x[0, :16] = TRIM[0]
+        rewards.append(info["reward_terms"]["reached"])
+        targets.append(info["target"])
+        reached.append(info["reached"])
+        assert observation[-4] == pytest.approx(info["target"][0], abs=1e-3)
+    assert np.flatnonzero(rewards).tolist() == [49]  # half a second
+    assert rewards[49] == tasks.TASKS["waypoints"].weights["reached"]
+    assert reached[48:51] == [0, 1, 1]
+    assert np.allclose(targets[48], [0.2, 0.0, -1.5, 0.1])
+    assert np.allclose(targets[49], [1.0, 0.0, -1.5, 0.0])
+    for place, value in ((13, 0.6), (15, -1.9), (12, 0.5)):
+        outside = np.array(TRIM[0])
+        outside[place] = value
+        env.reset(seed=0, options={"state": outside})
+        for _ in range(60):
+            *_, info = env.step(np.zeros(4))
+            env.fleet.x[0, :16] = outside
+        assert info["reached"] == 0
+
+
+def test_the_last_waypoint_stays_and_is_paid_once():
+    env = CoaxEnv(task="waypoints", sensors="state", target=(0.0, 0.0, 1.5, 0.0))
+    env.reset(seed=0, options={"state": TRIM[0]})
+    paid = 0.0
+    for _ in range(160):
+        _, _, terminated, _, info = env.step(np.zeros(4))
+        env.fleet.x[0, :16] = TRIM[0]
+        paid += info["reward_terms"]["reached"]
+    assert paid == 50.0 and info["reached"] == 1 and not terminated
+    assert np.allclose(info["target"], [0.0, 0.0, -1.5, 0.0])
+
+
+def test_drawn_targets_fill_their_box_and_follow_each_other():
+    env = CoaxVectorEnv(3000, task="waypoints", sensors="state")
+    _, info = env.reset(seed=0)
+    drawn = info["target"] * (1.0, 1.0, -1.0, 1.0)
+    own = tasks.TASKS["waypoints"]
+    low, high = np.array(own.lowest), np.array(own.highest)
+    assert (drawn >= low).all() and (drawn <= high).all()
+    assert np.allclose(drawn.std(axis=0), (high - low) / math.sqrt(12.0), rtol=0.05)
+    for _ in range(50):
+        env.fleet.x[:, :16] = 0.0
+        env.fleet.x[:, 12:16] = np.roll(info["target"], 1, axis=1)
+        *_, step_info = env.step(np.zeros((3000, 4)))
+    assert (step_info["reached"] == 1).all()
+    assert (np.abs(step_info["target"] - info["target"]).max(axis=1) > 1e-6).all()
+
+
+# --- drawn vehicles ---------------------------------------------------------------------------------
+
+
+def test_ranges_draw_uniformly_and_fly():
+    ranges = {"mass": (0.7, 0.9), "ground_effect.gain": (0.0, 0.3)}
+    env = CoaxVectorEnv(3000, randomize=ranges)
+    _, info = env.reset(seed=0)
+    for name, (low, high) in ranges.items():
+        drawn = info["vehicle"][name]
+        assert low <= drawn.min() and drawn.max() <= high
+        assert drawn.mean() == pytest.approx(0.5 * (low + high), rel=0.02)
+        assert drawn.std() == pytest.approx((high - low) / math.sqrt(12.0), rel=0.05)
+        assert np.array_equal(env.fleet.params[:, effects.parameter_index(name)], drawn)
+    assert (info["vehicle"]["ground_effect.decay"] == 2.0).all()
+    assert (info["vehicle"]["gravity"] == LAMA["gravity"].value).all()
+    assert info["_vehicle"].all()
+
+
+def test_a_list_draws_each_vehicle_with_its_own_sensors_and_limits():
+    heavy = LAMA.with_effect("added_mass", mass=0.1).with_actuators(swash_travel=0.01)
+    heavy = heavy.with_sensor("h", bias=1.0, noise=0.0)
+    env = CoaxVectorEnv(600, randomize=[LAMA, heavy])
+    observations, info = env.reset(seed=0, options={"state": TRIM[0]})
+    is_heavy = info["vehicle"]["added_mass.mass"] == 0.1
+    assert abs(is_heavy.mean() - 0.5) < 0.1
+    height = observations[:, env.observation_names.index("h")]
+    assert np.allclose(height[is_heavy], 2.5) and (height[~is_heavy] < 2.0).all()
+    *_, info = env.step(np.tile([0.0, 0.0, 1.0, 0.0], (600, 1)))
+    assert np.allclose(info["state"][is_heavy, 18], 0.01)
+    assert np.allclose(info["state"][~is_heavy, 18], 0.2)
+
+
+def test_a_drawn_vehicle_flies_as_if_it_had_been_given():
+    ranges = {
+        "mass": (0.7, 0.9),
+        "rotor_drag.coefficient": (1e-4, 5e-4),
+        "motor_lag.upper": (0, 0.1),
+    }
+    env = CoaxEnv(randomize=ranges, nominal=LAMA, sensors="state")
+    _, info = env.reset(seed=3)
+    same = LAMA.with_values({"mass": info["vehicle"]["mass"]})
+    for name in list(ranges)[1:]:
+        effect, own = name.split(".")
+        same = same.with_effect(effect, **{own: info["vehicle"][name]})
+    twin = CoaxEnv(same, nominal=LAMA, sensors="state")
+    twin.reset(options={"state": info["state"]})
+    for action in actions(1, 50, 4):
+        ours, theirs = env.step(action), twin.step(action)
+        assert np.array_equal(ours[4]["state"], theirs[4]["state"])
+
+
+def test_the_spread_of_a_file_is_drawn_jointly():
+    joint = replace(
+        LAMA,
+        correlated=("mass", "arm_upper"),
+        correlation=np.array([[1.0, -0.9], [-0.9, 1.0]]),
+    )
+    env = CoaxVectorEnv(1500, joint, randomize="posterior")
+    drawn = env.reset(seed=0)[1]["vehicle"]
+    assert np.corrcoef(drawn["mass"], drawn["arm_upper"])[0, 1] == pytest.approx(-0.9, abs=0.03)
+    assert drawn["mass"].std() == pytest.approx(LAMA["mass"].std, rel=0.1)
+    assert (drawn["mass"] > 0.0).all() and (drawn["gravity"] == LAMA["gravity"].value).all()
+
+
+# --- rows -------------------------------------------------------------------------------------------
+
+WORLDS = {
+    "everything": {
+        "vehicle": EYED.with_effect("rotor_drag", coefficient=4e-4)
+        .with_effect("servo_delay", time=0.027)
+        .with_actuators(swash_travel=0.1, swash_rate=2.0),
+        "turbulence": 3.0, "wind": 2.0, "task": "waypoints", "sensors": "mocap",
+    },
+    "ranges": {"randomize": {"mass": (0.7, 0.9), "servo_delay.time": (0.0, 0.05)}},
+    "list": {
+        "randomize": [LAMA, EYED, "skybotix_coax"], "gusts": (0.1, 1e-3),
+        "sensors": "mocap", "task": "position",
+    },
+    "course": {
+        "task": "waypoints", "sensors": "state", "target": [(1, 1, 1.5, 0.3), (0, 0, 1, 0)],
+    },
+}  # fmt: skip
+
+
+def same(one: object, many: dict, name: str, row: int) -> bool:
+    """Whether a single env's info is what the batch's says of a row."""
+    if isinstance(one, dict):
+        return all(same(value, many[name], key, row) for key, value in one.items())
+    return bool(many[f"_{name}"][row]) and np.array_equal(one, many[name][row])
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_row_flies_as_a_single_env_in_any_world(world):
+    arguments, n, seed = WORLDS[world], 3, 5
+    rows = CoaxVectorEnv(n, max_episode_steps=70, **arguments)
+    singles = [gymnasium.make("CoaxHeli-v0", max_episode_steps=70, **arguments) for _ in range(n)]
+    observations, info = rows.reset(seed=seed)
+    for i, env in enumerate(singles):
+        observation, one = env.reset(seed=seed + i)
+        assert np.array_equal(observation, observations[i])
+        assert all(same(value, info, key, i) for key, value in one.items())
+    waiting, ends = np.zeros(n, dtype=bool), 0
+    for action in actions(1, 200, n, 4):
+        observations, rewards, terminated, truncated, info = rows.step(action)
+        for i, env in enumerate(singles):
+            fresh = waiting[i]
+            if fresh:
+                observation, one = env.reset()
+                reward, over, late = 0.0, False, False
+            else:
+                observation, reward, over, late, one = env.step(action[i])
+            assert np.array_equal(observation, observations[i])
+            assert observation in env.observation_space
+            assert (reward, over, late) == (rewards[i], terminated[i], truncated[i])
+            assert all(same(value, info, key, i) for key, value in one.items())
+            waiting[i] = over or late
+            ends += waiting[i]
+    assert ends >= 6
+
+
+def test_an_unlimited_bare_world_costs_no_memory():
+    fleet = CoaxVectorEnv(64).fleet
+    assert fleet.past.size == 0 and fleet.swash.shape[1] == 1 and len(fleet.params) == 1
+    arrays = (v for v in vars(fleet).values() if isinstance(v, np.ndarray) and len(v) == 64)
+    assert sum(array.nbytes for array in arrays) / 64 < 1000
+    assert len(tasks.TASKS["hover"].terms) == hover.N_TERMS
