@@ -32,7 +32,9 @@ KERNEL_SOURCES = (
     "hover.py",
     "tasks.py",
     "randomisation.py",
+    "period.py",
     "fleet.py",
+    "fleet_lanes.py",
     "engine/kalman.py",
 )
 

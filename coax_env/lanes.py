@@ -84,8 +84,6 @@ class WordsType(_Vector):
 LANES = LanesType("Lanes", ir.DoubleType())
 FLAGS = FlagsType("Flags", ir.IntType(1))
 WORDS = WordsType("Words", ir.IntType(64))
-ROW = types.Array(LANES, 1, "C", aligned=False)
-"""A row of lanes: what the kernel takes for a state, an input or a workspace."""
 
 
 @register_model(LanesType)
@@ -149,7 +147,7 @@ def _define(key: Any, kinds: tuple[_Vector, ...], result: types.Type, emit: Call
         return emit(builder, *values)
 
 
-def _called(name: str, *extra: Any) -> Callable:
+def _called(name: str) -> Callable:
     """Code that calls one of LLVM's own functions of lanes."""
 
     def emit(builder: Any, *values: Any) -> Any:
@@ -173,6 +171,8 @@ def _choose(sign: str) -> Callable:
 
 
 _TWO = (LANES, LANES)
+_fabs = _called("fabs")
+_INFINITE = ir.Constant(LANES.vector, [math.inf] * WIDTH)
 for _name, _emit in {
     "add": lambda b, x, y: b.fadd(x, y, flags=_LOOSE),
     "sub": lambda b, x, y: b.fsub(x, y, flags=_LOOSE),
@@ -188,14 +188,14 @@ for _name, _sign in {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "=="}.i
     )  # fmt: skip
 _define(operator.ne, _TWO, types.boolean, lambda b, x, y: _any(b, b.fcmp_unordered("!=", x, y)))
 _define(operator.neg, (LANES,), LANES, lambda b, x: b.fneg(x))
-_define(abs, (LANES,), LANES, _called("fabs"))
+_define(abs, (LANES,), LANES, _fabs)
 _define(max, _TWO, LANES, _choose(">"))
 _define(min, _TWO, LANES, _choose("<"))
 _define(math.sqrt, (LANES,), LANES, _called("sqrt"))
 _define(math.floor, (LANES,), LANES, _called("floor"))
+_define(math.isfinite, (LANES,), FLAGS, lambda b, x: b.fcmp_ordered("<", _fabs(b, x), _INFINITE))
 _define(operator.and_, (FLAGS, FLAGS), FLAGS, lambda b, x, y: b.and_(x, y))
 _define(operator.or_, (FLAGS, FLAGS), FLAGS, lambda b, x, y: b.or_(x, y))
-_define(operator.invert, (FLAGS,), FLAGS, lambda b, x: b.not_(x))
 
 for _name, _emit in {
     "add": lambda b, x, y: b.add(x, y),
@@ -215,12 +215,18 @@ def select(flag: Any, yes: Any, no: Any) -> Any:
     return yes if flag else no
 
 
+def negated(flag: Any) -> Any:
+    """Not a flag: of one helicopter or of each lane."""
+    return not flag
+
+
 def anywhere(flag: Any) -> Any:
     """Whether a flag is true in any lane."""
     return flag
 
 
 _define(select, (FLAGS, LANES, LANES), LANES, lambda b, c, x, y: b.select(c, x, y))
+_define(negated, (FLAGS,), FLAGS, lambda b, x: b.not_(x))
 _define(anywhere, (FLAGS,), types.boolean, _any)
 
 
@@ -229,6 +235,11 @@ def _select_one(flag, yes, no):
     if isinstance(flag, types.Boolean):
         return lambda flag, yes, no: yes if flag else no
     return None
+
+
+@overload(negated, jit_options=_INLINE)
+def _negated_one(flag):
+    return (lambda flag: not flag) if isinstance(flag, types.Boolean) else None
 
 
 @overload(anywhere, jit_options=_INLINE)
@@ -385,21 +396,29 @@ def _logarithm(x):
 # --- rows ------------------------------------------------------------------------------------------
 
 
-@intrinsic
-def lanes_of(typingctx: Any, array: Any) -> Any:
-    """A contiguous array (n, WIDTH) of doubles as n lanes: the same memory, which must outlive them."""
+def _view(kind: _Vector) -> Callable:
+    """`lanes_of` for one kind: a contiguous array (n, WIDTH) as n lanes, the same memory."""
+    row = types.Array(kind, 1, "C", aligned=False)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         source = make_array(sig.args[0])(context, builder, args[0])
-        rows = make_array(ROW)(context, builder)
-        shape = cgutils.unpack_tuple(builder, source.shape, 2)
+        rows = make_array(row)(context, builder)
+        count, _ = cgutils.unpack_tuple(builder, source.shape, 2)
         size = context.get_constant(types.intp, 8 * WIDTH)
-        populate_array(
-            rows,
-            data=builder.bitcast(source.data, LANES.vector.as_pointer()),
-            shape=[shape[0]], strides=[size], itemsize=size,
-            meminfo=None,
-        )  # fmt: skip
+        data = builder.bitcast(source.data, kind.vector.as_pointer())
+        populate_array(rows, data, shape=[count], strides=[size], itemsize=size, meminfo=None)
         return rows._getvalue()
 
-    return ROW(array), emit
+    return lambda typingctx, array: (row(array), emit)
+
+
+@intrinsic
+def lanes_of(typingctx, array):
+    """An array (n, WIDTH) of doubles, contiguous, as n `Lanes`: the same memory, not kept alive."""
+    return _view(LANES)(typingctx, array)
+
+
+@intrinsic
+def words_of(typingctx, array):
+    """An array (n, WIDTH) of 64-bit numbers, contiguous, as n `Words`: the same, not kept alive."""
+    return _view(WORDS)(typingctx, array)
