@@ -11,27 +11,9 @@ from coax_env import effects, hover, tasks
 from coax_env import parameters as P
 from coax_env.dynamics import WORK_SIZE, measure_bare, step_bare
 from coax_env.jit import compiled
-from coax_env.lanes import WIDTH, lanes_of, select, words_of
+from coax_env.lanes import WIDTH, gather, lanes_of, scatter, select, words_of
 from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
 from coax_env.period import DT, blow, command, read, seen, turned
-
-
-@compiled()
-def _gather(rows, which, out):
-    """The rows (count, n) of a group, which (WIDTH,), into the lanes (n, WIDTH)."""
-    for j in range(WIDTH):
-        row = which[j]
-        for k in range(len(out)):
-            out[k, j] = rows[row, k]
-
-
-@compiled()
-def _scatter(lanes, which, n, rows):
-    """The first `n` lanes of a group back into its rows."""
-    for j in range(n):
-        row = which[j]
-        for k in range(len(lanes)):
-            rows[row, k] = lanes[k, j]
 
 
 @compiled()
@@ -89,15 +71,15 @@ def _fly_of(own):
                     observations[i, k] = held[i, k]
         n, after = _next_group(first, last, active, which)
         while n > 0:
-            _gather(x, which, x_block)
-            _gather(actions, which, action_block)
-            _gather(asked, which, asked_block)
-            _gather(targets, which, target_block)
-            _gather(held, which, held_block)
-            _gather(bias, which, bias_block)
-            _gather(streams, which, stream_block)
+            gather(x, which, x_block)
+            gather(actions, which, action_block)
+            gather(asked, which, asked_block)
+            gather(targets, which, target_block)
+            gather(held, which, held_block)
+            gather(bias, which, bias_block)
+            gather(streams, which, stream_block)
             if own:
-                _gather(params, which, p_block)
+                gather(params, which, p_block)
             for j in range(WIDTH):
                 clock_block[0, j] = rows[which[j]]
                 clock_block[1, j] = azimuth[which[j]]
@@ -112,8 +94,8 @@ def _fly_of(own):
             u_[TIME] = clock_[0] * DT
             clock_[2] = hover.reward(x_, action_, target_, weights, scales, terms_)
             clock_[3] = select(hover.is_over(x_), 1.0, 0.0)
-            _scatter(x_block, which, n, x)
-            _scatter(term_block, which, n, terms)
+            scatter(x_block, which, n, x)
+            scatter(term_block, which, n, terms)
             for j in range(n):
                 row = which[j]
                 rows[row] = int(clock_block[0, j])
@@ -121,7 +103,7 @@ def _fly_of(own):
                 rewards[row] = clock_block[2, j]
                 over[row] = clock_block[3, j] != 0.0
             if dwell > 0:
-                _scatter(stream_block, which, n, streams)
+                scatter(stream_block, which, n, streams)
                 for j in range(n):
                     row = which[j]
                     if tasks.arrive(x[row], targets[row], dwell, progress[row], course):
@@ -130,20 +112,19 @@ def _fly_of(own):
                         tasks.aim(
                             streams[row], course, box, progress[row, tasks.REACHED], targets[row]
                         )
-                _gather(targets, which, target_block)
-                _gather(streams, which, stream_block)
+                gather(targets, which, target_block)
+                gather(streams, which, stream_block)
 
             measure_bare(x_, u_, p, work, readings_)
             seen(x_, readings_, sensors, values_)
             read(values_, clock_[0], sensors, bias_, stream_, aim - n_sensors, held_)
             if len(places) > 0:
                 tasks.point(held_, places, height_sign, target_, held_[aim:])
-            _scatter(u_block, which, n, u)
-            _scatter(action_block, which, n, actions)
-            _scatter(asked_block, which, n, asked)
-            _scatter(held_block, which, n, held)
-            _scatter(held_block, which, n, observations)
-            _scatter(stream_block, which, n, streams)
+            scatter(u_block, which, n, u)
+            scatter(asked_block, which, n, asked)
+            scatter(held_block, which, n, held)
+            scatter(held_block, which, n, observations)
+            scatter(stream_block, which, n, streams)
             n, after = _next_group(after, last, active, which)
 
     return compiled()(fly)

@@ -34,8 +34,12 @@ from numba.extending import (
 )
 from numba.np.arrayobj import make_array, populate_array
 
+from coax_env.jit import compiled
+
 WIDTH = 8
-"""Helicopters in one group: the doubles of an AVX2 register."""
+"""Helicopters in one group, a multiple of four: the doubles of two AVX2 registers."""
+
+_I32 = ir.IntType(32)
 
 _LOOSE = ("contract", "arcp")  # products and sums fused, divisions by one divisor shared
 _INLINE = {"forceinline": True}
@@ -97,12 +101,12 @@ class _VectorModel(models.PrimitiveModel):
 def _splat(builder: Any, value: Any) -> Any:
     vector = ir.VectorType(value.type, WIDTH)
     first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, _index(0))
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+    zeros = ir.Constant(ir.VectorType(_I32, WIDTH), [0] * WIDTH)
     return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
 
 
 def _index(i: int) -> Any:
-    return ir.Constant(ir.IntType(32), i)
+    return ir.Constant(_I32, i)
 
 
 @lower_cast(types.Float, LanesType)
@@ -422,3 +426,83 @@ def lanes_of(typingctx, array):
 def words_of(typingctx, array):
     """An array (n, WIDTH) of 64-bit numbers, contiguous, as n `Words`: the same, not kept alive."""
     return _view(WORDS)(typingctx, array)
+
+
+def _four_by_four(builder: Any, rows: list) -> list:
+    """Four vectors of four, transposed."""
+
+    def mixed(a: Any, b: Any, places: list[int]) -> Any:
+        return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, 4), places))
+
+    low = [mixed(rows[i], rows[i + 1], [0, 4, 2, 6]) for i in (0, 2)]
+    high = [mixed(rows[i], rows[i + 1], [1, 5, 3, 7]) for i in (0, 2)]
+    return [mixed(*pair, half) for half in ([0, 1, 4, 5], [2, 3, 6, 7]) for pair in (low, high)]
+
+
+@intrinsic
+def _transpose(typingctx, source, places, target, targets):
+    """Four times four numbers at these places of a flat array, transposed to those of another."""
+    signature_ = types.void(source, places, target, targets)
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        def at(array: Any, kind: Any, place: Any) -> Any:
+            pointer = builder.gep(make_array(kind)(context, builder, array).data, [place])
+            element = context.get_value_type(kind.dtype)
+            return builder.bitcast(pointer, ir.VectorType(element, 4).as_pointer())
+
+        size = {t: t.bitwidth // 8 for t in (source.dtype, target.dtype)}
+        found = [
+            builder.load(at(args[0], source, place), align=size[source.dtype])
+            for place in cgutils.unpack_tuple(builder, args[1], 4)
+        ]
+        found = _four_by_four(builder, found)
+        if target.dtype != source.dtype:
+            narrow = ir.VectorType(context.get_value_type(target.dtype), 4)
+            found = [builder.fptrunc(row, narrow) for row in found]
+        for row, place in zip(found, cgutils.unpack_tuple(builder, args[3], 4), strict=True):
+            builder.store(row, at(args[2], target, place), align=size[target.dtype])
+        return context.get_dummy_value()
+
+    return signature_, emit
+
+
+@compiled()
+def gather(rows, which, lanes):
+    """A group's rows, `which` (WIDTH,) of `rows` (count, >= n), into the lanes (n, WIDTH)."""
+    n, stride = len(lanes), rows.shape[1]
+    if n < 4:
+        for j in range(WIDTH):
+            for k in range(n):
+                lanes[k, j] = rows[which[j], k]
+        return
+    for j in range(0, WIDTH, 4):
+        a, b, c, d = (which[j] * stride, which[j + 1] * stride, which[j + 2] * stride,
+                      which[j + 3] * stride)  # fmt: skip
+        for i in range(0, n, 4):
+            k = min(i, n - 4)  # the last four columns may overlap those before
+            to = k * WIDTH + j
+            _transpose(
+                rows, (a + k, b + k, c + k, d + k),
+                lanes, (to, to + WIDTH, to + 2 * WIDTH, to + 3 * WIDTH),
+            )  # fmt: skip
+
+
+@compiled()
+def scatter(lanes, which, some, rows):
+    """The first `some` lanes of (n, WIDTH) back into their rows, `which` (WIDTH,) of (count, >= n)."""
+    n, stride = len(lanes), rows.shape[1]
+    if some < WIDTH or n < 4:
+        for j in range(some):
+            for k in range(n):
+                rows[which[j], k] = lanes[k, j]
+        return
+    for j in range(0, WIDTH, 4):
+        a, b, c, d = (which[j] * stride, which[j + 1] * stride, which[j + 2] * stride,
+                      which[j + 3] * stride)  # fmt: skip
+        for i in range(0, n, 4):
+            k = min(i, n - 4)
+            to = k * WIDTH + j
+            _transpose(
+                lanes, (to, to + WIDTH, to + 2 * WIDTH, to + 3 * WIDTH),
+                rows, (a + k, b + k, c + k, d + k),
+            )  # fmt: skip

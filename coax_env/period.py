@@ -76,13 +76,17 @@ def read(values, row, sensors, bias, stream, flags, held):
         held[k] = 0.0
     noisy = 0
     pair = -1
+    rate = -1.0
+    due = row < 0
     first = second = 0.0 * row
     for k in range(n):
         noise = sensors[k, NOISE]
         place = noisy // 2
         even = noisy % 2 == 0
         noisy += noise > 0.0
-        due = is_new(row, sensors[k, RATE])
+        if sensors[k, RATE] != rate:
+            rate = sensors[k, RATE]
+            due = is_new(row, rate)
         if not anywhere(due):
             continue
         value = values[k] + bias[k]
@@ -93,12 +97,13 @@ def read(values, row, sensors, bias, stream, flags, held):
             value += noise * (first if even else second)
         if sensors[k, WRAPS] != 0.0:
             value -= _TURN * math.floor((value + math.pi) / _TURN)
+        here = due
         if sensors[k, DROPOUT] > 0.0:
             chance = chance_of(bits_ahead(stream, n + int(sensors[k, INSTRUMENT])))
-            due = due & ((row <= 0) | (chance >= sensors[k, DROPOUT]))
+            here = due & ((row <= 0) | (chance >= sensors[k, DROPOUT]))
         kept = min(max(value, sensors[k, LOW]), sensors[k, HIGH])
-        held[k] = select(due & math.isfinite(value), kept, held[k])
+        held[k] = select(here & math.isfinite(value), kept, held[k])
         flag = int(sensors[k, FLAG])
         if flag >= 0:
-            held[flag] = select(due, 1.0, held[flag])
+            held[flag] = select(here, 1.0, held[flag])
     skip(stream, 2 * n)
