@@ -146,7 +146,8 @@ def _fly_rows(
             continue
         p = params[i] if many else params[0]
         kind = kinds[i]
-        command(actions[i], trim, scale, limits[kind], asked[i], u[i])
+        command(actions[i], trim, scale, u[i])
+        limit(u[i], asked[i], limits[kind], DT)
         slots = swash.shape[1]
         at = rows[i] % slots
         swash[i, at, 0], swash[i, at, 1] = u[i, 2], u[i, 3]

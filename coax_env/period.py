@@ -8,7 +8,6 @@ import math
 
 from coax_env import hover
 from coax_env import parameters as P
-from coax_env.actuators import limit
 from coax_env.jit import compiled
 from coax_env.lanes import anywhere, select
 from coax_env.layout import N_CHANNELS
@@ -26,14 +25,13 @@ _TURN = 2.0 * math.pi
 
 
 @compiled()
-def command(action, trim, scale, limits, asked, u):
-    """An action (4,), clipped in place to [-1, 1], as commands within their limits, into `u`."""
+def command(action, trim, scale, u):
+    """An action (4,), clipped in place to [-1, 1], as commands into `u`."""
     for k in range(4):
         a = action[k]
         a = select(a < -1.0, -1.0, a)
         action[k] = select(a > 1.0, 1.0, a)  # NaN stays
         u[k] = trim[k] + scale[k] * action[k]
-    limit(u, asked, limits, DT)
 
 
 @compiled()
