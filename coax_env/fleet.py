@@ -323,12 +323,18 @@ class Fleet:
         """Give a row the stream of a seed, from its beginning."""
         self.streams[row] = stream_key(np.uint64(seed & 0xFFFFFFFFFFFFFFFF)), 0
 
-    def restart(self, which: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
+    def restart(
+        self,
+        which: np.ndarray,
+        states: np.ndarray | None = None,
+        observations: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Start new flights in the rows of a mask and return all observations, float32.
 
         Args:
             which: bool, shape (count,).
             states: paper or full states to start from, (count, 16 or 26); random when None.
+            observations: where to put the rows' observations, (count, n_observed).
         """
         if self.draws.random:
             streams = self.streams[which]
@@ -345,7 +351,8 @@ class Fleet:
             x[:, 16:20] = self.trim
             x[:, : states.shape[-1]] = states
             self.x[which] = x[which]
-        observations = self.held.astype(np.float32)
+        if observations is None:
+            observations = self.held.astype(np.float32)
         _restart_rows(
             which, states is not None, self.trim, self.params, self.kinds, self._table, self._limits,
             self._wind_speed, self._turbulence,
