@@ -396,10 +396,7 @@ class Fleet:
                 self.held, *results,
             )  # fmt: skip
 
-        if self._threads == 1:
-            rows(0, n)
-        else:
-            _in_threads(rows, n, self._threads)
+        in_threads(rows, n, self._threads)
         return outcome
 
     def _side_by_side(self) -> bool:
@@ -499,8 +496,11 @@ def _wind(wind: float | Sequence[float] | None) -> tuple[np.ndarray, float]:
 _POOLS: dict[tuple[int, int], ThreadPoolExecutor] = {}
 
 
-def _in_threads(function: Callable[[int, int], None], count: int, threads: int) -> None:
+def in_threads(function: Callable[[int, int], None], count: int, threads: int) -> None:
     """Call function(first, last) on equal shares; the compiled kernel lets other threads run."""
+    if threads == 1:
+        function(0, count)
+        return
     key = (os.getpid(), threads)  # a forked child has no threads of its parent
     if key not in _POOLS:
         _POOLS[key] = ThreadPoolExecutor(threads)

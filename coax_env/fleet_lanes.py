@@ -11,10 +11,13 @@ from coax_env import effects, hover, tasks
 from coax_env import parameters as P
 from coax_env.actuators import limit
 from coax_env.dynamics import WORK_SIZE, measure_bare, step_bare
+from coax_env.errors import InputError
+from coax_env.fleet import STAGES, in_threads
 from coax_env.jit import compiled
 from coax_env.lanes import WIDTH, gather, lanes_of, scatter, select, words_of
 from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
 from coax_env.period import BIAS, BIAS_STD, DT, blow, command, read, seen, turned
+from coax_env.vehicle import Vehicle
 
 CHUNK = 64
 """Rows that are flown, and then sense: the code of either stays at hand for some groups."""
@@ -53,7 +56,11 @@ def _step_of(own):
         stream_block, work_block = np.empty((2, WIDTH), np.uint64), np.empty((WORK_SIZE, WIDTH))
         row_block = np.empty((_N_SINGLES, WIDTH))
         x_, u_, action_ = lanes_of(x_block), lanes_of(u_block), lanes_of(action_block)
-        asked_, target_, terms_ = lanes_of(asked_block), lanes_of(target_block), lanes_of(term_block)
+        asked_, target_, terms_ = (
+            lanes_of(asked_block),
+            lanes_of(target_block),
+            lanes_of(term_block),
+        )
         single_, work, stream_ = lanes_of(row_block), lanes_of(work_block), words_of(stream_block)
         if own:
             p_block = np.empty((_N_PARAMETERS, WIDTH))
@@ -208,3 +215,31 @@ def _fly_of(own):
 
 fly_shared = _fly_of(False)
 fly_own = _fly_of(True)
+
+
+@compiled()
+def _dynamics_rows(first, last, x, u, p):
+    which, active = np.empty(WIDTH, np.int64), np.ones(len(x), np.bool_)
+    x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
+    work_block = np.empty((WORK_SIZE, WIDTH))
+    x_, u_, work = lanes_of(x_block), lanes_of(u_block), lanes_of(work_block)
+    n, after = _next_group(first, last, active, which)
+    while n > 0:
+        gather(x, which, x_block)
+        gather(u, which, u_block)
+        step_bare(x_, u_, DT, p, work, x_)
+        scatter(x_block, which, n, x)
+        n, after = _next_group(after, last, active, which)
+
+
+def fly_dynamics(x: np.ndarray, u: np.ndarray, vehicle: Vehicle, threads: int = 1) -> None:
+    """The dynamics alone, of one vehicle without effects, over one control period and in place.
+
+    No sensors, no task, no ends: what the env's speed is measured against.
+
+    Args:
+        x: full states, (count, 26). u: commands and time, (count, 5).
+    """
+    if vehicle.vector[STAGES].any():
+        raise InputError(f"vehicle {vehicle.name!r} has effects: lanes are for those without")
+    in_threads(lambda a, b: _dynamics_rows(a, b, x, u, vehicle.vector), len(x), threads)

@@ -5,9 +5,10 @@ arrays of `Lanes` (one double per helicopter) instead of arrays of doubles, beco
 helicopters with one instruction: one physics, two machine codes. What `dynamics.step` needs of a number
 is defined here for `Lanes`: arithmetic, comparison and the functions of `math`.
 
-Three types: `Lanes`, WIDTH doubles; `Flags`, WIDTH truths, what comparing lanes gives; `Words`, WIDTH
-unsigned 64-bit numbers. Where helicopters differ there is no branch but `select`; a branch on flags does
-not compile. ``!=`` alone gives one truth, whether any lane differs: it asks whether an effect is on.
+Three types: `Lanes`, WIDTH doubles; `Flags`, WIDTH truths, what comparing lanes gives; `Words`,
+WIDTH unsigned 64-bit numbers. Where helicopters differ there is no branch but `select`; a branch on
+flags does not compile. ``!=`` alone gives one truth, whether any lane differs: it asks whether an
+effect is on.
 
 Products and sums may be fused, so lanes agree with the scalar kernel to rounding, not to the bit.
 """
@@ -269,7 +270,11 @@ def sine_and_cosine(x):
 
 @overload(sine_and_cosine, jit_options=_INLINE)
 def _sine_and_cosine_of(x):
-    return (lambda x: _lanes_sine_and_cosine(x)) if x == LANES else lambda x: (math.sin(x), math.cos(x))
+    return (
+        (lambda x: _lanes_sine_and_cosine(x))
+        if x == LANES
+        else lambda x: (math.sin(x), math.cos(x))
+    )
 
 
 @numba.njit(error_model="numpy", **_INLINE)
@@ -371,10 +376,13 @@ def _exponential(x):
 
 @overload(math.log, jit_options=_INLINE)
 def _logarithm(x):
-    """Natural logarithm of positive normal numbers, to 2e-16 (Cephes, Moshier 1989); NaN at others."""
+    """Natural logarithm of positive normal numbers, to 3e-16 (Cephes, Moshier 1989).
+
+    NaN at what is not positive.
+    """
 
     def logarithm(x):
-        bits = _bits(select(x > 0.0, x, math.nan))
+        bits = _bits(x)
         exponent = float(bits >> _EXPONENT) - 1022.0
         m = _from_bits((bits & _MANTISSA) | _HALF)
         low = m < math.sqrt(0.5)
@@ -392,7 +400,7 @@ def _logarithm(x):
         b = b * r + 7.11544750618563894466e1
         b = b * r + 2.31251620126765340583e1
         y = r * z * a / b - exponent * 2.121944400546905827679e-4 - 0.5 * z
-        return (r + y) + exponent * 0.693359375
+        return select(x > 0.0, (r + y) + exponent * 0.693359375, math.nan)
 
     return logarithm if x == LANES else None
 
@@ -436,7 +444,11 @@ def _four_by_four(builder: Any, rows: list) -> list:
 
     low = [mixed(rows[i], rows[i + 1], [0, 4, 2, 6]) for i in (0, 2)]
     high = [mixed(rows[i], rows[i + 1], [1, 5, 3, 7]) for i in (0, 2)]
-    return [mixed(*pair, half) for half in ([0, 1, 4, 5], [2, 3, 6, 7]) for pair in (low, high)]
+    return [
+        mixed(pair[0], pair[1], half)
+        for half in ([0, 1, 4, 5], [2, 3, 6, 7])
+        for pair in (low, high)
+    ]
 
 
 @intrinsic
