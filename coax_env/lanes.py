@@ -23,6 +23,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.imputils import impl_ret_borrowed
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, Signature, infer_global, signature
 from numba.extending import (
@@ -418,21 +419,23 @@ def _view(kind: _Vector) -> Callable:
         count, _ = cgutils.unpack_tuple(builder, source.shape, 2)
         size = context.get_constant(types.intp, 8 * WIDTH)
         data = builder.bitcast(source.data, kind.vector.as_pointer())
-        populate_array(rows, data, shape=[count], strides=[size], itemsize=size, meminfo=None)
-        return rows._getvalue()
+        populate_array(
+            rows, data, shape=[count], strides=[size], itemsize=size, meminfo=source.meminfo
+        )  # fmt: skip
+        return impl_ret_borrowed(context, builder, row, rows._getvalue())
 
     return lambda typingctx, array: (row(array), emit)
 
 
 @intrinsic
 def lanes_of(typingctx, array):
-    """An array (n, WIDTH) of doubles, contiguous, as n `Lanes`: the same memory, not kept alive."""
+    """An array (n, WIDTH) of doubles, contiguous, as n `Lanes`, the same memory."""
     return _view(LANES)(typingctx, array)
 
 
 @intrinsic
 def words_of(typingctx, array):
-    """An array (n, WIDTH) of 64-bit numbers, contiguous, as n `Words`: the same, not kept alive."""
+    """An array (n, WIDTH) of 64-bit numbers, contiguous, as n `Words`, the same memory."""
     return _view(WORDS)(typingctx, array)
 
 
