@@ -11,8 +11,10 @@ named by the caller, ``rpm_upper_cmd = actuator_outputs.output[0] * 2.1 - 1800``
 motor controllers report are found without.
 """
 
+import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -117,7 +119,8 @@ def import_log(
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: a log ends in {', '.join(readers)}, found {path.suffix!r}")
     read, table = readers[path.suffix.lower()]
-    signals = read(path)
+    with _silence():
+        signals = read(path)
     channels = channels_of(signals, table, take or {}, path)
     begin = min(t[0] for t, _ in channels.values())
     channels = {name: (t - begin, values) for name, (t, values) in channels.items()}
@@ -210,6 +213,22 @@ def _binned(signal: Signal, t: np.ndarray, step: float, last: bool) -> np.ndarra
     total = np.bincount(row, values, minlength=len(t))
     column[count > 0] = total[count > 0] / count[count > 0]
     return column
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Without what the readers, compiled parts included, say on stdout and stderr by themselves."""
+    saved = [os.dup(stream) for stream in (1, 2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        for stream, own in zip((1, 2), saved, strict=True):
+            os.dup2(own, stream)
+            os.close(own)
+        os.close(nowhere)
 
 
 # --- readers ------------------------------------------------------------------------------------------

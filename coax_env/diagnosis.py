@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import effects, next_maneuver, unlisted, vibration
+from coax_env import closed_loop, effects, next_maneuver, unlisted, vibration
 from coax_env.calibration import false_alarm_rate
 from coax_env.engine.fit import Engine, RunPass, part
 from coax_env.engine.model import FreeParameter, Noise, Record
@@ -105,7 +105,7 @@ def diagnose(
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
     remarks = list(flight.notes) + double_counting(flight, vehicle)
     model = HeliModel(vehicle)
-    candidates = _candidates(exclude, vehicle, flight)
+    candidates = namable(exclude, vehicle, flight)
     for name in hold_out or ():
         flight.run(name)
     if hold_out and set(hold_out) == set(flight.run_names):
@@ -134,6 +134,7 @@ def diagnose(
     )
     state, quadratic, terms = unlisted.explain(search, state, quadratic)
     say("weighing the causes against their look-alikes")
+    closed_loop.listen(search, state)
     state, quadratic, weights = search.prune(state)
     passes_after = engine.filter(state.values, state.noise)
     white_before = whiteness(passes_before, CHANNELS)
@@ -199,7 +200,7 @@ def diagnose(
 # --- what to fit on ---------------------------------------------------------------------------------
 
 
-def _candidates(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:
+def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:
     """Effects that may be named: not excluded, not in the vehicle yet, and with their sensor aboard."""
     for name in exclude:
         if name not in effects.CATALOGUE:
@@ -418,7 +419,7 @@ def _design(
     say("designing the next maneuver")
     alternatives = []
     for name, refit in {tied: state, **ties[tied]}.items():
-        free = search.free(refit.active)
+        free = search.free_of_vehicle(refit.active)
         i = quadratic.index([f.name for f in free])
         alternatives.append(
             next_maneuver.Alternative.of(
@@ -523,9 +524,13 @@ def _extended(
 ) -> Vehicle:
     """The vehicle with the causes in it, refitted on all runs."""
     engine = Engine(model, records)
-    free = search.free(state.active)
-    estimate = engine.fit(free, state.values, state.noise, iterations=3, tolerance=0.5)
+    if any(record.news is not None for record in search.engine.records):
+        closed_loop.attach_news(engine, state)
+    loose = search.free(state.active)
+    estimate = engine.fit(loose, state.values, state.noise, iterations=3, tolerance=0.5)
     dt = median_step(records)
+    free = search.free_of_vehicle(state.active)
+    own = [loose.index(f) for f in free]
 
     def std(f: FreeParameter) -> float:
         colour = colours.get(f.name.partition(".")[0], 1.0)
@@ -536,7 +541,7 @@ def _extended(
         free,
         estimate.values,
         {f.name: std(f) for f in free},
-        estimate.covariance,
+        estimate.covariance[np.ix_(own, own)],
         _diagnosed(flight),
         flight,
     )

@@ -16,22 +16,25 @@ exactly over the step. A reading at a row is taken just after the row's command 
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import float64, types
 
 from coax_env import effects
 from coax_env import flow as F
 from coax_env import parameters as P
 from coax_env.errors import InputError
-from coax_env.jit import compiled, pointer
+from coax_env.jit import compiled
 from coax_env.lanes import anywhere, select, sine_and_cosine
+from coax_env.late import late
 from coax_env.layout import CHANNELS, N_CHANNELS, N_COMMANDS, N_FULL, N_INPUTS, N_STATES, TIME
 from coax_env.vehicle import Vehicle, load_vehicle
 
 READING_DELAY = 1e-4  # [s] after the command of the same row
 LONGEST_STEP = 0.02  # [s] a longer row is split
+NEWTON_STEPS = 12
+BALANCED = 1e-11  # [m/s2, rad/s2] left over at a hover
 SHORTEST_LAG = 1e-9  # [s] below it exp(-READING_DELAY/lag) is zero: the command itself
 
 _air_effects = effects.stage_function(effects.AIR)
@@ -39,8 +42,21 @@ _swash_effects = effects.stage_function(effects.SWASH)
 _rotor_effects = effects.stage_function(effects.ROTOR)
 _load_effects = effects.stage_function(effects.LOAD)
 _unlisted_terms = effects.stage_function(effects.UNLISTED)
-_sensor_effects = effects.stage_function(effects.SENSOR)
-_property_effects = effects.stage_function(effects.PROPERTY)
+_every_sensor_effect = effects.stage_function(effects.SENSOR)
+_every_property_effect = effects.stage_function(effects.PROPERTY)
+
+
+@late
+def _sensor_effects(x, f, p):
+    """The SENSOR effects of the catalogue."""
+    _every_sensor_effect(x, f, p)
+
+
+@late
+def _property_effects(x, f, p):
+    """The PROPERTY effects of the catalogue."""
+    _every_property_effect(x, f, p)
+
 
 WORK_SIZE = F.N_FLOW + N_FULL + 2 * N_STATES
 """Doubles of scratch that `step` and `measure` need."""
@@ -208,11 +224,11 @@ def _rates_of(with_effects):
         dx[14] = forward * sin_psi + right * cos_psi
         dx[15] = -u_ * sin_theta + (v_ * sin_phi + w_ * cos_phi) * cos_theta
 
-    return compiled(forceinline=not with_effects)(rates)
+    return rates
 
 
-_rates_with_effects = _rates_of(True)
-_rates_bare = _rates_of(False)
+_rates_with_effects = late(_rates_of(True))
+_rates_bare = compiled(forceinline=True)(_rates_of(False))
 
 
 @compiled()
@@ -367,30 +383,7 @@ measure = _measure_of(True)
 measure_bare = _measure_of(False)
 
 
-_A = float64[::1]
-STEP = types.void(_A, _A, float64, _A, _A, _A)
-MEASURE = types.void(_A, _A, _A, _A, _A)
-
-
-@pointer(STEP)
-def step_pointer(x, u, dt, p, work, out):
-    """`step`, in the form in which the engine takes a model."""
-    step(x, u, dt, p, work, out)
-
-
-@pointer(MEASURE)
-def measure_pointer(x, u, p, work, out):
-    """`measure`, in the form in which the engine takes a model."""
-    measure(x, u, p, work, out)
-
-
-@pointer(STEP)
-def drift_pointer(x, u, dt, p, work, out):
-    """`drift`, in the form in which the engine takes a model."""
-    drift(x, u, dt, p, work, out)
-
-
-@compiled(types.void(_A, _A, _A, _A, _A))
+@compiled()
 def _full_derivative(x, u, p, work, dx):
     """Rates of the full state at held input, lags as first-order states."""
     f = work[: F.N_FLOW]
@@ -487,8 +480,6 @@ def hover_trim(vehicle: Vehicle | str, height: float = 1.5) -> tuple[np.ndarray,
     Raises:
         InputError: where the vehicle cannot hover.
     """
-    from scipy.optimize import least_squares
-
     vehicle = load_vehicle(vehicle)
     values = vehicle.values()
     k_T = values["air_density"] * math.pi * values["rotor_radius"] ** 4
@@ -509,9 +500,29 @@ def hover_trim(vehicle: Vehicle | str, height: float = 1.5) -> tuple[np.ndarray,
         state, command = unpack(z)
         return derivative(state, command, vehicle)[:8]
 
-    start = np.array([1.0, ratio, 0, 0, 0, 0, 0, 0])
-    found = least_squares(residual, start, xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    state, command = unpack(found.x)
-    if np.abs(found.fun).max() > 1e-6 or command[:2].min() <= 0.0:
+    found = _balance(residual, np.array([1.0, ratio, 0, 0, 0, 0, 0, 0]))
+    state, command = unpack(found)
+    if np.abs(residual(found)).max() > 1e-6 or command[:2].min() <= 0.0:
         raise InputError(f"vehicle {vehicle.name!r} has no hover: its forces do not balance")
     return state, command
+
+
+def _balance(residual: Callable[[np.ndarray], np.ndarray], start: np.ndarray) -> np.ndarray:
+    """Where as many residuals as unknowns vanish, or come nearest to it.
+
+    Newton's method; least squares where that does not arrive, as near a stage's kink. SciPy alone
+    would do, but to import its optimisers takes longer than all else that an env needs.
+    """
+    z = start.copy()
+    step = 1e-6 * np.eye(start.size)
+    for _ in range(NEWTON_STEPS):
+        slope = np.array([residual(z + d) - residual(z - d) for d in step]).T / 2e-6
+        try:
+            z = z - np.linalg.solve(slope, residual(z))
+        except np.linalg.LinAlgError:
+            break
+        if np.abs(residual(z)).max() < BALANCED:
+            return z
+    from scipy.optimize import least_squares
+
+    return least_squares(residual, start, xtol=1e-15, ftol=1e-15, gtol=1e-15).x

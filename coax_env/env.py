@@ -1,14 +1,13 @@
-"""CoaxHeli-v0: the hover task for Gymnasium, one helicopter or many.
+"""CoaxHeli-v0: a small coaxial helicopter for Gymnasium, one or many.
 
 Both envs are thin shells over the same batch kernel (fleet.py); `CoaxEnv` is a fleet of one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -17,6 +16,7 @@ from coax_env.errors import InputError
 from coax_env.fleet import Fleet, Nominal
 from coax_env.layout import N_FULL, N_STATES
 from coax_env.randomisation import Randomize
+from coax_env.spaces import action_space, observation_space, observed
 from coax_env.vehicle import Vehicle
 
 _FPS = round(1.0 / hover.CONTROL_PERIOD)
@@ -24,74 +24,122 @@ _ALL = np.ones(1, dtype=np.bool_)
 
 
 class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Hover a micro coaxial helicopter on its own noisy sensors.
+    """Fly a micro coaxial helicopter on its own noisy sensors: hover, hold a place, follow waypoints.
 
     ## Description
-    The nonlinear model of Huynh et al. (2012), eqs (1)-(44), with whatever effects the vehicle file
-    has, at a control rate of 100 Hz. The machine shall stay at 1.5 m over its start, heading north.
+    The nonlinear model of Huynh et al. (2012), eqs (1)-(44), with whatever effects, sensors and
+    limits of actuators the vehicle file has, at a control rate of 100 Hz. ``task="hover"``: stay at
+    1.5 m over the start, heading north. ``"position"``: go to a position and a heading, and stay
+    there. ``"waypoints"``: one after the other, each reached once the machine has been within 0.3 m
+    and 15 deg of it for 0.5 s; the last of a list is held.
 
     ## Action Space
     ``Box(-1, 1, (4,), float32)``, about the hover trim of the *nominal* vehicle; larger actions are
-    clipped. Servo and rotor rates are limited only where the vehicle has `servo_lag`, `motor_lag`.
+    clipped.
 
-    | number | action | -1 .. 1 |
-    |---|---|---|
-    | 0 | speed of the upper rotor | trim -15 % .. trim +15 % |
-    | 1 | speed of the lower rotor | trim -15 % .. trim +15 % |
-    | 2 | swash tilt, longitudinal (positive tilts the thrust back) | trim -0.2 .. trim +0.2 rad |
-    | 3 | swash tilt, lateral (positive tilts the thrust right) | trim -0.2 .. trim +0.2 rad |
+    | number | command | meaning | -1 .. 1 |
+    |---|---|---|---|
+    | 0 | omega_u | speed of the upper rotor | trim -+ 15 % |
+    | 1 | omega_l | speed of the lower rotor | trim -+ 15 % |
+    | 2 | delta_lon | swash tilt, positive tilts the thrust back | trim -+ 0.2 rad |
+    | 3 | delta_lat | swash tilt, positive tilts the thrust right | trim -+ 0.2 rad |
+
+    Rotors and swash plate follow at once but for what the vehicle file has: the effects
+    `motor_lag`, `servo_lag`, `servo_delay` and `battery_sag`, and ``[actuators]``, limits of
+    travel, speed and rates.
 
     ## Observation Space
-    ``Box(low, high, (n,), float32)``, SI units and rev/min, with the bounds of `coax_env.sensors`.
-    ``env.unwrapped.observation_names`` names every entry. ``onboard``, n = 18:
+    ``Box(low, high, (n,), float32)``; ``observation_names`` and ``observation_units`` say what
+    every entry is; noise is a std. ``sensors="onboard"``, n = 18:
 
-    | numbers | reading | noise | rate |
-    |---|---|---|---|
-    | 0-1 | rpm_upper, rpm_lower | 2 rev/min | 100 Hz |
-    | 2-4 | p, q, r | 2 deg/s | 100 Hz |
-    | 5-7 | ax, ay, az | 0.1 m/s2 | 100 Hz |
-    | 8-10 | phi, theta, psi (wrapped) | 0.5 deg | 40 Hz |
-    | 11 | h | 0.05 m | 20 Hz |
-    | 12-14 | vn, ve, vd | 0.2 m/s | 10 Hz |
-    | 15-17 | compass, sonar, velocity: 1 where new, else the last value is held | | |
+    | number | entry | unit | low | high | noise | rate |
+    |---|---|---|---|---|---|---|
+    | 0 | rpm_upper | rev/min | 0 | 4000 | 2 | 100 Hz |
+    | 1 | rpm_lower | rev/min | 0 | 4000 | 2 | 100 Hz |
+    | 2 | p | rad/s | -8.727 | 8.727 | 0.0349 | 100 Hz |
+    | 3 | q | rad/s | -8.727 | 8.727 | 0.0349 | 100 Hz |
+    | 4 | r | rad/s | -8.727 | 8.727 | 0.0349 | 100 Hz |
+    | 5 | ax | m/s2 | -58.84 | 58.84 | 0.1 | 100 Hz |
+    | 6 | ay | m/s2 | -58.84 | 58.84 | 0.1 | 100 Hz |
+    | 7 | az | m/s2 | -58.84 | 58.84 | 0.1 | 100 Hz |
+    | 8 | phi | rad | -3.142 | 3.142 | 0.00873 | 40 Hz |
+    | 9 | theta | rad | -1.571 | 1.571 | 0.00873 | 40 Hz |
+    | 10 | psi | rad | -3.142 | 3.142 | 0.00873 | 40 Hz |
+    | 11 | h | m | 0.15 | 6.5 | 0.05 | 20 Hz |
+    | 12 | vn | m/s | -30 | 30 | 0.2 | 10 Hz |
+    | 13 | ve | m/s | -30 | 30 | 0.2 | 10 Hz |
+    | 14 | vd | m/s | -30 | 30 | 0.2 | 10 Hz |
+    | 15 | new_compass | 1 | 0 | 1 |  |  |
+    | 16 | new_sonar | 1 | 0 | 1 |  |  |
+    | 17 | new_velocity | 1 | 0 | 1 |  |  |
 
+    An instrument slower than 100 Hz holds its last value, and has a flag that is 1 where it is new.
     ``paper``: p q r ax ay az h v, all at 100 Hz. ``mocap``: ``onboard`` with pn, pe (2 mm, 100 Hz)
-    before the flags. ``state``: the sixteen states, rotor speeds and swash tilt, exact. The
-    previous action is not observed: whoever gave it knows it.
+    before the flags. ``state``: the sixteen states, rotor speeds and swash tilt, exact. What the
+    vehicle file says under ``[sensors]`` takes the place of the suite's numbers (not in ``state``):
+    noise, bias (its std: drawn for every flight), rate, delay, limits, and dropout, the share of
+    lost samples, as of a sonar's echoes: the last value is held, and its flag is 0. The previous
+    action is not observed: whoever gave it knows it.
+
+    ``position`` and ``waypoints`` append the way to the target as the readings tell it, in the
+    heading's axes; they need ``mocap`` or ``state``, and other sensors are an InputError. With
+    ``mocap``:
+
+    | 20 | target_forward | m | -50 | 50 |  |  |
+    | 21 | target_right | m | -50 | 50 |  |  |
+    | 22 | target_up | m | -10 | 10 |  |  |
+    | 23 | heading_error | rad | -3.142 | 3.142 |  |  |
 
     ## Rewards
-    A weighted sum in (0, 1] of terms 1/(1 + |error|/scale): alive (1), height, position, speed,
-    heading, rates, effort (of the action); scales and weights in `coax_env.hover`.
-    ``info["reward_terms"]`` has the weighted terms.
+    A weighted sum of terms 1/(1 + |error|/scale) about the target, in (0, 1]: alive (1), height,
+    position (horizontal), speed, heading, rates, effort (of the action); scales and weights of each
+    task in `coax_env.tasks`. ``waypoints`` adds ``reached``, 50 for each waypoint.
+    ``info["reward_terms"]`` has the weighted terms by name.
 
     ## Starting State
     Uniform: tilt +-5 deg, heading +-20 deg, rates +-10 deg/s, velocity +-0.3 m/s per axis, height
-    1.5 +- 0.3 m; rotors at the nominal trim. ``reset(options={"state": x})`` starts from a state
-    (16,) or (26,) instead.
+    1.5 +- 0.3 m, at the origin; rotors at the nominal trim. ``reset(options={"state": x})`` starts
+    from a state (16,) or (26,) instead. Targets that are not given are drawn, north and east of the
+    origin +-1 m, height 1 to 2 m, heading +-45 deg in ``position``; +-2 m, 1 to 2.5 m and any
+    heading in ``waypoints``.
 
     ## Episode End
-    Terminated: height under 0.05 or over 6 m, tilt over 60 deg, 25 m from the start, 15 m/s, or a
-    state that is not a number (as after an action that is not). Truncated after 2000 steps, 20 s
-    (the TimeLimit of `gymnasium.make`).
+    Terminated: height under 0.05 or over 6 m, tilt over 60 deg, 25 m from the origin, 15 m/s, or a
+    state that is not a number (as after an action that is not); never by success. Truncated after
+    2000 steps, 20 s (the TimeLimit of `gymnasium.make`). `coax_env.tasks.succeeded` judges a
+    flight.
 
     ## Arguments
     - ``vehicle``: shipped name, path, or Vehicle: what flies.
     - ``nominal``: the vehicle whose trim centres the action; default the shipped bare one of the
       same name, else `vehicle` without its effects. Or (trim, scale), as controllers store it.
     - ``sensors``: ``"onboard"``, ``"paper"``, ``"mocap"`` or ``"state"``.
-    - ``wind``: None, (north, east) in m/s, or a speed whose direction is drawn at each reset. The
-      wind acts only on a vehicle with a drag or blow-back.
-    - ``gusts``: None, or the std of gust force [N] and moment [N m], memory 0.5 s.
-    - ``randomize``: None, or ``"posterior"``: every flight draws a vehicle from the file's spread
-      (``info["vehicle"]``).
+    - ``wind``: None, (north, east) in m/s, or a speed whose direction is drawn at each reset.
+    - ``turbulence``: None, ``"light"``, ``"moderate"``, ``"severe"``, or the mean wind at 6 m in
+      m/s whose Dryden turbulence blows (`coax_env.turbulence`); the mean itself is ``wind``. Both
+      act through the vehicle's drag, damping and blow-back: the bare model has none and feels
+      nothing.
+    - ``gusts``: None, or the std of gust force [N] and moment [N m], memory 0.5 s; any vehicle
+      feels them.
+    - ``randomize``: what each flight draws. None; ``"posterior"``: a vehicle from the file's
+      spread; {parameter: (low, high)}: uniform numbers, as ``{"mass": (0.7, 0.9),
+      "ground_effect.gain": (0, 0.3)}``; or a list of vehicles (names, paths, Vehicles), each as
+      likely.
+    - ``render_mode``: None, ``"rgb_array"`` or ``"human"``.
+    - ``task``: ``"hover"``, ``"position"`` or ``"waypoints"``.
+    - ``target``: (north, east, height, heading) in m and rad, for ``waypoints`` one or several;
+      None: drawn.
 
-    ``info["state"]`` is the true full state (26,), `coax_env.layout.FULL_STATES`.
+    ## Info
+    ``state``, the true full state (26,), `coax_env.layout.FULL_STATES`; ``target``, x y z psi in
+    force, (4,), where the task has one; ``reached``, waypoints so far; after a reset with
+    ``randomize``, ``vehicle``: the numbers drawn, by name.
 
     ## Version History
     - v0: first.
     """
 
-    metadata = {"render_modes": [], "render_fps": _FPS}  # noqa: RUF012 - Gymnasium's form
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": _FPS}  # noqa: RUF012
 
     def __init__(
         self,
@@ -106,16 +154,18 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         task: str = "hover",
         target: Any = None,
     ) -> None:
-        _check_render_mode(render_mode)
-        self.render_mode = render_mode
+        self.render_mode = _render_mode(render_mode)
         self.fleet = Fleet(
             1, vehicle, nominal, sensors, wind, gusts, randomize,
             turbulence=turbulence, task=task, target=target,
         )  # fmt: skip
-        self.observation_space = observation_space(self.fleet)
+        entries = observed(self.fleet)
+        self.observation_space = observation_space(entries)
         self.action_space = action_space()
-        self.observation_names = observation_names(self.fleet)
+        self.observation_names = tuple(entry.name for entry in entries)
+        self.observation_units = tuple(entry.unit for entry in entries)
         self._terms = tuple(enumerate(self.fleet.task.terms))
+        self._screen = _Screen(self.fleet, render_mode)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -128,6 +178,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         elif fresh:
             self.fleet.seed(0, int(self.np_random.integers(2**63)))
         observation = self.fleet.restart(_ALL, _start_states(options, 1))[0]
+        self._screen.moved()
         info = self._told()
         if self.fleet.draws.random:
             drawn = self.fleet.drawn[0].tolist()
@@ -137,11 +188,20 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One control period of 0.01 s."""
         outcome = self.fleet.fly(np.array(action, dtype=np.float64).reshape(1, 4), _ALL)
+        self._screen.moved()
         terms = outcome.terms[0].tolist()
         info = self._told()
         info["reward_terms"] = {name: terms[k] for k, name in self._terms}
         reward = float(outcome.rewards[0])
         return outcome.observations[0], reward, bool(outcome.over[0]), False, info
+
+    def render(self) -> np.ndarray | None:
+        """The picture (540, 960, 3), uint8, in mode ``rgb_array``; ``human`` shows it, every 40 ms."""
+        return self._screen.pictures([0])[0] if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._screen.close()
 
     def _told(self) -> dict[str, Any]:
         fleet = self.fleet
@@ -165,7 +225,9 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
       row stays as it is until ``reset(options={"reset_mask": mask})``).
     - ``threads``: at most so many; default one per 256 rows and processor.
 
-    ``info["state"]`` is (num_envs, 26), ``info["reward_terms"]`` a dict of (num_envs,).
+    Infos are those of `CoaxEnv` with a first axis of num_envs, and masks ``_NAME`` as Gymnasium has
+    them: ``info["state"]`` is (num_envs, 26), ``info["reward_terms"]`` and ``info["vehicle"]``
+    (where rows have started anew) are dicts of (num_envs,). ``render`` gives one picture per row.
     """
 
     def __init__(
@@ -185,26 +247,28 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         task: str = "hover",
         target: Any = None,
     ) -> None:
-        _check_render_mode(render_mode)
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, found {num_envs}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**CoaxEnv.metadata, "autoreset_mode": self.autoreset_mode}
-        self.render_mode = render_mode
+        self.render_mode = _render_mode(render_mode)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.fleet = Fleet(
             num_envs, vehicle, nominal, sensors, wind, gusts, randomize, threads,
             turbulence, task, target,
         )  # fmt: skip
-        self.single_observation_space = observation_space(self.fleet)
+        entries = observed(self.fleet)
+        self.single_observation_space = observation_space(entries)
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_names = observation_names(self.fleet)
+        self.observation_names = tuple(entry.name for entry in entries)
+        self.observation_units = tuple(entry.unit for entry in entries)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._every = np.ones(num_envs, dtype=np.bool_)
         self._seeded = False
+        self._screen = _Screen(self.fleet, render_mode)
 
     def reset(
         self,
@@ -224,20 +288,21 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         super().reset(seed=first)
         if seed is None and not self._seeded:
             first = int(self.np_random.integers(2**62))
-        if seed is None and first is None:
-            seeds: list[int | None] = [None] * self.num_envs
-        elif first is not None:
-            seeds = [int(first) + i for i in range(self.num_envs)]
+        if first is not None:
+            seeds: list[int | None] = [int(first) + i for i in range(self.num_envs)]
         else:
-            seeds = list(seed)  # type: ignore[arg-type]
-            if len(seeds) != self.num_envs:
-                raise InputError(f"seed must be one number or {self.num_envs}, found {len(seeds)}")
+            seeds = [None] * self.num_envs if seed is None else list(seed)  # type: ignore[arg-type]
+        if len(seeds) != self.num_envs:
+            raise InputError(f"seed must be one number or {self.num_envs}, found {len(seeds)}")
         for i, row_seed in enumerate(seeds):
-            if row_seed is not None and which[i]:
+            if row_seed is None and not self._seeded:
+                row_seed = int(self.np_random.integers(2**62))
+            if row_seed is not None and (which[i] or not self._seeded):
                 self.fleet.seed(i, row_seed)
         self._seeded = True
         self._ended &= ~which
         observations = self.fleet.restart(which, _start_states(options, self.num_envs))
+        self._screen.moved()
         return observations, self._told(which) | self._vehicles(which)
 
     def step(
@@ -270,7 +335,17 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             fleet.restart(done, observations=observations)
             info |= self._vehicles(done)
         info |= self._step_info(outcome.terms)
+        self._screen.moved()
         return observations, outcome.rewards, terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """One picture per row in mode ``rgb_array``; ``human`` shows the first row's."""
+        rows = range(self.num_envs)
+        return self._screen.pictures(rows) if self.render_mode == "rgb_array" else None
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the window, if there is one."""
+        self._screen.close()
 
     def _step_info(self, terms: np.ndarray) -> dict[str, Any]:
         named = {name: terms[:, k] for k, name in enumerate(self.fleet.task.terms)}
@@ -301,25 +376,43 @@ def _masked(info: Mapping[str, np.ndarray], which: np.ndarray) -> dict[str, Any]
     return {**info, **{f"_{name}": which for name in info}}
 
 
-def action_space() -> Box:
-    """Four commands in [-1, 1] about the nominal hover trim."""
-    return Box(-1.0, 1.0, (4,), np.float32)
+def _render_mode(render_mode: str | None) -> str | None:
+    modes = CoaxEnv.metadata["render_modes"]
+    if render_mode not in (None, *modes):
+        raise InputError(f"render_mode must be None, {' or '.join(modes)}, found {render_mode!r}")
+    return render_mode
 
 
-def observation_space(fleet: Fleet) -> Box:
-    """Readings within their sensors' bounds, one flag per slow instrument, the way to the target."""
-    return Box(fleet.low.astype(np.float32), fleet.high.astype(np.float32), dtype=np.float32)
+class _Screen:
+    """Pictures of a fleet, where they are wanted; drawing is imported with the first of them."""
 
+    def __init__(self, fleet: Fleet, render_mode: str | None) -> None:
+        self._fleet, self._mode = fleet, render_mode
+        self._renderer: Any = None
+        self._traces: Any = None
+        if render_mode is not None:
+            from coax_env.rendering import Renderer
+            from coax_env.scene import Traces
 
-def observation_names(fleet: Fleet) -> tuple[str, ...]:
-    """Name of every entry of the observation: readings, ``new_INSTRUMENT`` flags, tasks.AIM."""
-    aim = [name for name, *_ in tasks.AIM] if fleet.task.aims else []
-    return (*(s.name for s in fleet.sensors), *(f"new_{flag}" for flag in fleet.flags), *aim)
+            self._renderer, self._traces = Renderer(), Traces(fleet)
 
+    def moved(self) -> None:
+        """The fleet has reset or flown a row: remember it, and show it on a screen now and then."""
+        if self._mode is None:
+            return
+        from coax_env.rendering import HUMAN_EVERY
 
-def _check_render_mode(render_mode: str | None) -> None:
-    if render_mode is not None:
-        raise InputError(f"render_mode must be None: CoaxHeli-v0 cannot draw, not {render_mode!r}")
+        self._traces.record()
+        if self._mode == "human" and self._fleet.rows[0] % HUMAN_EVERY == 0:
+            self._renderer.show(self._traces.view(0))
+
+    def pictures(self, rows: Iterable[int]) -> tuple[np.ndarray, ...]:
+        """One picture of each row."""
+        return tuple(self._renderer.picture(self._traces.view(row)) for row in rows)
+
+    def close(self) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
 
 
 def _start_states(options: dict[str, Any] | None, count: int) -> np.ndarray | None:

@@ -3,9 +3,33 @@
 import importlib
 from types import ModuleType
 
+LONGEST = 900
+"""Characters of a message; a longer one loses its middle."""
+
 
 class InputError(ValueError):
     """Bad input. The message is one line; scripts print it and exit with code 2."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
+
+
+def one_line(text: str) -> str:
+    """Text that quotes a file, whatever was in it, as one printable line."""
+    line = " ".join(text.split())
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    if len(line) > LONGEST:
+        line = f"{line[: LONGEST - 200]} ... {line[-190:]}"
+    return line
+
+
+def shown(value: object) -> str:
+    """A value from somebody's file as a message quotes it."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer too long to be written
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= 100 else text[:100] + "..."
 
 
 def require(module: str, extra: str) -> ModuleType:

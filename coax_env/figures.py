@@ -123,6 +123,21 @@ def _labels(channels: Sequence[str]) -> list[str]:
     return [CHANNEL_NAMES.get(c, c) for c in channels]
 
 
+def bode(omega: np.ndarray, responses: Mapping[str, np.ndarray]) -> Figure:
+    """Gain [dB] and phase [deg] of named frequency responses, complex (w,), over Hz."""
+    layout = _stack([1.0, 1.0], ["gain [dB]", "phase [deg]"], spacing=0.08)
+    layout["xaxis"] |= {"type": "log", "title": {"text": "frequency [Hz]"}}
+    data = []
+    for k, (name, values) in enumerate(responses.items()):
+        phase = np.degrees(np.unwrap(np.angle(values)))
+        phase -= 360.0 * np.round((phase[len(phase) // 2] + 180.0) / 360.0)
+        for row, curve in ((1, 20.0 * np.log10(np.abs(values) + 1e-12)), (2, phase)):
+            more = {"showlegend": row == 1, "line": {
+                "color": WHEEL[k % len(WHEEL)], "width": 1.7, "dash": DASHES[k % 3]}}  # fmt: skip
+            data.append(_curve(omega / (2.0 * math.pi), curve, name, "", row, **more))
+    return _figure(data, 400, **layout)
+
+
 # --- histories ------------------------------------------------------------------------------------
 
 
@@ -402,6 +417,37 @@ def whiteness_bars(shares: Mapping[str, tuple[float, float]], threshold: float) 
         xaxis={"title": {"text": "predictable from its own past [%]"}, "rangemode": "tozero"},
         yaxis={"ticklabelstandoff": 6},
         shapes=[_upright(100.0 * threshold)],
+    )
+
+
+def side_by_side(
+    groups: Sequence[str],
+    values: Mapping[str, Sequence[float | None]],
+    title: str,
+    log: bool = False,
+    colours: Sequence[str] = WHEEL,
+) -> Figure:
+    """Bars of several contestants in every group; None leaves a gap.
+
+    Args:
+        values: contestant -> one value per group.
+        title: of the value axis. log: whether that is logarithmic.
+    """
+    data = [
+        {
+            "type": "bar", "name": name, "marker": {"color": colours[k % len(colours)]},
+            "x": list(groups), "y": list(bars),
+            "hovertemplate": "%{x}: %{y:.3g}<extra>" + name + "</extra>",
+        }
+        for k, (name, bars) in enumerate(values.items())
+    ]  # fmt: skip
+    return _figure(
+        data,
+        300,
+        barmode="group",
+        bargap=0.3,
+        hovermode="closest",
+        yaxis={"title": {"text": title}, **({"type": "log", "dtick": 1} if log else {})},
     )
 
 

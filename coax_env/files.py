@@ -1,15 +1,55 @@
-"""Writing files so that a reader never sees half of one."""
+"""Writing files so that a reader never sees half of one, and reading those that a user wrote."""
 
 import json
 import os
 import shutil
 import tempfile
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from coax_env.errors import InputError
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """A file's content, or in one line why it cannot be read."""
+    try:
+        path = Path(path)
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise InputError(f"cannot read {path}: not a file but a device or a pipe")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    except ValueError as error:  # InputError is one
+        raise InputError(
+            str(error) if isinstance(error, InputError) else f"cannot read {path!s:.200}: {error}"
+        ) from error
+
+
+def read_text(path: str | Path) -> str:
+    """A text file, with or without a byte order mark, or in one line why it is none."""
+    content = read_bytes(path)
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise InputError(f"{path}: UTF-16 text, not UTF-8: save it as UTF-8")
+    if b"\0" in content:
+        raise InputError(f"{path}: binary, not text")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: not UTF-8 text (byte {error.start}): save it as UTF-8"
+        ) from error
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """A TOML file as a table, or in one line why it is none."""
+    text = read_text(path)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # also of what tomllib does not foresee
+        raise InputError(f"{path}: not valid TOML: {error}") from error
 
 
 def write_text(path: str | Path, text: str) -> Path:

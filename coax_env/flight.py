@@ -8,8 +8,9 @@ and told in :attr:`Flight.notes`.
 import csv
 import hashlib
 import io
+import os
 import re
-import tomllib
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -19,8 +20,9 @@ from typing import Any
 import numpy as np
 import tomlkit
 
-from coax_env.errors import InputError
-from coax_env.files import staged_folder, write_text
+from coax_env.errors import InputError, shown
+from coax_env.files import read_bytes, read_text, read_toml, staged_folder, write_text
+from coax_env.foreign_columns import advice, header_of, time_advice
 from coax_env.layout import CHANNELS, RPM_PER_RAD_S
 from coax_env.log_units import LOG_UNITS, ROTOR_COMMANDS, SWASH_COMMANDS, factor_to_canonical
 from coax_env.outliers import find_outliers
@@ -28,6 +30,11 @@ from coax_env.outliers import find_outliers
 CARD = "card.toml"
 SHORTEST_RUN = 2.0
 """A run must last this long [s]."""
+LONGEST_RUN = 24 * 3600.0
+SLOWEST_ROWS = 0.5
+"""A run that lasts longer, or whose rows come more seldom [s], has its time in another unit."""
+BEYOND_ALL = 1e20
+"""No reading in any unit is larger; what is, is a bit error and dropped."""
 GAP = 0.1
 """Time without a row, or without any reading, that counts as a gap [s]."""
 
@@ -75,6 +82,7 @@ class Flight:
         notes: what was done to the data while reading, in words, with counts.
         counts: the same as numbers, e.g. ``{"outliers in h": 12}``.
         hashes: file name -> SHA-256, to recognise data that was used before.
+        unread: columns of the files that are no channel and were ignored.
     """
 
     vehicle: str
@@ -85,6 +93,7 @@ class Flight:
     notes: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
     hashes: Mapping[str, str] = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
 
     @property
     def run_names(self) -> tuple[str, ...]:
@@ -120,24 +129,25 @@ def read_flight(path: str | Path) -> Flight:
     folder = Path(path)
     if folder.name == CARD:
         folder = folder.parent
-    if not folder.is_dir():
-        found = "a file" if folder.exists() else "nothing"
-        raise InputError(f"no flight folder at {folder}: found {found} there")
-    card_bytes = _read_bytes(folder / CARD)
-    card = _Card(folder / CARD, card_bytes)
-    hashes = {CARD: hashlib.sha256(card_bytes).hexdigest()}
+    _check_folder(folder)
+    card = _Card(folder / CARD)
+    hashes = {CARD: _hash(folder / CARD)}
     counts: Counter[str] = Counter(card.counts)
     used: set[str] = set()
+    unread: dict[str, None] = {}
     runs = []
     for entry in card.runs:
-        content = _read_bytes(folder / entry["file"])
-        hashes[entry["file"]] = hashlib.sha256(content).hexdigest()
-        log = _Log(folder / entry["file"], content, card.columns)
+        log = _Log(folder / entry["file"], card.columns)
+        hashes[entry["file"]] = _hash(folder / entry["file"])
         used |= log.renamed
+        unread |= dict.fromkeys(log.unknown)
         runs.append(_make_run(entry, log, card.noise, counts))
     for channel, (name, _) in card.columns.items():
         if channel not in used:
-            raise InputError(f"{folder / CARD}: channel {channel}: no run has a column {name!r}")
+            raise InputError(
+                f"{folder / CARD}: channel {channel}: no run has a column {name!r}; not read:"
+                f" {', '.join(unread) or 'none'}"
+            )
     return Flight(
         vehicle=card.vehicle,
         runs=tuple(runs),
@@ -147,19 +157,38 @@ def read_flight(path: str | Path) -> Flight:
         notes=tuple(f"{what}: {count}" for what, count in counts.items()),
         counts=dict(counts),
         hashes=hashes,
+        unread=tuple(unread),
     )
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse what is no flight folder, and say how to make one."""
+    if os.path.isfile(folder):
+        if folder.suffix.lower() in (".ulg", ".bin", ".log"):
+            step = f"import it: scripts/import_log.py {folder}"
+        else:
+            step = "put it in a folder of its own, then scripts/check_flight.py FOLDER --draft"
+        raise InputError(f"no flight folder at {folder}: found a file there; {step}")
+    if not os.path.isdir(folder):
+        raise InputError(f"no flight folder at {folder}: found nothing there")
+    if not (folder / CARD).exists():
+        raise InputError(
+            f"cannot read {folder / CARD}: No such file or directory; a flight folder needs one:"
+            f" scripts/check_flight.py {folder} --draft writes a first one for the CSVs in it"
+        )
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
 class _Card:
     """The flight test card, checked."""
 
-    def __init__(self, path: Path, content: bytes) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.counts: dict[str, int] = {}
-        try:
-            self.table = tomllib.loads(_decode(path, content))
-        except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{path}: not valid TOML: {error}") from error
+        self.table = read_toml(path)
         self.vehicle = self._text(self._section("vehicle", required=True), "name", "[vehicle]")
         self.air = self._positive_numbers("air", AIR)
         self.noise = self._positive_numbers("noise", CHANNELS)
@@ -174,7 +203,7 @@ class _Card:
             raise self._fail(f"no [{name}] section")
         section = self.table.get(name, {})
         if not isinstance(section, dict):
-            raise self._fail(f"[{name}] should be a section, found {section!r}")
+            raise self._fail(f"[{name}] should be a section, found {shown(section)}")
         return section
 
     def _text(self, table: dict[str, Any], key: str, where: str, default: str | None = None) -> str:
@@ -182,18 +211,20 @@ class _Card:
         if value is None:
             raise self._fail(f"{where} has no {key}")
         if not isinstance(value, str) or not (value.strip() or default is not None):
-            raise self._fail(f"{where} {key} should be text, found {value!r}")
+            raise self._fail(f"{where} {key} should be text, found {shown(value)}")
         if key != "note" and not value.isprintable():
-            raise self._fail(f"{where} {key} should be one printable line, found {value!r}")
+            raise self._fail(f"{where} {key} should be one printable line, found {shown(value)}")
         return value
 
     def _positive_numbers(self, section: str, known: tuple[str, ...]) -> dict[str, float]:
         numbers = {}
         for key, value in self._section(section).items():
             if isinstance(value, bool) or not isinstance(value, int | float):
-                raise self._fail(f"[{section}] {key} should be a number, found {value!r}")
-            if not 0.0 < value < float("inf"):
-                raise self._fail(f"[{section}] {key} should be positive and finite, found {value}")
+                raise self._fail(f"[{section}] {key} should be a number, found {shown(value)}")
+            if not 0.0 < value <= sys.float_info.max:
+                raise self._fail(
+                    f"[{section}] {key} should be positive and finite, found {shown(value)}"
+                )
             if key in known:
                 numbers[key] = float(value)
             else:
@@ -205,18 +236,33 @@ class _Card:
         columns = {}
         for channel, entry in self._section("columns").items():
             if channel not in LOG_UNITS:
-                raise self._fail(f"[columns] unknown channel {channel!r}")
+                raise self._fail(
+                    f"[columns] unknown channel {channel!r}; channels are {', '.join(LOG_UNITS)}"
+                )
             if isinstance(entry, str):
                 entry = {"name": entry}
             if not isinstance(entry, dict):
-                raise self._fail(f"[columns] {channel} should be {{ name, unit }}, found {entry!r}")
+                raise self._fail(
+                    f"[columns] {channel} should be {{ name, unit, scale }}, found {shown(entry)}"
+                )
             name = self._text(entry, "name", f"[columns] {channel}", default=channel)
             unit = self._text(entry, "unit", f"[columns] {channel}", default=LOG_UNITS[channel])
             try:
-                columns[channel] = (name.strip(), factor_to_canonical(channel, unit))
+                factor = factor_to_canonical(channel, unit)
             except InputError as error:
                 raise self._fail(f"[columns] {error}") from error
+            columns[channel] = (name.strip(), factor * self._scale(channel, entry))
         return columns
+
+    def _scale(self, channel: str, entry: dict[str, Any]) -> float:
+        """What else the column is multiplied by: -1 turns an axis round."""
+        scale = entry.get("scale", 1.0)
+        number = isinstance(scale, int | float) and not isinstance(scale, bool)
+        if not number or not 1e-12 < abs(scale) < 1e12:
+            raise self._fail(
+                f"[columns] {channel} scale should be a number, not 0, found {shown(scale)}"
+            )
+        return float(scale)
 
     def _read_runs(self) -> list[dict[str, str]]:
         entries = self.table.get("run", [])
@@ -226,7 +272,7 @@ class _Card:
         for number, entry in enumerate(entries, 1):
             where = f"[[run]] {number}"
             if not isinstance(entry, dict):
-                raise self._fail(f"{where} should be a section, found {entry!r}")
+                raise self._fail(f"{where} should be a section, found {shown(entry)}")
             file = self._text(entry, "file", where)
             runs.append(
                 {
@@ -245,12 +291,14 @@ class _Card:
 class _Log:
     """One CSV as arrays by channel, in canonical units, NaN where a cell is empty."""
 
-    def __init__(self, path: Path, content: bytes, columns: dict[str, tuple[str, float]]) -> None:
+    def __init__(self, path: Path, columns: dict[str, tuple[str, float]]) -> None:
         self.path = path
-        header, self.rows, self.lines = self._split(_decode(path, content))
-        by_name = {name: index for index, name in enumerate(header) if name}
+        self.header, self.rows, self.lines = self._split(read_text(path))
+        by_name = {name: index for index, name in enumerate(self.header) if name}
         self.renamed: set[str] = set()
         self.data: dict[str, np.ndarray] = {}
+        self.beyond = 0
+        self.time_column = "t"
         taken = set()
         for channel in LOG_UNITS:
             name, factor = columns.get(channel, (channel, 1.0))
@@ -258,14 +306,29 @@ class _Log:
                 taken.add(name)
                 if channel in columns:
                     self.renamed.add(channel)
-                self.data[channel] = factor * self._numbers(by_name[name], name)
+                values = self._numbers(by_name[name], name)
+                if channel == "t":
+                    self.time_column = name
+                    self._check_times(values)
+                else:
+                    beyond = np.abs(values) > BEYOND_ALL
+                    values[beyond] = np.nan
+                    self.beyond += int(np.count_nonzero(beyond))
+                self.data[channel] = factor * values
             elif channel == "t":
-                raise InputError(f"{path}: no time column {name!r}; found {list(by_name)!r:.200}")
+                raise InputError(f"{path}: no time column {name!r}; {advice(by_name, ['t'])}")
         self.unknown = [name for name in by_name if name not in taken]
 
     def _split(self, text: str) -> tuple[list[str], list[list[str]], list[int]]:
         """Header, rows that hold anything, and the line each row ends on."""
-        reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+        first, delimiter = header_of(text)
+        if any(first) and all(_is_finite_number(cell) for cell in first if cell):
+            raise InputError(
+                f"{self.path}, line 1: numbers, no header: the first row must name the columns"
+            )
+        reader = csv.reader(
+            io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True
+        )
         header: list[str] = []
         rows, lines = [], []
         try:
@@ -279,7 +342,7 @@ class _Log:
                 if len(cells) != len(header):
                     raise InputError(
                         f"{self.path}, line {reader.line_num}: {len(cells)} cells"
-                        f" where the header has {len(header)}"
+                        f" where the header has {len(header)} (cells parted by {delimiter!r})"
                     )
                 rows.append(cells)
                 lines.append(reader.line_num)
@@ -303,10 +366,21 @@ class _Log:
         except ValueError:
             pass
         bad = next(k for k, cell in enumerate(cells) if cell and not _is_finite_number(cell))
+        if bad == 0 and not any(map(_is_finite_number, self.rows[0])):
+            raise InputError(
+                f"{self.path}, line {self.lines[0]}: {cells[0][:40]!r} and no number in the row: if"
+                " it holds the units, delete it, and name them in card.toml under [columns]"
+            )
         raise InputError(
             f"{self.path}, line {self.lines[bad]}, column {name!r}:"
-            f" {cells[bad][:40]!r} is not a finite number"
+            f" {cells[bad][:40]!r} is not a finite number{_hint(cells[bad])}"
         )
+
+    def _check_times(self, t: np.ndarray) -> None:
+        far = np.abs(t) > BEYOND_ALL
+        if far.any():
+            row = int(np.argmax(far))
+            raise InputError(f"{self.path}, line {self.lines[row]}: {t[row]:.3g} is no time")
 
     def merge_repeated_times(self) -> int:
         """Make rows with one time stamp one row, later readings winning; how many rows went.
@@ -323,11 +397,18 @@ class _Log:
             late = int(np.argmax(step < 0.0)) + 1
             raise InputError(
                 f"{self.path}, line {self.lines[late]}:"
-                f" time runs backwards, from {t[late - 1]:.6g} to {t[late]:.6g} s"
+                f" time runs backwards, from {t[late - 1]:.6g} to {t[late]:.6g} s;"
+                " where a log starts anew, cut it there into two files, a [[run]] each"
             )
-        if not t[-1] - t[0] >= SHORTEST_RUN:
+        length = t[-1] - t[0]
+        if not length >= SHORTEST_RUN:
             raise InputError(
-                f"{self.path}: the run lasts {t[-1] - t[0]:.3g} s, at least {SHORTEST_RUN:g} needed"
+                f"{self.path}: the run lasts {length:.3g} s, at least {SHORTEST_RUN:g} needed"
+            )
+        if length > LONGEST_RUN or np.median(step) > SLOWEST_ROWS:
+            raise InputError(
+                f"{self.path}: the run lasts {length:.3g} s with a row every {np.median(step):.3g} s;"
+                f" {time_advice(self.time_column, float(np.median(step)))}"
             )
         last = np.append(step > 0.0, True)
         repeated = int(np.count_nonzero(~last))
@@ -347,6 +428,8 @@ def _make_run(
     """Turn a log into a run and add what had to be done to ``counts``."""
     if log.unknown:
         counts["unknown columns ignored"] += len(log.unknown)
+    if log.beyond:
+        counts[f"readings beyond {BEYOND_ALL:g} dropped"] += log.beyond
     repeated = log.merge_repeated_times()
     if repeated:
         counts["rows with a repeated time stamp merged"] += repeated
@@ -383,7 +466,10 @@ def _commands(log: _Log, measured: dict[str, np.ndarray], counts: Counter[str]) 
         speed = log.data.get(name)
         if speed is None or np.isnan(speed).all():
             if stand_in not in measured:
-                raise InputError(f"{log.path}: no rotor speed: neither {name} nor {stand_in}")
+                raise InputError(
+                    f"{log.path}: no rotor speed: neither {name} nor {stand_in};"
+                    f" {advice(log.header, (name, stand_in))}"
+                )
             speed = measured.pop(stand_in)
             counts[f"runs in which measured {stand_in} stands for the command"] += 1
         negative = int(np.count_nonzero(speed < 0.0))
@@ -437,29 +523,22 @@ def hold_last(values: np.ndarray) -> np.ndarray:
     return values[index]
 
 
+def _hint(cell: str) -> str:
+    """What to do about a cell that is no number, where that is known."""
+    if re.fullmatch(r"[-+]?\d+,\d+", cell):
+        return ": write numbers with a decimal point"
+    if cell.strip().lower() in ("na", "n/a", "null", "none", "-", "--", "?"):
+        return ": leave the cell empty where there is no reading"
+    if re.match(r"\d+[-/:.]\d+[-/:.]\d+", cell):
+        return ": time is needed in seconds, from any beginning"
+    return ""
+
+
 def _is_finite_number(cell: str) -> bool:
     try:
         return "_" not in cell and not np.isinf(float(cell))
     except ValueError:
         return False
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"cannot read {path!s:.200}: {error}") from error
-
-
-def _decode(path: Path, content: bytes) -> str:
-    if b"\0" in content:
-        raise InputError(f"{path}: binary, not text")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
 
 
 # --- writing ---------------------------------------------------------------------------------

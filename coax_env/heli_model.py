@@ -5,13 +5,16 @@ interval holds two commands, replaced by their mean over it (the step is split t
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from numba import float64, types
 
 from coax_env import dynamics, effects
 from coax_env import parameters as P
 from coax_env.engine.model import FreeParameter, Noise, Record
 from coax_env.flight import Flight, Run
+from coax_env.jit import compiled, pointer
 from coax_env.layout import (
     ANGLES,
     CHANNELS,
@@ -58,14 +61,61 @@ its true noise the likelihood would be spent on what no parameter can mend.
 """
 
 
+_A = float64[::1]
+STEP = types.void(_A, _A, float64, _A, _A, _A)
+MEASURE = types.void(_A, _A, _A, _A, _A)
+
+
+@compiled()
+def _heed(u: Any, p: Any, x: Any) -> None:
+    """Correct a state (26,) in place by the news of the commands, u[5:9]; see closed_loop.py."""
+    if u.size == N_INPUTS:
+        return
+    gain = p[P.COMMAND_GAIN : P.N_FIXED]
+    lon, lat = u[N_INPUTS + 2], u[N_INPUTS + 3]
+    turn, lift = u[N_INPUTS] - u[N_INPUTS + 1], u[N_INPUTS] + u[N_INPUTS + 1]
+    x[3] += gain[0] * lat
+    x[4] += gain[0] * lon
+    x[23] += gain[1] * lat
+    x[24] += gain[1] * lon
+    x[20] += gain[2] * lon
+    x[21] -= gain[2] * lat
+    x[5] += gain[3] * turn
+    x[25] += gain[4] * turn
+    x[2] += gain[5] * lift
+    x[22] += gain[6] * lift
+
+
+@pointer(STEP)
+def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.step` after what the commands tell, in the engine's form."""
+    for i in range(N_FULL):
+        out[i] = x[i]
+    _heed(u, p, out)
+    dynamics.step(out, u, dt, p, work, out)
+
+
+@pointer(MEASURE)
+def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.measure`, in the form in which the engine takes a model."""
+    dynamics.measure(x, u, p, work, out)
+
+
+@pointer(STEP)
+def _drift(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.drift` and what the commands tell, in the engine's form."""
+    dynamics.drift(x, u, dt, p, work, out)
+    _heed(u, p, out)
+
+
 class HeliModel:
     """A vehicle, through the engine's protocol."""
 
     channels = CHANNELS
     wraps = np.array([c in ANGLES for c in CHANNELS])
-    step = dynamics.step_pointer
-    measure = dynamics.measure_pointer
-    drift = dynamics.drift_pointer
+    step = _step
+    measure = _measure
+    drift = _drift
     exact = np.arange(N_FULL) >= N_STATES
     work_size = dynamics.WORK_SIZE
     state_scale = np.array(
@@ -85,7 +135,7 @@ class HeliModel:
         return vector
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
-        """Commands and time since the run's start, (n, 5)."""
+        """Commands and time since the run's start, (n, 5); and the commands' news, (n, 9)."""
         u = np.empty((record.t.size, N_INPUTS))
         u[:, :TIME] = record.command
         u[:, TIME] = record.t - record.origin
@@ -93,7 +143,7 @@ class HeliModel:
         if delay > 0.0:
             for column in (2, 3):
                 u[:, column] = _mean_of_late(record.t, record.command[:, column], delay)
-        return u
+        return u if record.news is None else np.hstack([u, record.news])
 
     def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """First state from the medians of the first half second, with a wide covariance."""

@@ -62,8 +62,8 @@ class RunEstimate:
 class Identification:
     """Result of `identify`: the fitted vehicle, what was free, and the runs flown again (`flight`).
 
-    undetermined, directions: numbers and combinations that the flights leave open; see `_open`. by_run:
-    each run alone. widened: factor on the priors' std, 1 where the file's were believed.
+    undetermined, directions: numbers and combinations that the flights leave open (`left_open`).
+    by_run: each run alone. widened: factor on the priors' std, 1 where the file's were believed.
     """
 
     flight: Flight
@@ -216,7 +216,7 @@ def identify(
         fly_again(again, model.bare_values, first),
         fly_again(again, values, noise),
         tuple(remarks),
-        *_open(free, estimate.covariance),
+        *left_open(free, estimate.covariance),
         _each_run(engine, free, lin, values, colour),
         widened,
     )
@@ -278,7 +278,7 @@ def _fitted(
     return free, estimate, noise, widened
 
 
-def _open(
+def left_open(
     free: Sequence[FreeParameter], covariance: np.ndarray
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Numbers that the flights do not determine, and the combinations they leave open, in words.

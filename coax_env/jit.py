@@ -24,6 +24,7 @@ KERNEL_SOURCES = (
     "generic_terms.py",
     "effects.py",
     "lanes.py",
+    "late.py",
     "dynamics.py",
     "sensors.py",
     "actuators.py",
@@ -97,7 +98,9 @@ def name_apart(function: Callable, *values: Any) -> Callable:
 
 def compiled(signature: Any = None, **options: Any) -> Callable[[Callable], Any]:
     """``numba.njit`` that caches under CACHE_DIR and releases the GIL."""
-    settings = {"cache": True, "nogil": True, "error_model": "numpy", **options}
+    settings = {
+        "cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options,
+    }  # fmt: skip
 
     def decorate(function: Callable) -> Any:
         name_apart(function)
@@ -114,6 +117,7 @@ def pointer(signature: Any) -> Callable[[Callable], Any]:
 
     def decorate(function: Callable) -> Any:
         with _own_cache():
-            return numba.cfunc(signature, cache=True, nopython=True)(function)
+            settings = {"cache": True, "nopython": True, "error_model": "numpy"}
+            return numba.cfunc(signature, **settings)(function)
 
     return decorate

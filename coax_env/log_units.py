@@ -69,3 +69,16 @@ def factor_to_canonical(channel: str, unit: str) -> float:
             raise InputError(f"channel {channel}: unit {unit!r} is no unit for it, {canonical} is")
         raise InputError(f"channel {channel}: unknown unit {unit!r}; known: {', '.join(known)}")
     return known[plain]
+
+
+def unit_that_makes(channel: str, factor: float, within: tuple[float, float]) -> str:
+    """A unit of a channel, other than its own, by which numbers are off by about a factor; "" if none.
+
+    Args:
+        factor: what the numbers should be multiplied by. within: ratios that are about 1.
+    """
+    canonical = LOG_UNITS[channel]
+    for unit, own in _FACTORS[canonical].items():
+        if own != 1.0 and within[0] < factor / own < within[1]:
+            return unit
+    return ""

@@ -71,4 +71,17 @@ GUST_REFERENCE = {
 AIR_DOWN = GUST_MEMORY + 1
 """Velocity of the air downwards [m/s], beside the effect `wind`: zero but in turbulence.py's air."""
 
-N_FIXED = AIR_DOWN + 1  # after it: one switch per stage, then the effects' parameters
+COMMAND_GAINS = {
+    "command_gain.rate_xy": "rad/s per rad",
+    "command_gain.moment_xy": "N m per rad",
+    "command_gain.force_xy": "N per rad",
+    "command_gain.rate_z": "1",
+    "command_gain.moment_z": "N m per rad/s",
+    "command_gain.speed_z": "m/s per rad/s",
+    "command_gain.force_z": "N per rad/s",
+}
+"""How the filter's state answers what a command gives away (closed_loop.py); zero in a simulation."""
+COMMAND_GAIN = AIR_DOWN + 1
+
+N_FIXED = COMMAND_GAIN + len(COMMAND_GAINS)
+# after it: one switch per stage, then the effects' parameters

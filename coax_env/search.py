@@ -23,6 +23,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from coax_env import effects
+from coax_env import parameters as P
 from coax_env.engine.fit import Engine, Linearised, RunPass, bounded_solve, objective
 from coax_env.engine.model import FreeParameter, Noise
 from coax_env.engine.whiteness import is_white
@@ -261,6 +262,10 @@ class Search:
         names = set(self.free_names(active))
         return [f for f in self.all if f.name in names]
 
+    def free_of_vehicle(self, active: Collection[str]) -> list[FreeParameter]:
+        """Those of them that a vehicle file can hold."""
+        return [f for f in self.free(active) if f.name not in P.COMMAND_GAINS]
+
     def pinned(self, effect: str) -> dict[str, float]:
         """Values that the base parameters replaced by an effect go back to."""
         return {b: self.model.bare_values[b] for b in effects.CATALOGUE[effect].replaces}
@@ -361,7 +366,7 @@ class Search:
         """
         state = self.settle(state, MOST_STEPS, POLISH)
         free = self.free(state.active)
-        own = [f for f in free if "." in f.name]
+        own = [f for e in state.active for f in self.by_effect[e]]
         if not own:
             return state
         if not is_white(self.engine.filter(state.values, state.noise), self.model.channels):

@@ -24,8 +24,8 @@ The form::
 A vehicle without an effect's group is without the effect.
 """
 
-import math
-import tomllib
+import os
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -35,7 +35,8 @@ from typing import Any
 import numpy as np
 
 from coax_env import actuators, effects, parameters, sensors
-from coax_env.errors import InputError
+from coax_env.errors import InputError, shown
+from coax_env.files import read_toml
 from coax_env.layout import CHANNEL_UNITS
 
 SHIPPED = Path(__file__).parent / "vehicles"
@@ -233,18 +234,12 @@ def load_vehicle(source: "str | Path | Vehicle") -> Vehicle:
     path = Path(source)
     if str(source) in shipped_vehicles():
         path = SHIPPED / f"{source}.toml"
-    elif not path.exists():
+    elif not os.path.exists(path):
         known = ", ".join(shipped_vehicles())
         raise InputError(f"no vehicle {str(source)!r}: neither a file nor one of {known}")
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except IsADirectoryError as error:
-        raise InputError(f"{path}: is a folder, a vehicle is one TOML file") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a TOML file ({error})") from error
-    return _vehicle_from(document, path)
+    elif path.is_dir():
+        raise InputError(f"{path}: is a folder, a vehicle is one TOML file")
+    return _vehicle_from(read_toml(path), path)
 
 
 def _vehicle_from(document: dict[str, Any], path: Path) -> Vehicle:
@@ -276,6 +271,9 @@ def _vehicle_from(document: dict[str, Any], path: Path) -> Vehicle:
             _check_unit(parameter, known[name].unit, path, f"effects.{effect}.{name}")
         groups[effect] = effects.completed(effect, table, Parameter)
     names, correlation = _covariance(document.get("covariance"), path)
+    provenance = document.get("provenance", {})
+    if not isinstance(provenance, dict) or not isinstance(provenance.get("flights", []), list):
+        raise InputError(f"{path}: [provenance] must be a table, its flights a list of hashes")
     vehicle = Vehicle(
         name=str(document.get("name", path.stem)),
         parameters=base,
@@ -283,7 +281,7 @@ def _vehicle_from(document: dict[str, Any], path: Path) -> Vehicle:
         description=str(document.get("description", "")),
         correlated=names,
         correlation=correlation,
-        provenance=document.get("provenance", {}),
+        provenance=provenance,
         sensors=_sensors(document.get("sensors", {}), path),
         actuators=_actuators(document.get("actuators", {}), path),
     )
@@ -315,9 +313,13 @@ def _table(content: Any, path: Path, where: str) -> dict[str, Parameter]:
         for key in ("value", "std"):
             number = entry[key]
             if isinstance(number, bool) or not isinstance(number, int | float):
-                raise InputError(f"{path}: {where}.{name}.{key} must be a number, found {number!r}")
-            if not math.isfinite(number):
-                raise InputError(f"{path}: {where}.{name}.{key} must be finite, found {number}")
+                raise InputError(
+                    f"{path}: {where}.{name}.{key} must be a number, found {shown(number)}"
+                )
+            if not abs(number) <= sys.float_info.max:
+                raise InputError(
+                    f"{path}: {where}.{name}.{key} must be finite, found {shown(number)}"
+                )
         if entry["std"] < 0.0:
             raise InputError(f"{path}: {where}.{name}.std must not be negative")
         result[name] = Parameter(
@@ -378,7 +380,9 @@ def _covariance(content: Any, path: Path) -> tuple[tuple[str, ...], np.ndarray |
     try:
         names = tuple(content["names"])
         matrix = np.array(content["correlation"], dtype=float)
-    except (KeyError, TypeError, ValueError) as error:
+        if not all(isinstance(name, str) for name in names):
+            raise TypeError("a name that is no text")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: [covariance] needs names and a square correlation") from error
     if matrix.shape != (len(names), len(names)):
         raise InputError(f"{path}: covariance.correlation must be {len(names)} x {len(names)}")

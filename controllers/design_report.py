@@ -9,7 +9,8 @@ from coax_env import figures, hover
 from coax_env.env import CoaxVectorEnv
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from coax_env.vehicle import Vehicle
-from controllers.lqr import LQG, Margins
+from controllers.loading import Controller
+from controllers.lqr import LQG, Margins, frequency_responses
 
 MARGIN_HEADER = ("input", "gain down", "gain up", "phase", "least distance", "at")
 START = {"z": -hover.HEIGHT + 0.5, "psi": 0.5, "phi": 0.08, "u": 0.5}
@@ -34,16 +35,25 @@ def design_page(
     margins: list[Margins],
     disk: float,
     score: dict[str, Any],
+    worst: dict[str, Any],
+    spread: np.ndarray,
     command_line: str = "",
 ) -> str:
-    """The report as HTML text."""
+    """The report as HTML text.
+
+    `worst` is of `evaluate_spread`, `spread` of `lqr.margins_over_spread`, on the same vehicle.
+    """
     gain, phase = disk_in_words(disk)
     lead = [
         f"Flown on {vehicle.name} with its own noisy {controller.sensors} sensors, "
         f"{score['episodes']} flights of {score['seconds']:.0f} s: "
         f"**{100 * score['success_rate']:.0f} % succeed**.",
         f"All four inputs at once may be off by {gain} in gain or {phase} in phase.",
+        spread_in_words(worst, spread),
     ]
+    omega, _, single = frequency_responses(controller)
+    loops = dict(zip((m.input.replace("_", " ") for m in margins), single.T, strict=True))
+    seen_band = omega > 0.06
     t, panels = step_response(controller, vehicle)
     blocks = [figure(figures.histories(t, panels), "From a start that is too low, turned, tilted")]
     seen = [f"{n}: {s:.2g}" for n, s in zip(controller.estimator.states,
@@ -52,6 +62,8 @@ def design_page(
     parts = [
         Section("Margins", [
             table(MARGIN_HEADER, margin_rows(margins), "One input at a time, the others closed"),
+            figure(figures.bode(omega[seen_band], {n: r[seen_band] for n, r in loops.items()}),
+                   "The loop of each input, the others closed"),
             prose("Of the loop with the single-rate equivalent of the multi-rate filter."),
         ]),
         Section("A flight", blocks),
@@ -66,6 +78,17 @@ def design_page(
     return page(f"Hover controller for {vehicle.name}", lead, parts, kicker="Controller design")
 
 
+def spread_in_words(worst: dict[str, Any], spread: np.ndarray) -> str:
+    """What is left on the worst of the vehicles drawn from the file's spread."""
+    gain, phase = disk_in_words(float(spread.min()))
+    return (
+        f"Worst of {len(worst['vehicles'])} vehicles drawn from the file's spread: "
+        f"{100 * worst['success_rate']:.0f} % of the flights succeed, cost {worst['mean_cost']:.2g} "
+        f"(median {np.median([v['mean_cost'] for v in worst['vehicles']]):.2g}); "
+        f"of {len(spread)} more: {gain} in gain or {phase} in phase."
+    )
+
+
 def disk_in_words(disk: float) -> tuple[str, str]:
     """A disk margin as the gain factor and the phase it allows."""
     factor = (2.0 + disk) / (2.0 - disk) if disk < 2.0 else np.inf
@@ -73,7 +96,7 @@ def disk_in_words(disk: float) -> tuple[str, str]:
 
 
 def step_response(
-    controller: LQG, vehicle: Vehicle, seconds: float = 8.0
+    controller: Controller, vehicle: Vehicle, seconds: float = 8.0
 ) -> tuple[np.ndarray, list[tuple[str, dict[str, np.ndarray]]]]:
     """True states of one flight from START on noisy sensors: time (n,) and panels of curves."""
     from coax_env.layout import N_STATES, STATES

@@ -21,10 +21,12 @@ from scipy.linalg import schur
 from coax_env import hover
 from coax_env.errors import InputError
 from coax_env.fleet import DT, Nominal, action_map
+from coax_env.jit import compiled
 from coax_env.layout import CHANNELS, FULL_STATES, N_COMMANDS
 from coax_env.linear import sampled
 from coax_env.sensors import BASE_RATE, Sensor, is_new, slow_instruments, suite
 from coax_env.vehicle import Vehicle
+from controllers.target import TargetView
 
 DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; not the fly-bar's, from which it must be told
 FORCE_SHARE = 0.05  # std of the disturbing force, of the weight
@@ -129,7 +131,7 @@ def design_estimator(
     vehicle: Vehicle, nominal: Nominal = None, sensors: str = "onboard"
 ) -> EstimatorDesign:
     """The filter for a vehicle and a sensor suite. A pure servo delay is taken as a lag."""
-    used = [s for s in suite(sensors) if s.index != _SPEED]  # |V| has no slope at hover
+    used = [s for s in suite(sensors, vehicle) if s.index != _SPEED]  # |V| has no slope at hover
     A_flown, B_flown, C_channels, D_channels, x_trim, u_trim = sampled(delay_as_lag(vehicle), DT)
     A, B = np.eye(len(_NAMES)), np.zeros((len(_NAMES), N_COMMANDS))
     A[:_N_FULL, :_N_FULL], B[:_N_FULL] = A_flown, B_flown
@@ -198,7 +200,8 @@ def integrated_readings(design: EstimatorDesign) -> dict[str, float]:
 class Tracker:
     """The running filter, for one helicopter or many, and the integrals of some readings.
 
-    In every control period: `see` the observation, then tell what was done with `acted`.
+    In every control period: `see` the observation, then tell what was done with `acted`. Where the
+    observation has a target, all is relative to it (controllers/target.py).
     """
 
     def __init__(self, design: EstimatorDesign, count: int = 1) -> None:
@@ -208,21 +211,30 @@ class Tracker:
         integrated = integrated_readings(design)
         self._integrated = [names.index(name) for name in integrated]
         self._most = _WINDUP * np.array(list(integrated.values()))
-        self._pairs = [(names.index(a), names.index(b)) for a, b in _PAIRS if a in names]
-        self._heading = names.index("psi") if "psi" in names else None
-        self._flags = np.where(design.flag_places >= 0, design.flag_places, 0)
-        self._always = design.flag_places < 0
+        pairs = [(names.index(a), names.index(b)) for a, b in _PAIRS if a in names]
+        self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+        self._view = TargetView(design.sensors)
+        self._asked = np.zeros((count, 4))
+        self._there = np.ones(count, dtype=np.bool_)
+        self._heading = names.index("psi") if "psi" in names else -1
         self.offset = design.action_trim - design.command_trim
         self._first = np.zeros(len(design.states))
         for k, name in enumerate(_NAMES[16:20]):
             if name in design.states:
                 self._first[design.index(name)] = self.offset[k]
+        self._A, self._B, self._C, self._D, self._first_gain, self._gains = (
+            np.ascontiguousarray(np.swapaxes(matrix, -1, -2))  # the kernel adds up columns
+            for matrix in (
+                design.A, design.B, design.C, design.D, design.first_gain[None], design.gains,
+            )
+        )  # fmt: skip
         self.state = np.zeros((count, len(design.states)))
         self.integrals = np.zeros((count, len(integrated)))
         self._readings = np.zeros((count, len(names)))
         self._command = np.zeros((count, N_COMMANDS))
         self._rows = np.zeros(count, dtype=np.int64)
-        self.reset(np.ones(count, dtype=bool))
+        self._every = np.ones(count, dtype=np.bool_)
+        self.reset(self._every)
 
     def reset(self, which: np.ndarray) -> None:
         """Forget everything in the rows of a mask: their next observation is a flight's first."""
@@ -237,58 +249,110 @@ class Tracker:
         Returns:
             what is known, (count, n + i): the estimate and the integrals.
         """
-        if which is None:
-            self.state, self._readings = self._corrected(
-                observations, self.state, self._command, self._rows
-            )
-        elif which.any():
-            self.state[which], self._readings[which] = self._corrected(
-                observations[which], self.state[which], self._command[which], self._rows[which]
-            )
+        design = self.design
+        which = self._every if which is None else which
+        observations = np.asarray(observations)
+        if self._view.aims(observations):
+            observations = self._aimed(observations, which)
+        _correct(
+            which, observations, self._rows,
+            self._command, design.reading_places, design.flag_places, self._pairs, self._heading,
+            design.reading_trim, self._C, self._D, self._first_gain, self._gains, self.state,
+            self._readings,
+        )  # fmt: skip
         return np.hstack([self.state, self.integrals])
+
+    def _aimed(self, observations: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Observations from the point asked for; where that has moved, the estimate moves too."""
+        seen, asked, there = self._view.seen(observations)
+        moved = np.where((self._rows > 0)[:, None], asked - self._asked, 0.0)[which]
+        heading = asked[which, 3] + seen[which, self._view.names.index("psi")]
+        cosine, sine = np.cos(heading), np.sin(heading)
+        changes = {
+            "x": cosine * moved[:, 0] + sine * moved[:, 1],
+            "y": cosine * moved[:, 1] - sine * moved[:, 0],
+            "z": moved[:, 2],
+            "psi": (moved[:, 3] + math.pi) % (2.0 * math.pi) - math.pi,
+        }
+        for name, change in changes.items():
+            if name in self.design.states:
+                self.state[which, self.design.index(name)] -= change
+        self._asked[which], self._there[which] = asked[which], there[which]
+        return seen
 
     def acted(self, actions: np.ndarray) -> None:
         """Move on by one control period under actions (count, 4)."""
-        design = self.design
-        self._command = self.offset + design.action_scale * actions
-        self.state = self.state @ design.A.T + self._command @ design.B.T
-        self.integrals += DT * self._readings[:, self._integrated]
+        self._command = self.offset + self.design.action_scale * actions
+        _predict(self._command, self._A, self._B, self.state)
+        self.integrals += DT * self._readings[:, self._integrated] * self._there[:, None]
         np.clip(self.integrals, -self._most, self._most, out=self.integrals)
         self._rows += 1
 
-    def _corrected(
-        self, observations: np.ndarray, state: np.ndarray, command: np.ndarray, rows: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """State after the readings, and the readings as deviations, horizontal ones turned."""
-        design = self.design
-        y = observations[:, design.reading_places].astype(float)
-        if self._heading is not None:
-            cosine, sine = np.cos(y[:, self._heading]), np.sin(y[:, self._heading])
-            for a, b in self._pairs:
-                north, east = y[:, a].copy(), y[:, b].copy()
-                y[:, a] = cosine * north + sine * east
-                y[:, b] = cosine * east - sine * north
-        y -= design.reading_trim
-        innovation = y - state @ design.C.T - command @ design.D.T
-        if self._heading is not None:
-            y[:, self._heading] = _wrapped(y[:, self._heading])
-            innovation[:, self._heading] = _wrapped(innovation[:, self._heading])
-        innovation *= self._always | (observations[:, self._flags] > 0.5)
-        phase = rows % len(design.gains)
-        if (rows == rows[0]).all():
-            gain = design.first_gain if rows[0] == 0 else design.gains[phase[0]]
-            return state + innovation @ gain.T, y
-        state = state.copy()
-        for k, gain in enumerate(design.gains):
-            at = (phase == k) & (rows > 0)
-            state[at] += innovation[at] @ gain.T
-        at = rows == 0
-        state[at] += innovation[at] @ design.first_gain.T
-        return state, y
+
+@compiled()
+def _wrapped(angle):
+    """An angle [rad] within -pi .. pi."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+@compiled(fastmath={"contract"})
+def _add_product(transposed, vector, total):
+    """total += transposed' vector, column by column: fast without another order of the sums."""
+    for k in range(len(vector)):
+        for j in range(len(total)):
+            total[j] += transposed[k, j] * vector[k]
+
+
+@compiled(fastmath={"contract"})
+def _correct(
+    which, observations, rows, command, places, flags, pairs, heading,
+    trim, C_by_state, D_by_command, first_gain, gains, state, readings,
+):  # fmt: skip
+    """States after the new readings, and the readings as deviations, horizontal ones turned.
+
+    See EstimatorDesign for `places` to `gains`, matrices transposed; `heading` is the reading of
+    it, -1 for none. `state` (count, n) and `readings` (count, m) are changed in place.
+    """
+    n, m = C_by_state.shape
+    expected = np.empty(m)
+    for i in range(len(which)):
+        if not which[i]:
+            continue
+        y, x = readings[i], state[i]
+        for k in range(m):
+            y[k] = observations[i, places[k]]
+        if heading >= 0:
+            cosine, sine = math.cos(y[heading]), math.sin(y[heading])
+            for j in range(len(pairs)):
+                north, east = y[pairs[j, 0]], y[pairs[j, 1]]
+                y[pairs[j, 0]] = cosine * north + sine * east
+                y[pairs[j, 1]] = cosine * east - sine * north
+        expected[:] = 0.0
+        _add_product(C_by_state, x, expected)
+        _add_product(D_by_command, command[i], expected)
+        gain = first_gain[0] if rows[i] == 0 else gains[rows[i] % len(gains)]
+        for k in range(m):
+            y[k] -= trim[k]
+            if k == heading:
+                y[k] = _wrapped(y[k])
+            if flags[k] >= 0 and observations[i, flags[k]] <= 0.5:
+                continue
+            innovation = y[k] - expected[k]
+            if k == heading:
+                innovation = _wrapped(innovation)
+            for j in range(n):
+                x[j] += gain[k, j] * innovation
+
+
+@compiled(fastmath={"contract"})
+def _predict(command, A_by_state, B_by_command, state):
+    """Move states (count, n) on by one control period, in place: x = A x + B du."""
+    before = np.empty(state.shape[1])
+    for i in range(len(state)):
+        before[:] = state[i]
+        state[i] = 0.0
+        _add_product(A_by_state, before, state[i])
+        _add_product(B_by_command, command[i], state[i])
 
 
 def _trim_readings(vehicle: Vehicle, x: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""How well a controller hovers: the figures of score.json, from true states."""
+"""How well a controller flies: the figures of score.json, from true states."""
 
 import math
 from collections.abc import Callable
@@ -7,17 +7,11 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from coax_env import hover
+from coax_env import hover, tasks
 from coax_env.env import CoaxVectorEnv
 from coax_env.errors import InputError
 from coax_env.vehicle import Vehicle, load_vehicle
 from controllers.loading import Controller
-
-SETTLED = 3.0  # [s] from here on the success conditions count
-HIGHEST_HEIGHT_RMS = 0.10  # [m]
-HIGHEST_SPEED_RMS = 0.25  # [m/s]
-HIGHEST_HEADING_RMS = 10.0  # [deg]
-FARTHEST_DRIFT = 2.0  # [m]
 
 
 def evaluate(
@@ -32,11 +26,13 @@ def evaluate(
 ) -> dict[str, Any]:
     """Fly ``episodes`` flights at once, seeds seed, seed + 1, ..., and judge them.
 
-    Success, from true states after the first 3 s: flown to the end, height rms < 0.10 m, speed rms
-    < 0.25 m/s, heading rms < 10 deg, drift < 2 m; drift is the largest horizontal distance from
-    the place at 3 s. The rms figures are pooled over what was flown after 3 s. ``mean_cost`` is the
-    mean of `hover.cost` over every step; steps not flown cost hover.CRASHED_COST. ``effort`` is the
-    rms of the action vector.
+    Success is `tasks.succeeded`'s, from true states: hovering, flown to the end, and after the
+    first 3 s height rms < 0.10 m, speed rms < 0.25 m/s, heading rms < 10 deg, drift < 2 m, the
+    largest horizontal distance from the place at 3 s (in ``position`` from the target); of
+    ``waypoints`` those given must be reached, or the first of those drawn. The rms figures are
+    pooled over what was flown after 3 s. ``mean_cost`` is the mean of `hover.cost` about the target
+    over every step; steps not flown cost hover.CRASHED_COST. ``effort`` is the rms of the action
+    vector.
 
     Args:
         sensors: default the controller's own suite, which it must be.
@@ -46,8 +42,8 @@ def evaluate(
     Returns:
         score.json; a figure without a flight to take it from is None.
     """
-    if episodes < 1 or not seconds > SETTLED:
-        raise InputError(f"need at least one episode of more than {SETTLED} s")
+    if episodes < 1 or not seconds > tasks.SETTLED:
+        raise InputError(f"need at least one episode of more than {tasks.SETTLED} s")
     if sensors not in (None, controller.sensors):
         raise InputError(f"this controller needs sensors {controller.sensors!r}, not {sensors!r}")
     vehicle = load_vehicle(vehicle)
@@ -55,23 +51,27 @@ def evaluate(
         episodes, vehicle, controller.nominal, controller.sensors,
         autoreset_mode=AutoresetMode.DISABLED, **env_arguments,
     )  # fmt: skip
-    steps, settled = round(seconds / hover.CONTROL_PERIOD), round(SETTLED / hover.CONTROL_PERIOD)
-    tally = _Tally(episodes)
-    observations, _ = env.reset(seed=seed)
+    steps = round(seconds / hover.CONTROL_PERIOD)
+    tally = _Tally(episodes, env_arguments.get("task", "hover"), env_arguments.get("target"))
+    observations, info = env.reset(seed=seed)
     controller.reset(episodes)
-    alive = np.ones(episodes, dtype=bool)
     for step in range(steps):
         actions = np.nan_to_num(controller.act(observations))
+        targets = info.get("target", tally.targets)
         observations, rewards, terminated, _, info = env.step(actions)
-        tally.add(alive, info["state"], np.clip(actions, -1.0, 1.0), rewards, step + 1 >= settled)
-        alive &= ~terminated
+        late = (step + 1) * hover.CONTROL_PERIOD >= tasks.SETTLED
+        tally.add(info, targets, np.clip(actions, -1.0, 1.0), rewards, late)
+        tally.alive &= ~terminated
         if progress:
             progress(1)
-    return tally.score(controller.kind, vehicle.name, alive, steps) | {
-        "survival_rate": float(alive.mean()),
+    return tally.score(steps) | {
+        "controller": controller.kind,
+        "vehicle": vehicle.name,
+        "episodes": episodes,
         "seconds": seconds,
         "seed": seed,
         "sensors": controller.sensors,
+        "task": tally.task,
         "cost": {
             "weights": hover.COST_WEIGHTS,
             "limits": hover.LIMITS,
@@ -80,62 +80,109 @@ def evaluate(
     }
 
 
+def evaluate_spread(
+    controller: Controller,
+    vehicle: str | Vehicle,
+    vehicles: int = 50,
+    episodes: int = 20,
+    seconds: float = 20.0,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+    **env_arguments: Any,
+) -> dict[str, Any]:
+    """`evaluate` on vehicles drawn from a vehicle's spread, the same seeds on each.
+
+    Returns:
+        score.json of the vehicle with the lowest success rate (the highest cost among equals), with
+        ``"vehicles"``: the figures of each, and what it was drawn as.
+    """
+    if vehicles < 1:
+        raise InputError(f"need at least one drawn vehicle, found {vehicles}")
+    vehicle = load_vehicle(vehicle)
+    rng = np.random.default_rng(seed)
+    scores, drawn = [], []
+    for _ in range(vehicles):
+        one = vehicle.draw(rng)
+        scores.append(evaluate(controller, one, episodes, seconds, seed, **env_arguments))
+        drawn.append(one.values())
+        if progress:
+            progress(1)
+    worst = min(scores, key=lambda score: (score["success_rate"], -score["mean_cost"]))
+    table = [
+        {name: score[name] for name in FIGURES} | {"values": values}
+        for score, values in zip(scores, drawn, strict=True)
+    ]
+    return worst | {"vehicles": table}
+
+
+FIGURES = (
+    "success_rate", "survival_rate", "mean_cost", "height_rms_m", "velocity_rms_mps",
+    "heading_rms_deg", "drift_m", "effort",
+)  # fmt: skip
+"""What a table of scores shows."""
+
+
 class _Tally:
     """Sums over every flight, kept while they are flown."""
 
-    def __init__(self, count: int) -> None:
-        self.count = count
+    def __init__(self, count: int, task: str, course: Any) -> None:
+        self.count, self.task = count, task
+        self.alive = np.ones(count, dtype=bool)
+        self.targets = np.tile([0.0, 0.0, -hover.HEIGHT, 0.0], (count, 1))
+        self.wanted = max(1, len(tasks.course(task, course)))
         self.cost, self.reward, self.effort = np.zeros(count), np.zeros(count), np.zeros(count)
         self.flown, self.judged = np.zeros(count), np.zeros(count)
         self.height, self.speed, self.heading = np.zeros(count), np.zeros(count), np.zeros(count)
-        self.drift = np.zeros(count)
+        self.drift, self.reached = np.zeros(count), np.zeros(count)
         self.place: np.ndarray | None = None
 
     def add(
         self,
-        alive: np.ndarray,
-        states: np.ndarray,
+        info: dict[str, Any],
+        targets: np.ndarray,
         actions: np.ndarray,
         rewards: np.ndarray,
-        settled: bool,
+        late: bool,
     ) -> None:
-        finite = alive & np.isfinite(states).all(axis=1)
+        """Count one period: states after `actions`, judged about the targets before them."""
+        states = info["state"]
+        finite = self.alive & np.isfinite(states).all(axis=1)
         states = np.where(finite[:, None], states, 0.0)
-        self.cost += np.where(finite, hover.cost(states, actions), 0.0)
-        self.cost += np.where(finite, 0.0, hover.CRASHED_COST)
+        self.cost += np.where(finite, hover.cost(states, actions, targets), hover.CRASHED_COST)
         self.reward += np.where(finite, rewards, 0.0)
         self.effort += np.where(finite, (actions.astype(float) ** 2).sum(axis=1), 0.0)
         self.flown += finite
-        if not settled:
+        self.reached = np.where(finite, info.get("reached", 0), self.reached)
+        if not late:
             return
         if self.place is None:
             self.place = states[:, 13:15].copy()
-        heading = (states[:, 12] + math.pi) % (2.0 * math.pi) - math.pi
-        self.height += np.where(finite, (states[:, 15] + hover.HEIGHT) ** 2, 0.0)
+        place = self.place if self.task == "hover" else targets[:, 0:2]
+        heading = (states[:, 12] - targets[:, 3] + math.pi) % (2.0 * math.pi) - math.pi
+        self.height += np.where(finite, (states[:, 15] - targets[:, 2]) ** 2, 0.0)
         self.speed += np.where(finite, (states[:, 0:3] ** 2).sum(axis=1), 0.0)
         self.heading += np.where(finite, heading**2, 0.0)
         self.judged += finite
-        away = np.linalg.norm(states[:, 13:15] - self.place, axis=1)
+        away = np.linalg.norm(states[:, 13:15] - place, axis=1)
         self.drift = np.maximum(self.drift, np.where(finite, away, 0.0))
 
-    def score(self, kind: str, vehicle: str, alive: np.ndarray, steps: int) -> dict[str, Any]:
+    def score(self, steps: int) -> dict[str, Any]:
+        """The figures, of flights that should have had so many steps."""
         judged = np.maximum(self.judged, 1.0)
         height = np.sqrt(self.height / judged)
         speed = np.sqrt(self.speed / judged)
-        heading = np.degrees(np.sqrt(self.heading / judged))
-        success = (
-            alive
-            & (height < HIGHEST_HEIGHT_RMS)
-            & (speed < HIGHEST_SPEED_RMS)
-            & (heading < HIGHEST_HEADING_RMS)
-            & (self.drift < FARTHEST_DRIFT)
-        )
+        heading = np.sqrt(self.heading / judged)
+        limit = tasks.SUCCESS
         but_drift = (
-            alive
-            & (height < HIGHEST_HEIGHT_RMS)
-            & (speed < HIGHEST_SPEED_RMS)
-            & (heading < HIGHEST_HEADING_RMS)
+            self.alive
+            & (height < limit["height"])
+            & (speed < limit["speed"])
+            & (heading < limit["heading"])
         )
+        success = but_drift & (self.drift < limit["drift"])
+        moves_on = tasks.task(self.task).moves_on
+        if moves_on:
+            success = self.alive & (self.reached >= self.wanted)
 
         def pooled(squares: np.ndarray) -> float | None:
             total = self.judged.sum()
@@ -143,10 +190,7 @@ class _Tally:
 
         heading_rms = pooled(self.heading)
         seen = self.judged > 0
-        return {
-            "controller": kind,
-            "vehicle": vehicle,
-            "episodes": self.count,
+        figures = {
             "success_rate": float(success.mean()),
             "mean_cost": float(self.cost.mean() / steps),
             "mean_return": float(self.reward.mean()),
@@ -156,5 +200,8 @@ class _Tally:
             "drift_m": float(self.drift[seen].mean()) if seen.any() else None,
             "effort": float(math.sqrt(self.effort.sum() / max(self.flown.sum(), 1.0))),
             "success_but_drift_rate": float(but_drift.mean()),
+            "survival_rate": float(self.alive.mean()),
             "worst_height_rms_m": float(height[seen].max()) if seen.any() else None,
+            "worst_cost": float(self.cost.max() / steps),
         }
+        return figures | ({"mean_reached": float(self.reached.mean())} if moves_on else {})

@@ -1,12 +1,35 @@
-"""What every controller can do, and how a saved one is read."""
+"""What every controller can do, and how one is got: by name, or from its file."""
 
 import json
+from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from coax_env.errors import InputError
+from coax_env.fleet import Nominal
+from coax_env.vehicle import Vehicle
+
+FORMAT = "coax-controller"
+VERSION = 1
+"""Of controller.json, whatever the kind."""
+
+KINDS = {
+    "lqr": "linear feedback of the exact state (--sensors state); on noisy sensors: lqg",
+    "lqi": "feedback of the exact state with integrals of height, heading and position",
+    "lqg": "lqi's feedback on a Kalman filter's estimate from noisy sensors",
+    "ppo": "a trained policy on that filter's estimate; the shipped one",
+    "pid": "cascaded loops on the raw sensors, tuned by hand",
+}
+"""The controllers by name."""
+
+_CLASSES = {
+    "lqr": ("state_feedback", "StateFeedback"),
+    "lqi": ("state_feedback", "StateFeedback"),
+    "lqg": ("lqr", "LQG"),
+    "pid": ("pid", "PID"),
+}
 
 
 class Controller(Protocol):
@@ -14,7 +37,7 @@ class Controller(Protocol):
 
     @property
     def kind(self) -> str:
-        """A word for tables: ``"lqg"``, ``"ppo"``."""
+        """A word for tables, a key of KINDS."""
 
     @property
     def sensors(self) -> str:
@@ -31,32 +54,58 @@ class Controller(Protocol):
         """Observation (n_obs,) or (count, n_obs) to action (4,) or (count, 4)."""
 
 
+def make_controller(
+    name: str | Path,
+    vehicle: str | Vehicle = "lama400d",
+    nominal: Nominal = None,
+    sensors: str | None = None,
+) -> Controller:
+    """A controller by a name of KINDS, designed on a vehicle for a suite, or read from a file.
+
+    ``sensors`` defaults to ``onboard``; ``lqi`` is given the exact state, the shipped policy of
+    ``ppo`` and a file have suites of their own.
+    """
+    from controllers import lqr, pid, policy, state_feedback
+
+    if (name in ("lqr", "lqi") and sensors == "state") or (name == "lqi" and sensors is None):
+        return state_feedback.design(vehicle, nominal, integral=name == "lqi")
+    if name == "lqi":
+        raise InputError(f"lqi needs sensors 'state', not {sensors!r}: lqg is for noisy ones")
+    if name in ("lqr", "lqg"):
+        return lqr.design(vehicle, nominal, sensors or "onboard")
+    if name == "pid":
+        return pid.design(vehicle, nominal, sensors or "onboard")
+    if name == "ppo":
+        return policy.load_policy(policy.SHIPPED)
+    return load_controller(name)
+
+
 def load_controller(path: str | Path) -> Controller:
-    """Read a controller.json of `design_lqr.py` or a policy.zip of `train_ppo.py`.
+    """Read a controller.json or a policy.zip; nothing in the file is run.
 
     Raises:
         InputError: no such file, or not one of these.
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"no controller {str(path)!r}: neither lqr nor a controller's file")
+        raise InputError(f"no controller {str(path)!r}: neither a file nor {', '.join(KINDS)}")
     if path.suffix == ".zip":
-        from controllers.ppo import load_policy
+        from controllers.policy import load_policy
 
         return load_policy(path)
-    from controllers.lqr import FORMAT, LQG, VERSION
-
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise InputError(f"{path}: not a JSON file ({error})") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"{path}: not a controller of this project (format is not {FORMAT!r})")
-    if content.get("version") != VERSION or content.get("kind") != LQG.kind:
+    if content.get("version") != VERSION or content.get("kind") not in _CLASSES:
         raise InputError(
             f"{path}: version {content.get('version')!r} of kind {content.get('kind')!r} is unknown"
         )
+    module, name = _CLASSES[content["kind"]]
     try:
-        return LQG.from_dict(content)
+        controller: Any = getattr(import_module(f"controllers.{module}"), name)
+        return controller.from_dict(content)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: a field is missing or of the wrong kind ({error})") from error

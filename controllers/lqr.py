@@ -7,6 +7,7 @@ velocity stands for it: the machine then holds still, and its place drifts.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,8 @@ from controllers.estimator import (
     design_estimator,
     integrated_readings,
 )
+from controllers.loading import FORMAT, VERSION
 
-FORMAT = "coax-controller"
-VERSION = 1
 INPUT_NAMES = ("rotor_upper", "rotor_lower", "swash_lon", "swash_lat")
 
 
@@ -103,27 +103,38 @@ class LQG:
         )
 
 
-def design(vehicle: str | Vehicle, nominal: Nominal = None, sensors: str = "onboard") -> LQG:
+BRISK = {"position": 0.5, "speed": 1.0}
+"""Limits [m, m/s] that make a design go to its target sooner than hover.LIMITS do."""
+
+
+def design(
+    vehicle: str | Vehicle,
+    nominal: Nominal = None,
+    sensors: str = "onboard",
+    limits: Mapping[str, float] | None = None,
+) -> LQG:
     """Design a hover controller on a vehicle.
 
     Args:
         vehicle: what the design is made on: shipped name, path or Vehicle.
         nominal: whose trim centres the action, as in the env.
         sensors: the suite it will be given.
+        limits: errors that count 1 in the cost, where not hover.LIMITS, such as BRISK.
     """
     import control
 
     vehicle = load_vehicle(vehicle)
     estimator = design_estimator(vehicle, nominal, sensors)
-    A, B, Q, R = regulator_problem(estimator)
+    A, B, Q, R = regulator_problem(estimator, limits)
     gain, cost_to_go, _ = control.dlqr(A, B, Q, R)
     return LQG(vehicle.name, estimator, np.asarray(gain), np.asarray(cost_to_go))
 
 
 def regulator_problem(
-    estimator: EstimatorDesign,
+    estimator: EstimatorDesign, limits: Mapping[str, float] | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """A, B, Q, R of the regulator: states and integrals, actions, `hover.cost` per period."""
+    limits = hover.LIMITS | dict(limits or {})
     integrated = integrated_readings(estimator)
     n = len(estimator.states)
     A, B = np.eye(n + len(integrated)), np.zeros((n + len(integrated), 4))
@@ -138,8 +149,8 @@ def regulator_problem(
     for error, names in errors.items():
         for name in set(names.split()) & set(estimator.states):
             at = estimator.index(name)
-            Q[at, at] += hover.COST_WEIGHTS[error] / hover.LIMITS[error] ** 2
-    R = np.eye(4) * hover.COST_WEIGHTS["effort"] / hover.LIMITS["effort"] ** 2
+            Q[at, at] += hover.COST_WEIGHTS[error] / limits[error] ** 2
+    R = np.eye(4) * hover.COST_WEIGHTS["effort"] / limits["effort"] ** 2
     return A, B, Q, R
 
 
@@ -155,8 +166,10 @@ class Margins:
     crossover_hz: float  # where the phase margin is least
 
 
-def loop(controller: LQG) -> Any:
+def loop(controller: LQG, flown: EstimatorDesign | None = None) -> Any:
     """The loop broken at the plant's four inputs, as a discrete ``control.StateSpace``.
+
+    `flown` is the model of another plant than the one designed on, from `design_estimator`.
 
     The estimator is the single-rate equivalent of the periodic one: slow sensors taken as fast ones
     with as much more noise.
@@ -166,12 +179,12 @@ def loop(controller: LQG) -> Any:
     e = controller.estimator
     integrated = integrated_readings(e)
     n, m, i = len(e.states), len(e.readings), len(integrated)
-    S = np.diag(e.action_scale)
+    S, plant_of = np.diag(e.action_scale), flown or e
     # plant: the states and the command in force; readings see both
     plant = control.ss(
-        np.block([[e.A, np.zeros((n, 4))], [np.zeros((4, n)), np.zeros((4, 4))]]),
-        np.vstack([e.B @ S, S]),
-        np.hstack([e.C, e.D]),
+        np.block([[plant_of.A, np.zeros((n, 4))], [np.zeros((4, n)), np.zeros((4, 4))]]),
+        np.vstack([plant_of.B @ S, S]),
+        np.hstack([plant_of.C, plant_of.D]),
         np.zeros((m, 4)),
         DT,
     )
@@ -200,6 +213,21 @@ def loop(controller: LQG) -> Any:
     return regulator * plant
 
 
+def frequency_responses(
+    controller: LQG, flown: EstimatorDesign | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of `loop`, up to Nyquist: frequencies [rad/s] (w,), the whole loop (w, 4, 4), and the loop of
+    each input with the others closed (w, 4)."""
+    omega = np.append(np.geomspace(1e-3, 0.99 * math.pi / DT, 1000), math.pi / DT)
+    L = np.moveaxis(loop(controller, flown).frequency_response(omega).frdata, -1, 0)
+    single = np.empty(L.shape[:2], dtype=complex)
+    for k in range(4):
+        rest = [i for i in range(4) if i != k]
+        others = np.linalg.solve(np.eye(3) + L[:, rest][:, :, rest], L[:, rest, k : k + 1])
+        single[:, k] = L[:, k, k] - (L[:, k : k + 1, rest] @ others)[:, 0, 0]
+    return omega, L, single
+
+
 def margins(controller: LQG) -> tuple[list[Margins], float]:
     """Classical margins of each input with the others closed, and the disk margin of all four.
 
@@ -208,17 +236,35 @@ def margins(controller: LQG) -> tuple[list[Margins], float]:
     """
     import control
 
-    omega = np.append(np.geomspace(1e-3, 0.99 * math.pi / DT, 1000), math.pi / DT)
-    L = np.moveaxis(loop(controller).frequency_response(omega).frdata, -1, 0)
-    found = []
-    for k, name in enumerate(INPUT_NAMES):
-        rest = [i for i in range(4) if i != k]
-        others = np.linalg.solve(np.eye(3) + L[:, rest][:, :, rest], L[:, rest, k : k + 1])
-        one = L[:, k, k] - (L[:, k : k + 1, rest] @ others)[:, 0, 0]
-        found.append(Margins(name, *_classical(control.frd(one, omega))))
+    omega, L, single = frequency_responses(controller)
+    found = [
+        Margins(name, *_classical(control.frd(one, omega)))
+        for name, one in zip(INPUT_NAMES, single.T, strict=True)
+    ]
+    return found, _disk(L)
+
+
+def margins_over_spread(
+    controller: LQG, vehicle: str | Vehicle, draws: int = 20, seed: int = 0
+) -> np.ndarray:
+    """Disk margin on each of so many vehicles drawn from a vehicle's spread, (draws,); 0: unstable."""
+    import control
+
+    vehicle = load_vehicle(vehicle)
+    rng = np.random.default_rng(seed)
+    found = np.zeros(draws)
+    for k in range(draws):
+        flown = design_estimator(vehicle.draw(rng), controller.nominal, controller.sensors)
+        closed = control.feedback(loop(controller, flown), np.eye(4))
+        if np.abs(closed.poles()).max() < 1.0:
+            found[k] = _disk(frequency_responses(controller, flown)[1])
+    return found
+
+
+def _disk(L: np.ndarray) -> float:
+    """Disk margin of a loop's frequency response (w, 4, 4), all inputs at once."""
     S = np.linalg.inv(np.eye(4) + L)
-    disk = 1.0 / max(_structured(matrix - 0.5 * np.eye(4)) for matrix in S)  # (S - T)/2
-    return found, disk
+    return 1.0 / max(_structured(matrix - 0.5 * np.eye(4)) for matrix in S)  # (S - T)/2
 
 
 def _classical(loop: Any) -> tuple[float, float, float, float, float]:

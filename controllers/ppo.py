@@ -1,13 +1,9 @@
 """PPO (Schulman et al. 2017, by Stable-Baselines3) on what the Kalman filter knows.
 
-Single noisy observations do not show the velocity, so the policy gets the estimate and the
-integrals of controllers/estimator.py, scaled, and its previous action. Torch is imported only when
-a policy is trained or loaded.
+The policy that comes out is controllers/policy.py's. Torch is imported only to train.
 """
 
 import io
-import json
-import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -23,105 +19,45 @@ from coax_env.errors import InputError, require
 from coax_env.files import make_folder
 from coax_env.fleet import DT, Nominal
 from coax_env.vehicle import Vehicle, load_vehicle
-from controllers.estimator import EstimatorDesign, Tracker, design_estimator, integrated_readings
-
-FORMAT = "coax-policy"
-VERSION = 1
-_MEMBER = "coax.json"  # inside policy.zip, beside what Stable-Baselines3 keeps there
+from controllers.estimator import EstimatorDesign, design_estimator
+from controllers.policy import (
+    Eyes,
+    Network,
+    feature_scales,
+    load_policy,
+    n_features,
+    save_policy,
+)
 
 SETTINGS: dict[str, Any] = {
     "n_envs": 256,
-    "n_steps": 64,
-    "batch_size": 1024,
+    "n_steps": 32,
+    "batch_size": 2048,
     "n_epochs": 5,
-    "learning_rate": 1.5e-3,
-    "gamma": 0.99,
-    "gae_lambda": 0.98,
+    "learning_rate": 1e-2,
+    "gamma": 0.97,
+    "gae_lambda": 0.95,
     "clip_range": 0.2,
     "ent_coef": 0.0,
     "log_std_init": -1.0,
-    "net_arch": [64, 64],
-    "episode_s": 10.0,
+    "net_arch": {"pi": [32, 32], "vf": [64]},
+    "activation": "tanh",
+    "episode_s": 5.0,
+    "hold": 4,
+    "cost_weight": 0.03,
+    "threads": 1,
 }
-"""Hyperparameters of `train`, kept in the policy's file."""
+"""Hyperparameters of `train`, kept in the policy's file.
 
-FEATURE_SCALES = {
-    "u": 0.5, "v": 0.5, "w": 0.5, "p": 0.3, "q": 0.3, "r": 0.3,
-    "alpha_l": 0.05, "beta_l": 0.05, "alpha_f": 0.05, "beta_f": 0.05,
-    "phi": 0.1, "theta": 0.1, "psi": 0.3, "x": 1.0, "y": 1.0, "z": 0.2,
-    "swash_lon": 0.1, "swash_lat": 0.1,
-}  # fmt: skip
-"""Size of an estimate that becomes 1 for the policy; the rest by the filter's own figures."""
+``hold``: an action is held for so many control periods while training (it is flown at 100 Hz):
+noise that lasts 40 ms moves the machine, so less of it is needed to learn from. ``cost_weight``: of
+`hover.cost`, added to the env's reward as weight * (MOST_COST - cost), which counts the first seconds
+of a flight as they are judged. ``threads``: torch's; two only help on a machine with nothing else to
+do.
+"""
 
-
-class Policy:
-    """A trained policy with its estimator: a controller like any other."""
-
-    kind = "ppo"
-
-    def __init__(self, model: Any, design: EstimatorDesign, content: dict[str, Any]) -> None:
-        self.model = model
-        self.estimator = design
-        self.content = content
-        self._eyes = _Eyes(design, 1)
-
-    @property
-    def sensors(self) -> str:
-        """The suite it must be given."""
-        return self.estimator.sensors
-
-    @property
-    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Trim and scale of its actions, for ``nominal=`` of the env."""
-        return self.estimator.action_trim, self.estimator.action_scale
-
-    def reset(self, count: int = 1) -> None:
-        """Forget the last flight; `count` helicopters are flown next."""
-        self._eyes = _Eyes(self.estimator, count)
-
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Observation (n_obs,) or (count, n_obs) to action (4,) or (count, 4), float32."""
-        batch = np.atleast_2d(observation)
-        if self._eyes.count != len(batch):
-            self.reset(len(batch))
-        features = self._eyes.see(batch)
-        actions = np.clip(self.model.predict(features, deterministic=True)[0], -1.0, 1.0)
-        self._eyes.acted(actions)
-        return actions if np.ndim(observation) == 2 else actions[0]
-
-
-class _Eyes:
-    """Observations to the policy's features, for one helicopter or many."""
-
-    def __init__(self, design: EstimatorDesign, count: int) -> None:
-        self.count = count
-        self.tracker = Tracker(design, count)
-        self._scale = feature_scales(design)
-        self._last = np.zeros((count, 4))
-
-    def reset(self, which: np.ndarray) -> None:
-        self.tracker.reset(which)
-        self._last[which] = 0.0
-
-    def see(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
-        """Features (count, n), float32, within [-10, 10]."""
-        known = self.tracker.see(observations, which) / self._scale
-        return np.clip(np.hstack([known, self._last]), -10.0, 10.0).astype(np.float32)
-
-    def acted(self, actions: np.ndarray) -> None:
-        self.tracker.acted(actions)
-        self._last = actions.astype(float)
-
-
-def feature_scales(design: EstimatorDesign) -> np.ndarray:
-    """What becomes 1 in each feature but the last four, shape (n + i,)."""
-    sizes = []
-    for name, spread in zip(design.states, design.spread, strict=True):
-        if name.startswith("omega_"):
-            sizes.append(float(design.action_scale[0 if name == "omega_u" else 1]))
-        else:
-            sizes.append(FEATURE_SCALES.get(name, max(3.0 * float(spread), 1e-6)))
-    return np.array(sizes + list(integrated_readings(design).values()))
+MOST_COST = 20.0
+"""Costs above count as this: a start far off may cost as much, and flying on must stay worth it."""
 
 
 def hover_vec_env(
@@ -130,10 +66,14 @@ def hover_vec_env(
     n_envs: int,
     episode_s: float = 10.0,
     reward_scale: float = 1.0,
+    hold: int = 1,
+    cost_weight: float = 0.0,
     **env_arguments: Any,
 ) -> Any:
     """A Stable-Baselines3 VecEnv over CoaxVectorEnv, whose observations are the features.
 
+    One step holds the action for `hold` control periods; its reward is the sum of theirs times the
+    scale, each with `cost_weight` * (MOST_COST - cost) where the flight goes on.
     Each env gets its own ``terminal_observation`` and ``TimeLimit.truncated`` as it ends.
     """
     base = require("stable_baselines3.common.vec_env", "rl")
@@ -147,9 +87,9 @@ def hover_vec_env(
                 max_episode_steps=round(episode_s / DT),
                 autoreset_mode=AutoresetMode.SAME_STEP, **env_arguments,
             )  # fmt: skip
-            self.eyes = _Eyes(design, n_envs)
+            self.eyes = Eyes(design, n_envs, feature_scales(design))
             self.episode_return, self.episode_length = np.zeros(n_envs), np.zeros(n_envs)
-            width = len(feature_scales(design)) + 4
+            width = n_features(design)
             super().__init__(
                 n_envs, Box(-10.0, 10.0, (width,), np.float32), self.env.single_action_space
             )
@@ -161,26 +101,33 @@ def hover_vec_env(
             self._reset_options()
             self.eyes.reset(np.ones(n_envs, dtype=bool))
             self.episode_return[:] = self.episode_length[:] = 0.0
-            return self.eyes.see(observations)
+            return self.eyes.features(self.eyes.see(observations))
 
         def step_async(self, actions: np.ndarray) -> None:
             self._actions = np.clip(actions, -1.0, 1.0)
 
         def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict]]:
-            self.eyes.acted(self._actions)
-            observations, rewards, terminated, truncated, info = self.env.step(self._actions)
-            self.episode_return += rewards
-            self.episode_length += 1
-            done = terminated | truncated
+            actions, total = self._actions, np.zeros(n_envs)
+            over = np.zeros(n_envs, dtype=bool)
             infos: list[dict[str, Any]] = [{} for _ in range(n_envs)]
-            if not done.any():
-                features = self.eyes.see(observations)
-            else:
-                last = self.eyes.see(info["final_obs"])
+            for _ in range(hold):
+                self.eyes.acted(actions)
+                observations, rewards, terminated, truncated, info = self.env.step(actions)
+                done = terminated | truncated
+                ended = info["final_info"]["state"] if done.any() else info["state"]
+                saved = MOST_COST - np.nan_to_num(hover.cost(ended, actions), nan=MOST_COST)
+                bonus = np.where(terminated, 0.0, cost_weight * np.maximum(saved, 0.0))
+                total += np.where(over, 0.0, rewards + bonus)
+                self.episode_return += np.where(over, 0.0, rewards)
+                self.episode_length += ~over
+                if not done.any():
+                    known = self.eyes.see(observations)
+                    continue
+                known = self.eyes.see(info["final_obs"])
+                last = self.eyes.features(known)
                 self.eyes.reset(done)
-                fresh = self.eyes.see(observations, done)
-                features = np.where(done[:, None], fresh, last)
-                for i in np.flatnonzero(done):
+                known = self.eyes.see(observations, done)
+                for i in np.flatnonzero(done & ~over):
                     infos[i] = {
                         "terminal_observation": last[i],
                         "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
@@ -190,8 +137,11 @@ def hover_vec_env(
                             "t": 0.0,
                         },
                     }
-                self.episode_return[done] = self.episode_length[done] = 0.0
-            return features, (reward_scale * rewards).astype(np.float32), done, infos
+                over |= done
+                actions = np.where(over[:, None], 0.0, actions)  # until the next decision
+            self.episode_return[over] = self.episode_length[over] = 0.0
+            rewards = (reward_scale * total).astype(np.float32)
+            return self.eyes.features(known), rewards, over, infos
 
         def close(self) -> None:
             self.env.close()
@@ -224,21 +174,27 @@ def train(
     progress: Callable[[int, dict[str, float]], None] | None = None,
     tensorboard: str | Path | None = None,
     checkpoint_steps: int = 500_000,
+    command_line: str = "",
     **env_arguments: Any,
 ) -> Path:
     """Train a policy; OUT/policy.zip is there from the first checkpoint on, and after Ctrl-C.
 
     Args:
-        steps: env steps, all envs together.
-        resume: a policy.zip to go on from.
+        steps: control periods, all envs together.
+        resume: a policy.zip to go on from. Its training members are pickles, which can run
+            anything: only from those you trust.
         progress: called after every rollout with the steps so far and the mean episode's figures.
+        tensorboard: folder for TensorBoard's logs; its package is the extra ``tensorboard``.
+        command_line: what made the policy, for its description.
         env_arguments: further ones of CoaxVectorEnv, such as ``randomize="posterior"``.
 
     Returns:
         the path of policy.zip.
     """
-    ppo = require("stable_baselines3", "rl")
     callbacks = require("stable_baselines3.common.callbacks", "rl")
+    torch = require("torch", "rl")
+    if tensorboard:
+        require("torch.utils.tensorboard", "tensorboard")
     if steps < 1:
         raise InputError(f"steps must be at least 1, found {steps}")
     path = make_folder(out) / "policy.zip"
@@ -247,42 +203,25 @@ def train(
     design = old.estimator if old else design_estimator(vehicle, nominal, sensors)
     settings = dict(SETTINGS)
     content = {
-        "format": FORMAT,
-        "version": VERSION,
-        "kind": Policy.kind,
         "vehicle": vehicle.name,
+        "command": command_line,
         "seed": seed,
         "steps": steps,
         "settings": settings,
         "cost": {"weights": hover.COST_WEIGHTS, "limits": hover.LIMITS},
         "reward": {"weights": hover.REWARD_WEIGHTS, "scales": hover.REWARD_SCALES},
-        "estimator": design.to_dict(),
     }
     env = hover_vec_env(
         vehicle, design, settings["n_envs"], settings["episode_s"],
-        reward_scale=1.0 - settings["gamma"], **env_arguments,
+        reward_scale=(1.0 - settings["gamma"]) / settings["hold"], hold=settings["hold"],
+        cost_weight=settings["cost_weight"], **env_arguments,
     )  # fmt: skip
     env.seed(seed)
-    if old:
-        model = old.model
-        model.set_env(env)
-    else:
-        rate = settings["learning_rate"]
-        model = ppo.PPO(
-            "MlpPolicy", env, seed=seed, device="cpu", verbose=0,
-            learning_rate=lambda left: rate * max(left, 0.05),
-            tensorboard_log=str(tensorboard) if tensorboard else None,
-            policy_kwargs={
-                "net_arch": settings["net_arch"], "log_std_init": settings["log_std_init"],
-            },
-            **{
-                k: settings[k]
-                for k in (
-                    "n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "clip_range",
-                    "ent_coef",
-                )
-            },
-        )  # fmt: skip
+    torch.set_num_threads(settings["threads"])
+    model = _old_model(resume, env) if resume else _new_model(env, settings, seed, tensorboard)
+
+    def save() -> None:
+        save_policy(path, network(model), design, feature_scales(design), content, _file_of(model))
 
     class Watch(callbacks.BaseCallback):  # type: ignore[name-defined]
         """Reports and saves after rollouts."""
@@ -299,49 +238,59 @@ def train(
                     "return": float(np.mean([e["r"] for e in episodes])) if episodes else 0.0,
                     "seconds": DT * float(np.mean([e["l"] for e in episodes])) if episodes else 0.0,
                 }
-                progress(self.num_timesteps, mean)
-            if self.num_timesteps - self.saved >= checkpoint_steps:
+                progress(self.num_timesteps * settings["hold"], mean)
+            if settings["hold"] * (self.num_timesteps - self.saved) >= checkpoint_steps:
                 self.saved = self.num_timesteps
-                save_policy(self.model, content, path)
+                save()
 
     try:
-        model.learn(steps, callback=Watch(), progress_bar=False)
+        model.learn(max(steps // settings["hold"], 1), callback=Watch(), progress_bar=False)
     finally:
-        save_policy(model, content, path)
+        save()
         env.close()
     return path
 
 
-def save_policy(model: Any, content: dict[str, Any], path: str | Path) -> Path:
-    """Write policy.zip whole or not at all: the model, and the estimator it looks through."""
-    path = Path(path)
+def _new_model(env: Any, settings: dict[str, Any], seed: int, tensorboard: Any) -> Any:
+    ppo = require("stable_baselines3", "rl")
+    nn = require("torch.nn", "rl")
+    rate = settings["learning_rate"]
+    names = ("n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "clip_range", "ent_coef")
+    return ppo.PPO(
+        "MlpPolicy", env, seed=seed, device="cpu", verbose=0,
+        learning_rate=lambda left: rate * max(left, 0.05),
+        tensorboard_log=str(tensorboard) if tensorboard else None,
+        policy_kwargs={
+            "net_arch": settings["net_arch"], "log_std_init": settings["log_std_init"],
+            "activation_fn": {"tanh": nn.Tanh, "relu": nn.ReLU}[settings["activation"]],
+        },
+        **{name: settings[name] for name in names},
+    )  # fmt: skip
+
+
+def _old_model(path: str | Path, env: Any) -> Any:
+    ppo = require("stable_baselines3", "rl")
+    with zipfile.ZipFile(path) as archive:
+        if "policy.pth" not in archive.namelist():
+            raise InputError(f"{path}: cannot be trained on: it holds the plain arrays only")
+    return ppo.PPO.load(path, env, device="cpu")
+
+
+def _file_of(model: Any) -> bytes:
+    """The model as Stable-Baselines3 writes it."""
     buffer = io.BytesIO()
     model.save(buffer)
-    with zipfile.ZipFile(buffer, "a") as archive:
-        archive.writestr(_MEMBER, json.dumps(content, allow_nan=False))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(buffer.getvalue())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
+    return buffer.getvalue()
 
 
-def load_policy(path: str | Path) -> Policy:
-    """Read a policy.zip of `train`."""
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no policy {str(path)!r}")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            content = json.loads(archive.read(_MEMBER))
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not a policy of this project") from error
-    if content.get("format") != FORMAT or content.get("version") != VERSION:
-        raise InputError(f"{path}: version {content.get('version')!r} of a policy is unknown")
-    ppo = require("stable_baselines3", "rl")
-    model = ppo.PPO.load(path, device="cpu")
-    return Policy(model, EstimatorDesign.from_dict(content["estimator"]), content)
+def network(model: Any) -> Network:
+    """The mean of a Stable-Baselines3 policy as plain arrays."""
+    nn = require("torch.nn", "rl")
+    modules = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
+    layers = [
+        (m.weight.detach().numpy().copy(), m.bias.detach().numpy().copy())
+        for m in modules
+        if isinstance(m, nn.Linear)
+    ]
+    tanh = any(isinstance(m, nn.Tanh) for m in modules)
+    return Network(layers, "tanh" if tanh else "relu")

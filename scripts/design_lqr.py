@@ -9,8 +9,14 @@ from coax_env.files import make_folder, write_text
 from coax_env.sensors import SUITES
 from coax_env.vehicle import load_vehicle
 from controllers import lqr
-from controllers.design_report import MARGIN_HEADER, design_page, disk_in_words, margin_rows
-from controllers.evaluation import evaluate
+from controllers.design_report import (
+    MARGIN_HEADER,
+    design_page,
+    disk_in_words,
+    margin_rows,
+    spread_in_words,
+)
+from controllers.evaluation import evaluate, evaluate_spread
 
 
 def main() -> None:
@@ -20,14 +26,20 @@ def main() -> None:
     parser.add_argument(
         "--sensors", default="onboard", help=f"{', '.join(SUITES)} (default: %(default)s)"
     )
+    parser.add_argument(
+        "--vehicles", type=int, default=20,
+        help="how many to draw from the file's spread for the worst case (default: %(default)s)",
+    )  # fmt: skip
     options = parser.parse_args()
 
     vehicle = load_vehicle(options.vehicle)
     controller = lqr.design(vehicle, options.nominal, options.sensors)
     margins, disk = lqr.margins(controller)
     score = evaluate(controller, vehicle, episodes=50, seed=options.seed)
+    worst = evaluate_spread(controller, vehicle, options.vehicles, 5, seed=options.seed)
+    spread = lqr.margins_over_spread(controller, vehicle, options.vehicles, options.seed)
     page = design_page(
-        controller, vehicle, margins, disk, score,
+        controller, vehicle, margins, disk, score, worst, spread,
         "scripts/design_lqr.py " + shlex.join(sys.argv[1:]),
     )  # fmt: skip
     make_folder(options.out)
@@ -45,6 +57,7 @@ def main() -> None:
         f"{score['episodes']} flights of {score['seconds']:.0f} s on this vehicle: "
         f"{100 * score['success_rate']:.0f} % succeed, mean cost {score['mean_cost']:.3g}"
     )
+    print(spread_in_words(worst, spread))
     print(f"controller {path}, report {options.out / 'report.html'}")
 
 

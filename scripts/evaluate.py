@@ -1,48 +1,104 @@
-"""Fly a hover controller many times and judge it from true states."""
+"""Fly a hover controller many times and judge it from true states; or compare all of them."""
+
+import argparse
+import shlex
+import sys
+from typing import Any
 
 import command_line
 from tqdm import tqdm
 
-from coax_env.files import write_json
+from coax_env.files import make_folder, write_json, write_text
 from coax_env.hover import CONTROL_PERIOD
-from coax_env.vehicle import load_vehicle
-from controllers import Controller, load_controller, lqr
-from controllers.evaluation import evaluate
+from coax_env.tasks import TASKS
+from coax_env.vehicle import Vehicle, load_vehicle
+from controllers import comparison, load_controller
+from controllers.evaluation import evaluate, evaluate_spread
+from controllers.loading import KINDS, Controller, make_controller
 
 
 def main() -> None:
     parser = command_line.parser("evaluate", __doc__, seed=True)
     parser.add_argument(
-        "--controller", default="lqr", metavar="lqr|PATH",
-        help="lqr (designed on the vehicle), a controller.json or a policy.zip",
+        "--controller", default="lqr", metavar="NAME|PATH",
+        help="a controller.json, a policy.zip, or "
+        + "; ".join(f"{name}: {words}" for name, words in KINDS.items()),
     )  # fmt: skip
     parser.add_argument(
         "--vehicle", default="lama400d", help="what flies: shipped name or TOML file"
     )
     parser.add_argument("--episodes", type=int, default=100, help="(default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=20.0, help="(default: %(default)s)")
-    parser.add_argument("--sensors", help="for lqr (default: onboard); else the controller's own")
+    parser.add_argument("--sensors", help="to design for (default: onboard); a file has its own")
     parser.add_argument("--wind", type=float, nargs="+", metavar="M/S", help="north east, or speed")
+    parser.add_argument("--turbulence", help="Dryden's: light, moderate, severe, or m/s at 6 m")
+    parser.add_argument("--task", default="hover", choices=list(TASKS), help="(default: hover)")
+    parser.add_argument(
+        "--randomize", choices=["posterior"],
+        help="fly vehicles drawn from the file's spread; the score is of the worst",
+    )  # fmt: skip
+    parser.add_argument("--vehicles", type=int, default=50, help="how many (default: 50)")
+    parser.add_argument(
+        "--compare", action="store_true",
+        help="LQG, PPO, PID and LQI in hover, gusts, wind, on drawn vehicles, and to targets; "
+        "--controller may give the policy",
+    )  # fmt: skip
     options = parser.parse_args()
 
     vehicle = load_vehicle(options.vehicle)
-    controller: Controller
-    if options.controller == "lqr":
-        controller = lqr.design(vehicle, sensors=options.sensors or "onboard")
-    else:
-        controller = load_controller(options.controller)
-    with tqdm(
-        total=round(options.seconds / CONTROL_PERIOD), unit="step", leave=False, disable=None
-    ) as bar:
-        score = evaluate(
-            controller, vehicle, options.episodes, options.seconds, options.seed, options.sensors,
-            bar.update, wind=options.wind,
-        )  # fmt: skip
+    if options.compare:
+        compare(options, vehicle)
+        return
+    controller = make_controller(options.controller, vehicle, None, options.sensors)
+    score = fly(options, vehicle, controller)
     path = write_json(options.out / "score.json", score)
     command_line.print_columns(
-        [[name, words(value)] for name, value in score.items() if not isinstance(value, dict)]
+        [[n, words(v)] for n, v in score.items() if not isinstance(v, dict | list)]
     )
     print(f"score {path}")
+
+
+def fly(options: argparse.Namespace, vehicle: Vehicle, controller: Controller) -> dict[str, Any]:
+    """The score, on the vehicle or on the worst of those drawn from its spread."""
+    env: dict[str, Any] = {"wind": options.wind, "task": options.task}
+    if options.turbulence:
+        env["turbulence"] = strength(options.turbulence)
+    if options.randomize:
+        with tqdm(total=options.vehicles, unit="vehicle", leave=False, disable=None) as bar:
+            return evaluate_spread(
+                controller, vehicle, options.vehicles, options.episodes, options.seconds,
+                options.seed, bar.update, **env,
+            )  # fmt: skip
+    steps = round(options.seconds / CONTROL_PERIOD)
+    with tqdm(total=steps, unit="step", leave=False, disable=None) as bar:
+        return evaluate(
+            controller, vehicle, options.episodes, options.seconds, options.seed, options.sensors,
+            bar.update, **env,
+        )  # fmt: skip
+
+
+def compare(options: argparse.Namespace, vehicle: Vehicle) -> None:
+    """The comparison's table, compare.json and report.html."""
+    policy = None if options.controller in KINDS else load_controller(options.controller)
+    with command_line.progress("compare") as say:
+        content = comparison.compare(
+            vehicle, policy, options.episodes, options.seconds, options.vehicles, options.seed, say
+        )
+    make_folder(options.out)
+    path = write_json(options.out / "compare.json", content)
+    text = comparison.comparison_page(content, "scripts/evaluate.py " + shlex.join(sys.argv[1:]))
+    page = write_text(options.out / "report.html", text)
+    rows = comparison.rows(content["conditions"])
+    command_line.print_columns(comparison.printed(comparison.HEADER, rows))
+    print(f"scores {path}, report {page}")
+
+
+def strength(text: str) -> float | str:
+    """A strength of turbulence as a number where it is one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def words(value: object) -> str:

@@ -1,6 +1,8 @@
 """Train a hover policy with PPO on the Kalman filter's estimate. Ctrl-C keeps what is learnt."""
 
 import os
+import shlex
+import sys
 from typing import Any
 
 import command_line
@@ -20,9 +22,14 @@ def main() -> None:
     parser.add_argument(
         "--sensors", default="onboard", help=f"{', '.join(SUITES)} (default: %(default)s)"
     )
-    parser.add_argument("--steps", type=float, default=3e6, help="of all envs (default: 3e6)")
+    parser.add_argument(
+        "--steps", type=float, default=3e6, help="of all helicopters (default: 3e6)"
+    )
     parser.add_argument("--randomize", choices=["posterior"], help="draw a vehicle every flight")
-    parser.add_argument("--resume", metavar="PATH", help="policy.zip to go on from")
+    parser.add_argument(
+        "--resume", metavar="PATH", help="policy.zip to go on from; it may run code: trust it"
+    )
+    parser.add_argument("--tensorboard", metavar="DIR", help="write TensorBoard's logs there")
     options = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
 
@@ -38,7 +45,8 @@ def main() -> None:
         more: dict[str, Any] = {"randomize": options.randomize} if options.randomize else {}
         path = ppo.train(
             vehicle, options.out, round(options.steps), options.seed, options.nominal,
-            options.sensors, options.resume, progress, **more,
+            options.sensors, options.resume, progress, options.tensorboard,
+            command_line=shlex.join(["scripts/train_ppo.py", *sys.argv[1:]]), **more,
         )  # fmt: skip
     score = evaluate(load_controller(path), vehicle, episodes=100, seed=10_000 + options.seed)
     write_json(options.out / "score.json", score)

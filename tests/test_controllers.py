@@ -1,8 +1,11 @@
 """Controllers: closed-form cost, filter statistics, hover on noisy sensors, files, scores."""
 
+import io
 import json
+import pickle
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import gymnasium
@@ -15,9 +18,12 @@ from coax_env.dynamics import WORK_SIZE, kernel_input, step
 from coax_env.errors import InputError
 from coax_env.fleet import DT
 from coax_env.linear import sampled
-from controllers import load_controller, lqr
+from controllers import comparison, load_controller, lqr, pid, policy, state_feedback
 from controllers.estimator import Tracker, design_estimator, integrated_readings
-from controllers.evaluation import evaluate
+from controllers.evaluation import evaluate, evaluate_spread
+from controllers.loading import make_controller
+from controllers.policy import Network
+from controllers.target import TargetView
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 LAMA = coax_env.load_vehicle("lama400d")
@@ -290,6 +296,233 @@ def test_scripts_design_and_evaluate(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+# --- other controllers, tasks and vehicles ------------------------------------------------------
+
+
+@pytest.mark.parametrize("integral", [False, True])
+def test_state_feedback_costs_what_its_riccati_solution_says(integral):
+    """x'Px for LQR and LQI, flown with the kernel itself near trim."""
+    design = state_feedback.design(LAMA, integral=integral)
+    model = design_estimator(LAMA, sensors="state")
+    _, _, Q, R = lqr.regulator_problem(model)
+    kept = np.r_[0:20, len(model.states) : len(model.states) + len(design.integrated)]
+    Q = Q[np.ix_(kept, kept)]
+    *_, trim, command = sampled(LAMA, DT)
+    x = trim.copy()
+    x[:16] += 1e-4 * np.random.default_rng(0).standard_normal(16)
+    known = np.concatenate([x[:20] - trim[:20], np.zeros(len(design.integrated))])
+    predicted, simulated, work = known @ design.cost_to_go @ known, 0.0, np.zeros(WORK_SIZE)
+    for _ in range(6000):
+        action = design.act(x[:20])
+        simulated += known @ Q @ known + action @ R @ action
+        step(x, kernel_input(command + design.action_scale * action), DT, LAMA.vector, work, x)
+        known = np.concatenate([x[:20] - trim[:20], design._integrals[0]])
+    assert simulated == pytest.approx(predicted, rel=2e-3)
+
+
+def test_lqi_takes_away_the_offset_that_lqr_leaves():
+    heavy = LAMA.with_effect("thrust_scale", scale=-0.05)
+    rms = {}
+    for integral in (False, True):
+        score = evaluate(state_feedback.design(LAMA, integral=integral), heavy, 4, 15.0)
+        rms[integral] = score["height_rms_m"]
+    assert rms[True] < 0.3 * rms[False]
+
+
+def test_the_exact_state_costs_less_than_noisy_sensors(onboard):
+    exact = evaluate(state_feedback.design(LAMA), LAMA, 10, 10.0)
+    noisy = evaluate(onboard, LAMA, 10, 10.0)
+    assert exact["mean_cost"] < 0.7 * noisy["mean_cost"]
+
+
+@pytest.mark.parametrize("sensors", ["onboard", "mocap"])
+def test_pid_hovers_on_raw_sensors(sensors):
+    score = evaluate(pid.design(LAMA, sensors=sensors), LAMA, episodes=10, seconds=15.0)
+    assert score["success_rate"] == 1.0
+
+
+def test_pid_needs_attitude():
+    with pytest.raises(InputError, match="pid needs"):
+        pid.design(LAMA, sensors="paper")
+
+
+@pytest.mark.parametrize("design", [lqr.design, pid.design, state_feedback.design])
+def test_hover_controllers_fly_to_a_target_and_stay(design):
+    sensors = {} if design is state_feedback.design else {"sensors": "mocap"}
+    more = {} if design is pid.design else {"limits": lqr.BRISK}
+    controller = design(LAMA, **sensors, **more)
+    env = gymnasium.make_vec(
+        "CoaxHeli-v0", num_envs=4, vectorization_mode="vector_entry_point", task="position",
+        target=(1.5, -1.0, 2.0, 1.0), sensors=controller.sensors, max_episode_steps=None,
+    )  # fmt: skip
+    observations, _ = env.reset(seed=0)
+    controller.reset(4)
+    for _ in range(1500):
+        observations, *_, info = env.step(controller.act(observations))
+    error = info["state"][:, [13, 14, 15, 12]] - [1.5, -1.0, -2.0, 1.0]
+    assert np.abs(error).max() < 0.3
+
+
+def test_a_target_seen_from_itself_is_a_hover():
+    """At the target, heading as asked, the observation is that of a hover; the way there is kept."""
+    view = TargetView("mocap")
+    rng = np.random.default_rng(0)
+    names = view.names
+    for _ in range(20):
+        psi, goal = rng.uniform(-3.0, 3.0), rng.uniform(-5.0, 5.0, 2)
+        base = np.zeros((1, view.width))
+        base[0, names.index("psi")] = psi
+        base[0, [names.index("pn"), names.index("pe")]] = goal
+        base[0, names.index("h")] = 2.2
+        base[0, [names.index("vn"), names.index("ve")]] = np.cos(psi), np.sin(psi)
+        seen, asked, there = view.seen(np.hstack([base, np.zeros((1, 4))]))
+        assert asked[0] == pytest.approx([*goal, -2.2, psi]) and there[0]
+        assert seen[0, [names.index(n) for n in ("pn", "pe", "psi")]] == pytest.approx(np.zeros(3))
+        assert seen[0, names.index("h")] == pytest.approx(hover.HEIGHT)
+        assert seen[0, [names.index("vn"), names.index("ve")]] == pytest.approx([1.0, 0.0])
+        away = np.array([[0.2, -0.1, 0.05, 0.1]])
+        seen, asked, there = view.seen(np.hstack([base, away]))
+        cosine, sine = np.cos(psi), np.sin(psi)
+        north, east = 0.2 * cosine + 0.1 * sine, 0.2 * sine - 0.1 * cosine
+        assert asked[0] == pytest.approx([goal[0] + north, goal[1] + east, -2.25, psi + 0.1])
+        there_again = np.hypot(*seen[0, [names.index("pn"), names.index("pe")]])
+        assert there_again == pytest.approx(np.hypot(0.2, 0.1)) and there[0]
+        assert not view.seen(np.hstack([base, 10.0 * away]))[2][0]
+
+
+def test_drawn_vehicles_are_judged_by_the_worst(onboard):
+    score = evaluate_spread(onboard, LAMA, vehicles=3, episodes=2, seconds=5.0)
+    rates = [one["success_rate"] for one in score["vehicles"]]
+    assert score["success_rate"] == min(rates) and len(rates) == 3
+    assert len({one["values"]["mass"] for one in score["vehicles"]}) == 3
+    json.dumps(score, allow_nan=False)
+
+
+def test_a_comparison_has_every_controller_in_every_condition():
+    content = comparison.compare(LAMA, episodes=5, seconds=4.0, vehicles=2)
+    for name, row in content["conditions"].items():
+        assert set(row) == {"lqg", "ppo", "pid", "lqi"}
+        assert (row["ppo"] is None) is (name in ("position", "waypoints"))
+    starts = {row["lqg"]["seed"] for row in content["conditions"].values()}
+    assert starts == {0}
+    page = comparison.comparison_page(content)
+    assert "waypoints" in page and len(comparison.rows(content["conditions"])) == 24
+    json.dumps(content, allow_nan=False)
+
+
+@pytest.mark.parametrize("name", ["lqr", "lqi", "lqg", "pid", "ppo"])
+def test_controllers_come_by_name_and_from_their_files(name, tmp_path):
+    controller = make_controller(name, LAMA)
+    assert controller.sensors == ("state" if name == "lqi" else "onboard")
+    if name == "ppo":
+        return
+    again = load_controller(controller.save(tmp_path / "controller.json"))
+    env = gymnasium.make("CoaxHeli-v0", sensors=controller.sensors)
+    observation = env.reset(seed=3)[0]
+    for _ in range(5):
+        action = controller.act(observation)
+        assert np.array_equal(action, again.act(observation))
+        observation = env.step(action)[0]
+
+
+# --- policies as plain arrays --------------------------------------------------------------------
+
+
+def test_the_shipped_policy_hovers_without_torch():
+    code = """
+import sys
+from controllers.evaluation import evaluate
+from controllers.loading import make_controller
+score = evaluate(make_controller("ppo"), "lama400d", episodes=20, seconds=10.0)
+assert not {"torch", "stable_baselines3"} & set(sys.modules)
+print(score["success_rate"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "1.0\n"), done.stderr
+
+
+def test_the_shipped_policy_holds_plain_members_and_its_command():
+    with zipfile.ZipFile(policy.SHIPPED) as archive:
+        assert set(archive.namelist()) == {policy.DESCRIPTION, policy.WEIGHTS}
+        content = json.loads(archive.read(policy.DESCRIPTION))
+    assert content["command"].startswith("scripts/train_ppo.py")
+    assert policy.SHIPPED.stat().st_size < 300_000
+
+
+def test_a_network_is_the_formula():
+    rng = np.random.default_rng(0)
+    W, b, V, c = (rng.standard_normal(shape) for shape in ((3, 5), (3,), (4, 3), (4,)))
+    x = rng.standard_normal((2, 5))
+    expected = np.tanh(x @ W.T + b) @ V.T + c
+    assert Network([(W, b), (V, c)])(x) == pytest.approx(expected)
+
+
+class _Bomb:
+    """Something that runs code when it is unpickled."""
+
+    def __reduce__(self):
+        return (open, ("bombed", "w"))
+
+
+@pytest.mark.parametrize("where", ["weights", "description", "data", "policy.pth", "npz"])
+def test_a_strangers_policy_runs_no_code(where, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    bomb = pickle.dumps(_Bomb())
+    with zipfile.ZipFile(policy.SHIPPED) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    if where == "weights":
+        members[policy.WEIGHTS] = bomb
+    elif where == "description":
+        members[policy.DESCRIPTION] = bomb
+    elif where == "npz":
+        buffer = io.BytesIO()
+        arrays = {"weight_0": np.array([_Bomb()], dtype=object), "bias_0": np.zeros(4)}
+        np.savez(buffer, **arrays)
+        members[policy.WEIGHTS] = buffer.getvalue()
+    else:
+        members[where] = bomb
+    with zipfile.ZipFile("policy.zip", "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    if where in ("weights", "description", "npz"):
+        with pytest.raises(InputError, match="not a policy"):
+            load_controller("policy.zip")
+    else:
+        assert load_controller("policy.zip").kind == "ppo"
+    assert not (tmp_path / "bombed").exists()
+
+
+@pytest.mark.parametrize("change", ["shape", "activation", "scales", "version", "huge"])
+def test_a_policy_that_does_not_fit_gets_one_line(change, tmp_path):
+    known = policy.load_policy(policy.SHIPPED)
+    layers, scales, content = list(known.network.layers), known.scales, {}
+    if change == "shape":
+        layers[0] = (layers[0][0][:, :-1], layers[0][1])
+    network = Network(layers, "exec" if change == "activation" else "tanh")
+    if change == "scales":
+        scales = scales[:-1]
+    if change == "huge":
+        content["note"] = "x" * (17 * 2**20)
+    path = policy.save_policy(tmp_path / "p.zip", network, known.estimator, scales, content)
+    if change == "version":
+        path.write_bytes(_with_version(path, 7))
+    with pytest.raises(InputError) as error:
+        load_controller(path)
+    assert "\n" not in str(error.value)
+
+
+def _with_version(path, version):
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    content = json.loads(members[policy.DESCRIPTION]) | {"version": version}
+    members[policy.DESCRIPTION] = json.dumps(content).encode()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, text in members.items():
+            archive.writestr(name, text)
+    return buffer.getvalue()
+
+
 # --- PPO ------------------------------------------------------------------------------------------
 
 
@@ -325,14 +558,52 @@ def test_ppo_trains_saves_resumes_and_is_judged(tmp_path, monkeypatch):
     monkeypatch.setitem(ppo.SETTINGS, "n_envs", 16)
     monkeypatch.setitem(ppo.SETTINGS, "batch_size", 256)
     seen = []
-    path = ppo.train(LAMA, tmp_path, steps=2048, seed=1, progress=lambda n, _: seen.append(n))
+    path = ppo.train(LAMA, tmp_path, steps=4096, seed=1, progress=lambda n, _: seen.append(n))
     again = ppo.train(LAMA, tmp_path / "more", steps=1024, resume=path)
-    assert seen == [1024, 2048]
+    assert seen == [2048, 4096]
     score = evaluate(load_controller(again), LAMA, episodes=2, seconds=4.0)
     assert set(score) >= CONTRACT_KEYS and score["controller"] == "ppo"
     one = load_controller(path)
     env = gymnasium.make("CoaxHeli-v0")
     assert one.act(env.reset(seed=0)[0]).shape == (4,)
+
+
+@pytest.mark.slow
+def test_a_held_action_earns_the_sum_of_its_periods_and_ends_in_its_own_flight():
+    pytest.importorskip("stable_baselines3")
+    from controllers.ppo import hover_vec_env
+
+    design = design_estimator(LAMA)
+    held, each = (hover_vec_env(LAMA, design, 2, episode_s=0.1, hold=k) for k in (4, 1))
+    for env in (held, each):
+        env.seed(3)
+        env.reset()
+    action = np.array([[0.1, 0.1, 0.05, 0.0], [0.0, 0.0, 0.0, 0.1]], np.float32)
+    for flown in (4, 4, 2):  # a flight of ten periods ends within the third action
+        _, rewards, done, infos = held.step(action)
+        singles = [each.step(action) for _ in range(flown)]
+        assert rewards == pytest.approx(np.sum([r for _, r, *_ in singles], axis=0), rel=1e-5)
+        assert done.all() == (flown == 2)
+    for i in range(2):
+        assert infos[i]["episode"]["l"] == 10
+        last = singles[-1][3][i]["terminal_observation"]
+        assert infos[i]["terminal_observation"] == pytest.approx(last, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_the_plain_arrays_are_stable_baselines_policy(tmp_path, monkeypatch):
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    from controllers import ppo
+
+    monkeypatch.setitem(ppo.SETTINGS, "n_envs", 16)
+    path = ppo.train(LAMA, tmp_path, steps=2048)
+    model = stable_baselines3.PPO.load(path, device="cpu")
+    features = np.random.default_rng(0).normal(size=(7, 33)).astype(np.float32)
+    expected = model.policy.predict(features, deterministic=True)[0]
+    found = np.clip(policy.load_policy(path).network(features), -1.0, 1.0)
+    assert found == pytest.approx(expected, abs=1e-5)
+    with pytest.raises(InputError, match="plain arrays only"):
+        ppo.train(LAMA, tmp_path / "more", steps=512, resume=policy.SHIPPED)
 
 
 @pytest.mark.slow

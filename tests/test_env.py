@@ -19,6 +19,7 @@ from coax_env.errors import InputError
 from coax_env.fleet import DT, action_map, nominal_for
 from coax_env.random_streams import stream_key, two_normals, uniform
 from coax_env.sensors import SUITES, is_new, log_readings, log_suite
+from coax_env.spaces import action_table, observation_table, observed
 
 LAMA = coax_env.load_vehicle("lama400d")
 DELAYED = LAMA.with_effect("servo_delay", time=0.027).with_effect("rotor_drag", coefficient=4e-4)
@@ -36,6 +37,17 @@ def test_check_env_passes_without_a_warning(sensors):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(gymnasium.make("CoaxHeli-v0", sensors=sensors).unwrapped)
+
+
+def test_the_docstring_has_the_spaces_tables():
+    env = coax_env.env.CoaxEnv()
+    doc = [line.strip() for line in coax_env.env.CoaxEnv.__doc__.splitlines()]
+    assert set(action_table()) <= set(doc)
+    assert set(observation_table(observed(env.fleet))) <= set(doc)
+    aimed = coax_env.env.CoaxEnv(sensors="mocap", task="position")
+    assert set(observation_table(observed(aimed.fleet))[-4:]) <= set(doc)
+    assert len(env.observation_units) == len(env.observation_names) == 18
+    assert env.observation_units[0] == "rev/min" and env.observation_units[-1] == "1"
 
 
 def test_gymnasium_checks_the_vector_env_without_a_warning():
@@ -122,6 +134,15 @@ def test_a_row_flies_as_a_single_env_through_every_reset(arguments):
             waiting[i] = over or late
             ends += waiting[i]
     assert ends >= 6
+
+
+def test_rows_without_a_seed_of_their_own_fly_apart():
+    env = CoaxVectorEnv(3)
+    observations, _ = env.reset(seed=[7, None, None])
+    assert np.array_equal(observations[0], gymnasium.make("CoaxHeli-v0").reset(seed=7)[0])
+    assert not np.array_equal(observations[1], observations[2])
+    with pytest.raises(InputError, match="seed must be one number or 3"):
+        env.reset(seed=[1, 2])
 
 
 def test_threads_change_nothing():

@@ -259,6 +259,28 @@ BAD_LOGS: dict[str, tuple[str | bytes, str]] = {
     "one row": (log(n=1), "the run lasts 0 s"),
     "no rotor speed": (log("t,delta_lon,q", "{t:.2f},0,0"), "neither rpm_upper_cmd nor rpm_upper"),
     "empty rotor speed": (log(row="{t:.2f},,2140,0,0,0"), "no rotor speed"),
+    "no header": (log().partition("\n")[2], "line 1: numbers, no header"),
+    "units below the header": (
+        HEADER + "s,rpm,rpm,rad,rad,1/s\n" + log().partition("\n")[2],
+        "if it holds the units, delete it",
+    ),
+    "time in us": (
+        HEADER + "".join(f"{k}e4,2000,2140,0,0,0\n" for k in range(301)),
+        't = { name = "t", unit = "us" }',
+    ),
+    "time jumps": (log() + "1e9,2000,2140,0,0,0\n", "does its time jump?"),
+    "no time at all": (log() + "1e30,2000,2140,0,0,0\n", "line 303: 1e+30 is no time"),
+    "decimal comma": (
+        log(HEADER.strip().replace(",", ";"), "{t:.2f};2000;2140;0;0;0,1"),
+        "decimal point",
+    ),
+    "missing in words": (log() + "3.01,2000,2140,0,0,null\n", "leave the cell empty"),
+    "time of day": (log(row="12:00:{t:05.2f},2000,2140,0,0,0"), "time is needed in seconds"),
+    "foreign rotor speed": (
+        log("t,motor1,motor2,q", "{t:.2f},2000,2140,0"),
+        'rpm_upper = { name = "motor1"',
+    ),
+    "UTF-16": (log().encode("utf-16"), "save it as UTF-8"),
     "binary": (bytes(range(256)) * 20, "hover.csv: binary, not text"),
     "latin": (log().encode() + b"\xb0", "hover.csv: not UTF-8 text"),
     "twice the same column": (log(f"t,{COMMANDS},t"), "2 columns are named 't'"),
@@ -285,6 +307,8 @@ BAD_CARDS: dict[str, tuple[str | bytes, str]] = {
     "wrong dimension": (CARD + '[columns]\nq = {unit = "m"}', "channel q: unit 'm' is no unit"),
     "unknown channel": (CARD + '[columns]\nqq = {unit = "m"}', "unknown channel 'qq'"),
     "column in no file": (CARD + '[columns]\nh = {name = "alt"}', "no run has a column 'alt'"),
+    "scale is zero": (CARD + "[columns]\nq = {scale = 0}", "q scale should be a number, not 0"),
+    "scale is text": (CARD + '[columns]\nq = {scale = "-"}', "q scale should be a number"),
     "column is a number": (CARD + "[columns]\nh = 3", "[columns] h should be"),
     "binary": (b"\x00\x01\x02", "card.toml: binary"),
 }

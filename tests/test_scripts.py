@@ -6,11 +6,14 @@ each kind of refusal is also seen once from outside.
 
 import json
 import os
+import re
 import runpy
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import injector
@@ -311,4 +314,94 @@ def test_the_benchmark_finds_the_calls_it_cuts(tmp_path):
     kernel = tmp_path / "dynamics.py"
     kernel.write_text((ROOT / "coax_env" / "dynamics.py").read_text())
     benchmark.strip_effects(kernel)
-    assert "_effects(x, f, p)" not in kernel.read_text()
+    assert not re.search(
+        r"^        +_\w+_(effects|terms)\(x, f, p\)", kernel.read_text(), re.MULTILINE
+    )
+
+
+class Counted:
+    """A vector env of three that counts its steps and takes a millisecond for each."""
+
+    def __init__(self):
+        self.steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        time.sleep(1e-3)
+
+
+def test_a_rate_counts_every_env_and_no_warm_up():
+    from speed import timing
+
+    env = Counted()
+    flown = timing.Flown(env.step, [0] * timing.BATCHES, 3, 100.0, 1, "0")
+    rate = timing.steps_per_second(flown, 0.05)
+    assert 0 < rate <= 3 / 1e-3
+    assert env.steps % timing.BATCHES == 0 and env.steps > timing.BATCHES
+
+
+@pytest.mark.parametrize("mode", ["one", "many", "kernel", "start"])
+def test_our_program_flies_in_every_mode(mode):
+    import benchmark
+
+    ours = benchmark.Contender("coax", Path(sys.executable), "fly_coax.py")
+    found = benchmark.fly(ours, mode, 5, 0.0)
+    assert found["value"] > 0.0 and found["count"] == (5 if mode in ("many", "kernel") else 1)
+
+
+def test_every_peer_has_its_program_and_its_pins():
+    from speed import peers
+
+    for peer in peers.PEERS:
+        words = [word for step in peer.steps for word in step]
+        assert all("==" in w for w in words if w.startswith((peer.name, "torch", "numpy==")))
+        assert not peer.program or (ROOT / "scripts/speed" / peer.program).is_file()
+        if peer.program:
+            compile((ROOT / "scripts/speed" / peer.program).read_text(), peer.program, "exec")
+
+
+def test_a_peer_that_cannot_be_installed_has_a_reason_and_no_number(tmp_path):
+    from speed import peers
+
+    absent = peers.Peer("absent", "fly_absent.py", (("--no-index", "no-such-package==1.0"),))
+    with pytest.raises(peers.Unavailable, match="no-such-package"):
+        peers.install(absent, tmp_path, None)
+    assert not (tmp_path / "absent" / "installed").exists()
+
+
+def test_the_benchmarks_table():
+    """Ratios are ours over theirs for speeds, theirs over ours for times; a failure has no figure."""
+    import benchmark
+
+    def found(value):
+        facts = {"count": 8, "control_hz": 100.0, "physics_steps": 1, "note": ""}
+        return {"value": value, **facts}
+
+    speeds = {"coax": found(600.0), "slow": found(200.0), "lame": {"failed": "no wheel"}}
+    result = {
+        "rows": {
+            row.title: {"coax": found(2.0), "late": found(3.0)} if row.fewer else speeds
+            for row in benchmark.ROWS
+        },
+        "kernel": found(1000.0), "cold_start_s": 12.0, "effects_off_ratio": 1.02,
+    }  # fmt: skip
+    lines = benchmark.table(result)
+    assert all(len(line) == len(lines[0]) for line in lines)
+    text = ["|".join(line) for line in lines]
+    assert sum("slow|200 /s|3 x faster" in line for line in text) == 2
+    assert sum("late|3 s|1.5 x quicker" in line for line in text) == 1
+    assert sum("lame|-|" in line and "no wheel" in line for line in text) == 2
+    assert any("0.60 of it in the env" in line for line in text)
+    assert text[-1].startswith("effects off, against cut out|coax|+2.0 %")
+
+
+def test_the_better_of_two_rounds_counts(monkeypatch):
+    import benchmark
+
+    values = iter([3.0, 5.0, 4.0, 3.0, 5.0, 4.0])
+    monkeypatch.setattr(benchmark, "fly", lambda *_: {"value": next(values)})
+    options = SimpleNamespace(rounds=3, envs=1, seconds=0.0)
+    ours = [benchmark.Contender("coax", Path(), "")]
+    for fewer, best in ((False, 5.0), (True, 3.0)):
+        row = benchmark.Row("", "one", fewer=fewer)
+        assert benchmark.in_turns(ours, row, options, str)["coax"]["value"] == best

@@ -228,8 +228,8 @@ def test_bad_paths_are_told_in_one_line(tmp_path):
         ("lama500", "no vehicle 'lama500'"),
         (tmp_path / "gone.toml", "no vehicle"),
         (tmp_path, "folder"),
-        (tmp_path / "broken.toml", "not a TOML file"),
-        (tmp_path / "binary.toml", "not a TOML file"),
+        (tmp_path / "broken.toml", "not valid TOML"),
+        (tmp_path / "binary.toml", "binary, not text"),
     ):
         with pytest.raises(InputError, match=message) as caught:
             load_vehicle(source)

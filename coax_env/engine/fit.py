@@ -469,7 +469,13 @@ def _some(records: Sequence[Record], seconds: float) -> list[Record]:
 
 def part(record: Record, rows: np.ndarray) -> Record:
     """Some rows of a record, its clock kept."""
-    return replace(record, t=record.t[rows], command=record.command[rows], z=record.z[rows])
+    return replace(
+        record,
+        t=record.t[rows],
+        command=record.command[rows],
+        z=record.z[rows],
+        news=None if record.news is None else record.news[rows],
+    )
 
 
 def objective(

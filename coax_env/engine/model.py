@@ -31,6 +31,7 @@ class Record:
     t: (n,) seconds, increasing. command: (n, k), held from each row to the next.
     z: (n, m) readings in the order of the model's channels, NaN where there is no new sample.
     origin: time at which the run began, also where the record is a part of it.
+    news: (n, k) what each command gives away beyond the readings before it, or None (closed_loop.py).
     """
 
     name: str
@@ -38,6 +39,7 @@ class Record:
     command: np.ndarray
     z: np.ndarray
     origin: float = 0.0
+    news: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

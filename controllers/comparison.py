@@ -1,0 +1,201 @@
+"""Controllers side by side: the same seeds, tasks, winds and vehicles for each."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from coax_env import figures
+from coax_env.fleet import Nominal
+from coax_env.report.page import Section, command, figure, page, prose, table
+from coax_env.vehicle import Vehicle, load_vehicle
+from controllers import lqr, pid, policy, state_feedback
+from controllers.evaluation import evaluate, evaluate_spread
+from controllers.loading import Controller
+
+GUSTS = (0.08, 1e-3)  # [N, N m] std: some 1 % of the weight
+WIND = {"wind": 2.0, "turbulence": "light"}  # [m/s] from anywhere
+ROTOR_DRAG = 3.5e-4  # [N s/m per rad/s] given to a vehicle that feels no wind of its own
+_DRAGS = ("rotor_drag", "body_drag", "flap_blowback")
+_AIMED = "mocap"
+
+Maker = Callable[[Vehicle, Nominal, str, bool], Controller | None]
+"""Vehicle designed on, nominal, suite, whether there is somewhere to go: a controller, or None."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One column of the comparison: what is flown, and how the env is set up."""
+
+    name: str
+    vehicle: Vehicle
+    sensors: str = "onboard"
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    spread: bool = False  # over vehicles drawn from the file's std: the worst counts
+
+    @property
+    def aims(self) -> bool:
+        """Whether there is somewhere to go."""
+        return self.arguments.get("task", "hover") != "hover"
+
+
+def conditions(vehicle: str | Vehicle) -> list[Condition]:
+    """Hover in still air, in gusts, in wind, on drawn vehicles; a position; waypoints."""
+    vehicle = load_vehicle(vehicle)
+    felt = any(vehicle.effects.get(name) for name in _DRAGS)
+    windy = vehicle if felt else vehicle.with_effect("rotor_drag", coefficient=ROTOR_DRAG)
+    return [
+        Condition("hover", vehicle),
+        Condition("hover in gusts", vehicle, arguments={"gusts": GUSTS}),
+        Condition("hover in wind", windy, arguments=WIND),
+        Condition("worst drawn vehicle", vehicle, spread=True),
+        Condition("position", vehicle, _AIMED, {"task": "position"}),
+        Condition("waypoints", vehicle, _AIMED, {"task": "waypoints"}),
+    ]
+
+
+def makers(ppo: Controller | None) -> dict[str, Maker]:
+    """How each controller of the comparison comes to be; `ppo` flies what its sensors are for."""
+
+    def trained(vehicle: Vehicle, nominal: Nominal, sensors: str, aims: bool) -> Controller | None:
+        return ppo if ppo is not None and ppo.sensors == sensors else None
+
+    return {
+        "lqg": lambda vehicle, nominal, sensors, aims: lqr.design(
+            vehicle, nominal, sensors, lqr.BRISK if aims else None
+        ),
+        "ppo": trained,
+        "pid": lambda vehicle, nominal, sensors, aims: pid.design(vehicle, nominal, sensors),
+        "lqi": lambda vehicle, nominal, sensors, aims: state_feedback.design(
+            vehicle, nominal, limits=lqr.BRISK if aims else None
+        ),
+    }
+
+
+def compare(
+    vehicle: str | Vehicle = "lama400d",
+    ppo: Controller | None = None,
+    episodes: int = 100,
+    seconds: float = 20.0,
+    vehicles: int = 50,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, Any]:
+    """Fly every controller in every condition.
+
+    All are designed on `vehicle`; none is told of wind, gusts or draws. ``lqi`` is given the exact
+    state: what it does better than ``lqg`` is what the sensors' noise costs.
+
+    Args:
+        ppo: the trained policy; default the shipped one.
+        episodes: flights per condition; on drawn vehicles a fifth of that for each.
+        vehicles: how many are drawn.
+
+    Returns:
+        compare.json: condition -> controller -> score.json, None where it cannot fly that.
+    """
+    vehicle = load_vehicle(vehicle)
+    ppo = policy.load_policy(policy.SHIPPED) if ppo is None else ppo
+    found: dict[str, dict[str, Any]] = {}
+    for condition in conditions(vehicle):
+        row = found[condition.name] = {}
+        for name, make in makers(ppo).items():
+            if progress:
+                progress(f"{condition.name}: {name}")
+            controller = make(vehicle, None, condition.sensors, condition.aims)
+            if controller is None:
+                row[name] = None
+            elif condition.spread:
+                row[name] = evaluate_spread(
+                    controller, condition.vehicle, vehicles, max(episodes // 5, 1), seconds, seed
+                )
+            else:
+                row[name] = evaluate(
+                    controller, condition.vehicle, episodes, seconds, seed, **condition.arguments
+                )
+    return {"vehicle": vehicle.name, "episodes": episodes, "seed": seed, "conditions": found}
+
+
+HEADER = (
+    "condition", "controller", "success", "cost", "worst cost", "height rms", "speed rms",
+    "heading rms", "effort", "reached",
+)  # fmt: skip
+
+
+def rows(found: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
+    """The comparison in words, under HEADER."""
+    return [
+        [condition, name, *score_words(score)]
+        for condition, row in found.items()
+        for name, score in row.items()
+    ]
+
+
+def score_words(score: Mapping[str, Any] | None) -> list[str]:
+    """A score's figures under HEADER's, without the first two columns."""
+    if score is None:
+        return ["-"] * (len(HEADER) - 2)
+
+    def words(key: str, form: str, factor: float = 1.0) -> str:
+        value = score.get(key)
+        return "-" if value is None else form.format(factor * value)
+
+    return [
+        words("success_rate", "{:.0f} %", 100.0),
+        words("mean_cost", "{:.3g}"),
+        words("worst_cost", "{:.3g}"),
+        words("height_rms_m", "{:.1f} cm", 100.0),
+        words("velocity_rms_mps", "{:.3f} m/s"),
+        words("heading_rms_deg", "{:.2f} deg"),
+        words("effort", "{:.2f}"),
+        words("mean_reached", "{:.1f}"),
+    ]
+
+
+def comparison_page(content: Mapping[str, Any], command_line: str = "") -> str:
+    """The report as HTML text."""
+    found = content["conditions"]
+    names = list(next(iter(found.values())))
+
+    def values(key: str) -> dict[str, list[float | None]]:
+        return {
+            name: [row[name][key] if row[name] else None for row in found.values()]
+            for name in names
+        }
+
+    charts: Iterable[tuple[str, str, bool]] = (
+        ("mean_cost", "quadratic cost per step, mean of all flights", True),
+        ("worst_cost", "quadratic cost per step, worst flight", True),
+        ("success_rate", "share of flights that succeed", False),
+        ("effort", "rms of the action", False),
+    )
+    shown = [figure(figures.side_by_side(list(found), values(k), t, log)) for k, t, log in charts]
+    parts = [
+        Section("Figures", [
+            prose("Less is better, but for success. `lqi` is given the exact state and no noise: "
+                  "it says what the sensors cost the others."),
+            *shown,
+        ]),
+        Section("Table", [table(HEADER, rows(found))]),
+    ]  # fmt: skip
+    if command_line:
+        parts.append(Section("How this was computed", [command(command_line)]))
+    lead = [
+        f"{content['episodes']} flights each from the same seeds, on {content['vehicle']}; all "
+        "designed or trained on the file as it is, and told nothing of wind, gusts or draws."
+    ]
+    return page("Controllers side by side", lead, parts, kicker="Comparison")
+
+
+def ratio(worse: Mapping[str, Any], better: Mapping[str, Any]) -> float:
+    """How many times the one's mean cost is of the other's."""
+    return float(worse["mean_cost"]) / float(better["mean_cost"])
+
+
+def printed(header: Sequence[str], body: Sequence[Sequence[str]]) -> list[list[str]]:
+    """A table for a terminal, a repeated first cell left out."""
+    shown = [list(header)]
+    last = ""
+    for row in body:
+        shown.append(["" if row[0] == last else row[0], *row[1:]])
+        last = row[0]
+    return shown

@@ -1,0 +1,166 @@
+"""What mending the model is worth in flight: controllers of the bare and of the mended model.
+
+A machine with hidden effects flies maneuvers; the flights are diagnosed; an LQG is designed and a
+policy trained on the bare model and on the diagnosed one; all fly the machine itself, from the same
+seeds. Designs differ in their model only: the same cost, integrals and disturbance estimator, and
+actions centred on the bare model's trim for all.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from coax_env import figures
+from coax_env.diagnosis import Diagnosis, diagnose
+from coax_env.errors import InputError
+from coax_env.flight import Flight, read_flight
+from coax_env.report.page import Section, bullets, command, figure, page, prose, table
+from coax_env.simulation import simulate
+from coax_env.vehicle import Vehicle, load_vehicle
+from controllers import lqr, ppo
+from controllers.comparison import HEADER, ratio, score_words
+from controllers.design_report import step_response
+from controllers.evaluation import evaluate
+from controllers.loading import Controller, load_controller
+
+HIDDEN: Mapping[str, Mapping[str, float]] = {
+    "motor_lag": {"upper": 0.08, "lower": 0.08},
+    "servo_lag": {"time": 0.04},
+    "rotor_drag": {"coefficient": 3.5e-4},
+}
+"""What the default machine has and its bare model lacks, SI: sizes as usual, see effects.py."""
+
+MANEUVERS = (
+    "hover", "lon_3211", "lat_3211", "heave_3211", "yaw_3211", "climb_descend", "forward_run",
+    "side_run", "lon_doublet", "lat_doublet", "heading_turn", "differential_rpm",
+)  # fmt: skip
+MODELS = ("bare", "mended")
+COLOURS = (figures.BEFORE, figures.AFTER)
+ROW_HEADER = HEADER[1:]
+
+
+def default_machine(bare: Vehicle) -> Vehicle:
+    """A vehicle with the HIDDEN effects."""
+    for effect, values in HIDDEN.items():
+        bare = bare.with_effect(effect, **values)
+    return bare
+
+
+def compare_models(
+    machine: str | Vehicle | None = None,
+    bare: str | Vehicle = "lama400d",
+    flight: str | Path | Flight | None = None,
+    out: str | Path = "runs/compare_models",
+    episodes: int = 100,
+    ppo_steps: int = 0,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[dict[str, Any], Diagnosis, dict[str, Controller]]:
+    """Diagnose a machine's flights, and fly it with controllers of the bare and the mended model.
+
+    Args:
+        machine: what truly flies; default `bare` with the HIDDEN effects.
+        bare: the model before the diagnosis.
+        flight: the machine's flights; default MANEUVERS flown by it in simulation.
+        out: folder of the policies.
+        ppo_steps: env steps of each policy's training; 0: LQG only.
+
+    Returns:
+        models.json; the diagnosis; the controllers by ``"lqg bare"``, ``"lqg mended"``, ...
+    """
+    say = progress or (lambda text: None)
+    bare = load_vehicle(bare)
+    machine = default_machine(bare) if machine is None else load_vehicle(machine)
+    if flight is None:
+        say("flying maneuvers")
+        flight = simulate(machine, MANEUVERS, seed=seed)
+    flight = flight if isinstance(flight, Flight) else read_flight(flight)
+    say("diagnosing")
+    result = diagnose(flight, bare, progress=lambda text: say(f"diagnosing: {text}"))
+    models = dict(zip(MODELS, (bare, result.vehicle_after), strict=True))
+    controllers: dict[str, Controller] = {}
+    for name, model in models.items():
+        controllers[f"lqg {name}"] = lqr.design(model, bare)
+        if ppo_steps:
+            say(f"training on the {name} model")
+            path = ppo.train(model, Path(out) / f"ppo_{name}", ppo_steps, seed, bare)
+            controllers[f"ppo {name}"] = load_controller(path)
+    scores = {}
+    for name, controller in controllers.items():
+        say(f"flying {name}")
+        scores[name] = evaluate(controller, machine, episodes, seed=seed + 1_000_000)
+    kinds = ["lqg", "ppo"] if ppo_steps else ["lqg"]
+    gains = {k: ratio(scores[f"{k} bare"], scores[f"{k} mended"]) for k in kinds}
+    content = {
+        "machine": machine.values(),
+        "bare": bare.name,
+        "hidden": sorted(machine.effects),
+        "found": [cause["effect"] for cause in result.findings["causes"]],
+        "verdict": result.findings["verdict"],
+        "scores": scores,
+        "cost_ratio": gains,
+    }
+    return content, result, controllers
+
+
+def rows(content: Mapping[str, Any]) -> list[list[str]]:
+    """The scores in words, under the comparison's header without its first column."""
+    return [[name, *score_words(score)] for name, score in content["scores"].items()]
+
+
+def models_page(
+    content: Mapping[str, Any],
+    controllers: Mapping[str, Controller],
+    machine: Vehicle,
+    command_line: str = "",
+) -> str:
+    """The report as HTML text."""
+    scores, gains = content["scores"], content["cost_ratio"]
+    words = " and ".join(f"{k.upper()} **{g:.1f} times** less" for k, g in gains.items())
+    lead = [
+        f"Designed on the mended model instead of the bare one, the same machine flies better: "
+        f"{words} cost.",
+        f"Hidden in it: {', '.join(content['hidden'])}; named by the diagnosis: "
+        f"{', '.join(content['found']) or 'nothing'}.",
+    ]
+    kinds = list(gains)
+    bars = {m: [scores[f"{k} {m}"]["mean_cost"] for k in kinds] for m in MODELS}
+    heading = {m: [scores[f"{k} {m}"]["heading_rms_deg"] for k in kinds] for m in MODELS}
+    parts = [
+        Section("What it is worth", [
+            figure(figures.side_by_side([k.upper() for k in kinds], bars, "cost per step",
+                                        colours=COLOURS)),
+            figure(figures.side_by_side([k.upper() for k in kinds], heading,
+                                        "heading rms [deg]", colours=COLOURS)),
+            table(ROW_HEADER, rows(content), "On the true machine, from the same seeds"),
+        ]),
+        Section("One flight of each", [
+            figure(_flights(controllers, machine), "Of the true machine, from the same start"),
+        ]),
+        Section("What is the same for all", [bullets([
+            "the cost, its weights, and the integrals of height, heading and speed",
+            "the estimator's disturbances and biases, which explain what the model does not",
+            "sensors, seeds, and actions centred on the bare model's trim",
+        ])]),
+    ]  # fmt: skip
+    if command_line:
+        parts.append(Section("How this was computed", [prose("One command:"),
+                                                       command(command_line)]))  # fmt: skip
+    return page("What a mended model is worth in flight", lead, parts, kicker="Controllers")
+
+
+def _flights(controllers: Mapping[str, Controller], machine: Vehicle) -> figures.Figure:
+    """Heading and height of one flight with each controller."""
+    panels: dict[str, dict[str, Any]] = {"heading [deg]": {}, "height [m]": {}}
+    for name, controller in controllers.items():
+        t, found = step_response(controller, machine)
+        named = dict(found)
+        panels["heading [deg]"][name] = named["attitude [deg]"]["heading"]
+        panels["height [m]"][name] = named["height [m]"]["height"]
+    return figures.histories(t, list(panels.items()))
+
+
+def check_machine(path: str | Path | None, flight: str | Path | None) -> None:
+    """A flight of one's own needs the machine that flew it."""
+    if flight and not path:
+        raise InputError("a flight needs --machine: the true vehicle that flew it")

@@ -1,0 +1,170 @@
+"""A cascade of PID loops on the raw sensors, tuned by hand: what most autopilots fly.
+
+::
+
+    place -> speed asked for -> speed -> tilt asked for -> attitude -> swash
+    height -> climb -> both rotors          heading -> turn rate -> one rotor against the other
+
+It knows no model: twelve gains tried out on lama400d. Slow and noisy speeds are smoothed by a first
+order lag. The place is held only where it is measured (suite ``mocap``).
+"""
+
+import math
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coax_env import hover
+from coax_env.errors import InputError
+from coax_env.files import write_json
+from coax_env.fleet import DT, Nominal, action_map
+from coax_env.sensors import suite
+from coax_env.vehicle import Vehicle, load_vehicle
+from controllers.loading import FORMAT, VERSION
+from controllers.target import TargetView
+
+_NEEDED = ("p", "q", "r", "phi", "theta", "psi", "h", "vn", "ve", "vd")
+_PLACE = ("pn", "pe")
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Of the loops, from outside in; an action of 1 is the end of its range."""
+
+    place: float = 0.35  # [m/s per m]
+    fastest: float = 0.5  # [m/s] that the place asks for
+    speed: float = 0.14  # [rad of tilt per m/s]
+    speed_sum: float = 0.02  # [rad per m]
+    steepest: float = 0.2  # [rad] that the speed asks for
+    tilt: float = 10.0  # [action per rad]
+    rate: float = 1.0  # [action per rad/s]
+    height: float = 2.5  # [action per m]
+    height_sum: float = 0.5  # [action per m s]
+    climb: float = 1.0  # [action per m/s]
+    heading: float = 5.0  # [action per rad]
+    heading_sum: float = 2.0  # [action per rad s]
+    turn: float = 1.0  # [action per rad/s]
+    smoothing: float = 0.1  # [s] of the speeds
+
+
+@dataclass
+class PID:
+    """The cascade for one helicopter or many; ``act`` as every controller."""
+
+    vehicle: str
+    suite: str
+    action_trim: np.ndarray  # (4,)
+    action_scale: np.ndarray  # (4,)
+    gains: Gains = field(default_factory=Gains)
+
+    kind = "pid"
+
+    def __post_init__(self) -> None:
+        names = [sensor.name for sensor in suite(self.suite)]
+        missing = [name for name in _NEEDED if name not in names]
+        if missing:
+            raise InputError(f"pid needs {', '.join(missing)}, which sensors {self.suite!r} lack")
+        self._view = TargetView(self.suite)
+        self._at = {name: names.index(name) for name in (*_NEEDED, *_PLACE) if name in names}
+        self.reset()
+
+    @property
+    def sensors(self) -> str:
+        """The suite it must be given."""
+        return self.suite
+
+    @property
+    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Trim and scale of its actions, for ``nominal=`` of the env."""
+        return self.action_trim, self.action_scale
+
+    def reset(self, count: int = 1) -> None:
+        """Forget the last flight; `count` helicopters are flown next."""
+        self._smooth: np.ndarray | None = None  # forward, right, down [m/s], (count, 3)
+        self._sums = np.zeros((count, 4))  # forward, right [m], height [m s], heading [rad s]
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Observation (n_obs,) or (count, n_obs) to action (4,) or (count, 4), float32."""
+        batch = np.atleast_2d(observation).astype(float)
+        if len(self._sums) != len(batch):
+            self.reset(len(batch))
+        there = np.ones(len(batch), dtype=bool)
+        if self._view.aims(batch):
+            batch, _, there = self._view.seen(batch)
+        actions = np.clip(self._actions(batch, there), -1.0, 1.0).astype(np.float32)
+        return actions if np.ndim(observation) == 2 else actions[0]
+
+    def _actions(self, batch: np.ndarray, there: np.ndarray) -> np.ndarray:
+        g, y = self.gains, {name: batch[:, at] for name, at in self._at.items()}
+        measured = np.column_stack([*_turned(y["vn"], y["ve"], y["psi"]), y["vd"]])
+        if self._smooth is None:
+            self._smooth = np.zeros_like(measured)
+        self._smooth += (measured - self._smooth) * (1.0 - math.exp(-DT / g.smoothing))
+        forward, right, down = self._smooth.T
+        ask_forward = ask_right = np.zeros(len(batch))
+        if "pn" in y:
+            ask = -g.place * np.column_stack([y["pn"], y["pe"]])
+            length = np.maximum(np.linalg.norm(ask, axis=1), 1e-9)
+            ask *= np.minimum(1.0, g.fastest / length)[:, None]
+            ask_forward, ask_right = _turned(ask[:, 0], ask[:, 1], y["psi"])
+        height = hover.HEIGHT - y["h"]
+        heading = -((y["psi"] + math.pi) % (2.0 * math.pi) - math.pi)
+        ahead, aside = ask_forward - forward, ask_right - right
+        self._sums += DT * there[:, None] * np.column_stack([ahead, aside, height, heading])
+        most = np.array([g.steepest / g.speed_sum] * 2 + [0.5 / g.height_sum, 0.5 / g.heading_sum])
+        np.clip(self._sums, -most, most, out=self._sums)
+        pitch = -(g.speed * ahead + g.speed_sum * self._sums[:, 0])
+        roll = g.speed * aside + g.speed_sum * self._sums[:, 1]
+        pitch, roll = (np.clip(tilt, -g.steepest, g.steepest) for tilt in (pitch, roll))
+        lift = g.height * height + g.height_sum * self._sums[:, 2] + g.climb * down
+        turn = g.heading * heading + g.heading_sum * self._sums[:, 3] - g.turn * y["r"]
+        return np.column_stack(
+            [
+                lift + turn,
+                lift - turn,
+                g.tilt * (pitch - y["theta"]) - g.rate * y["q"],
+                g.tilt * (roll - y["phi"]) - g.rate * y["p"],
+            ]
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a JSON file."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "kind": self.kind,
+            "vehicle": self.vehicle,
+            "sensors": self.suite,
+            "action_trim": self.action_trim.tolist(),
+            "action_scale": self.action_scale.tolist(),
+            "gains": {f.name: getattr(self.gains, f.name) for f in fields(Gains)},
+        }
+
+    def save(self, path: str | Path) -> Path:
+        """Write controller.json."""
+        return write_json(path, self.to_dict())
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> "PID":
+        """From a JSON file."""
+        trim, scale = (
+            np.array(content[key], dtype=float) for key in ("action_trim", "action_scale")
+        )
+        gains = Gains(**content["gains"])
+        return cls(str(content["vehicle"]), str(content["sensors"]), trim, scale, gains)
+
+
+def design(vehicle: str | Vehicle, nominal: Nominal = None, sensors: str = "onboard") -> PID:
+    """The cascade about a vehicle's nominal trim; nothing else of the vehicle is used."""
+    vehicle = load_vehicle(vehicle)
+    return PID(vehicle.name, sensors, *action_map(vehicle, nominal))
+
+
+def _turned(
+    north: np.ndarray, east: np.ndarray, heading: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Horizontal vectors as forward and right of a heading [rad]."""
+    cosine, sine = np.cos(heading), np.sin(heading)
+    return cosine * north + sine * east, cosine * east - sine * north

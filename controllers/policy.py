@@ -1,0 +1,239 @@
+"""A trained policy: plain arrays and a description, read and flown without torch.
+
+``policy.zip`` holds two members that anyone's file can be read from without running any code::
+
+    policy.json   what it is, how it was made, and the estimator it looks through
+    weights.npz   the network's arrays, which NumPy reads with pickles forbidden
+
+Beside them `ppo.train` leaves what Stable-Baselines3 needs to go on training (``data``, ``*.pth``):
+pickles, which may run anything, opened only by ``train(resume=...)``. A shipped policy has none.
+
+Single noisy observations do not show the velocity, so the policy gets the estimate and the
+integrals of controllers/estimator.py, scaled.
+"""
+
+import io
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coax_env.errors import InputError
+from controllers.estimator import EstimatorDesign, Tracker, integrated_readings
+
+FORMAT = "coax-policy"
+VERSION = 2
+DESCRIPTION = "policy.json"
+WEIGHTS = "weights.npz"
+SHIPPED = Path(__file__).parent / "policies" / "hover.zip"
+"""Trained on lama400d, default sensors; the command that made it is in its description."""
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, 0.0),
+}
+_LARGEST = 16 * 2**20  # bytes of a member that is read; ours have some 200 kB
+_FEATURE_LIMIT = 10.0
+
+FEATURE_SCALES = {
+    "u": 0.1, "v": 0.1, "w": 0.1, "p": 0.3, "q": 0.3, "r": 0.3,
+    "alpha_l": 0.05, "beta_l": 0.05, "alpha_f": 0.05, "beta_f": 0.05,
+    "phi": 0.05, "theta": 0.05, "psi": 0.05, "x": 1.0, "y": 1.0, "z": 0.1,
+    "swash_lon": 0.1, "swash_lat": 0.1,
+}  # fmt: skip
+"""Size of an estimate that becomes 1 for the policy, near what a good hover leaves; the rest by the
+filter's own figures. Coarser ones take several times longer to learn from."""
+
+
+@dataclass
+class Network:
+    """A multilayer perceptron: layers (weight (out, in), bias (out,)), the last without activation."""
+
+    layers: list[tuple[np.ndarray, np.ndarray]]
+    activation: str = "tanh"
+
+    def __call__(self, features: np.ndarray) -> np.ndarray:
+        """Features (count, in) to outputs (count, out)."""
+        bend = ACTIVATIONS[self.activation]
+        for weight, bias in self.layers[:-1]:
+            features = bend(features @ weight.T + bias)
+        weight, bias = self.layers[-1]
+        return features @ weight.T + bias
+
+
+@dataclass
+class Policy:
+    """A trained policy with its estimator: a controller like any other."""
+
+    network: Network
+    estimator: EstimatorDesign
+    scales: np.ndarray  # (n + i,), of what is known
+    content: dict[str, Any]
+    eyes: "Eyes | None" = field(default=None, init=False, repr=False, compare=False)
+
+    kind = "ppo"
+
+    @property
+    def sensors(self) -> str:
+        """The suite it must be given."""
+        return self.estimator.sensors
+
+    @property
+    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Trim and scale of its actions, for ``nominal=`` of the env."""
+        return self.estimator.action_trim, self.estimator.action_scale
+
+    def reset(self, count: int = 1) -> None:
+        """Forget the last flight; `count` helicopters are flown next."""
+        self.eyes = Eyes(self.estimator, count, self.scales)
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Observation (n_obs,) or (count, n_obs) to action (4,) or (count, 4), float32."""
+        batch = np.atleast_2d(observation)
+        if self.eyes is None or self.eyes.count != len(batch):
+            self.reset(len(batch))
+        assert self.eyes is not None
+        actions = np.clip(self.network(self.eyes.features(self.eyes.see(batch))), -1.0, 1.0).astype(
+            np.float32
+        )
+        self.eyes.acted(actions)
+        return actions if np.ndim(observation) == 2 else actions[0]
+
+
+class Eyes(Tracker):
+    """The filter, and what it knows as the policy's features, for one helicopter or many."""
+
+    def __init__(self, design: EstimatorDesign, count: int, scales: np.ndarray) -> None:
+        super().__init__(design, count)
+        self._per_scale = 1.0 / scales
+
+    def features(self, known: np.ndarray) -> np.ndarray:
+        """What `see` has returned as features (count, n), float32, within [-10, 10]."""
+        features = (known * self._per_scale).astype(np.float32)
+        return np.clip(features, -_FEATURE_LIMIT, _FEATURE_LIMIT, out=features)
+
+
+def feature_scales(design: EstimatorDesign) -> np.ndarray:
+    """What becomes 1 in each feature, shape (n + i,)."""
+    sizes = []
+    for name, spread in zip(design.states, design.spread, strict=True):
+        if name.startswith("omega_"):
+            sizes.append(float(design.action_scale[0 if name == "omega_u" else 1]))
+        else:
+            sizes.append(FEATURE_SCALES.get(name, max(3.0 * float(spread), 1e-6)))
+    return np.array(sizes + list(integrated_readings(design).values()))
+
+
+def n_features(design: EstimatorDesign) -> int:
+    """Number of features: estimate and integrals."""
+    return len(design.states) + len(integrated_readings(design))
+
+
+def save_policy(
+    path: str | Path,
+    network: Network,
+    design: EstimatorDesign,
+    scales: np.ndarray,
+    content: dict[str, Any],
+    training: bytes = b"",
+) -> Path:
+    """Write policy.zip whole or not at all.
+
+    Args:
+        content: further entries of the description.
+        training: a zip file of Stable-Baselines3, whose members join the plain ones.
+    """
+    path = Path(path)
+    arrays: dict[str, Any] = {}
+    for k, (weight, bias) in enumerate(network.layers):
+        arrays[f"weight_{k}"], arrays[f"bias_{k}"] = weight, bias
+    weights, buffer = io.BytesIO(), io.BytesIO(training)
+    np.savez(weights, **arrays)
+    content = {
+        **content,
+        "format": FORMAT, "version": VERSION, "kind": Policy.kind,
+        "activation": network.activation,
+        "feature_scales": scales.tolist(),
+        "estimator": design.to_dict(),
+    }  # fmt: skip
+    with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(_dated(DESCRIPTION), json.dumps(content, allow_nan=False))
+        archive.writestr(_dated(WEIGHTS), weights.getvalue())
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temporary.write_bytes(buffer.getvalue())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def _dated(name: str) -> zipfile.ZipInfo:
+    """A member without the time of day: the same policy makes the same file."""
+    member = zipfile.ZipInfo(name)
+    member.compress_type = zipfile.ZIP_DEFLATED
+    return member
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Read the plain members of a policy.zip; nothing in the file is run.
+
+    Raises:
+        InputError: no such file, or not a policy of this project.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"no policy {str(path)!r}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            content = json.loads(_member(archive, DESCRIPTION))
+            weights = _member(archive, WEIGHTS)
+        if content.get("format") != FORMAT or content.get("version") != VERSION:
+            raise InputError(f"{path}: version {content.get('version')!r} of a policy is unknown")
+        design = EstimatorDesign.from_dict(content["estimator"])
+        scales = np.array(content["feature_scales"], dtype=float)
+        if scales.shape != (n_features(design),) or not (scales > 0.0).all():
+            raise ValueError("feature_scales do not fit the estimator")
+        network = _network(weights, content["activation"], n_features(design))
+    except InputError:
+        raise
+    except (
+        OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RecursionError,
+        NotImplementedError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
+    ) as error:  # fmt: skip
+        raise InputError(f"{path}: not a policy of this project") from error
+    return Policy(network, design, scales, content)
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> bytes:
+    if archive.getinfo(name).file_size > _LARGEST:
+        raise ValueError(f"{name} is too large")
+    return archive.read(name)
+
+
+def _network(weights: bytes, activation: str, width: int) -> Network:
+    """The network of weights.npz, its shapes checked against `width` features and four actions."""
+    if activation not in ACTIVATIONS:
+        raise ValueError(f"unknown activation {activation!r}")
+    with zipfile.ZipFile(io.BytesIO(weights)) as members:
+        if sum(member.file_size for member in members.infolist()) > _LARGEST:
+            raise ValueError(f"{WEIGHTS} is too large")
+    layers = []
+    with np.load(io.BytesIO(weights), allow_pickle=False) as arrays:
+        for k in range(len(arrays.files) // 2):
+            weight, bias = arrays[f"weight_{k}"], arrays[f"bias_{k}"]
+            if weight.shape != (len(bias), width) or not np.isfinite(weight).all():
+                raise ValueError(f"layer {k} has shape {weight.shape}")
+            layers.append((weight.astype(np.float32), bias.astype(np.float32)))
+            width = len(bias)
+    if not layers or width != 4:
+        raise ValueError("the last layer must have four outputs")
+    return Network(layers, activation)

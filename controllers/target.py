@@ -1,0 +1,70 @@
+"""Flying to a target with a controller that only hovers: the flight seen from the target.
+
+In the tasks ``position`` and ``waypoints`` the observation ends with the way to the target
+(coax_env/tasks.py). Moved and turned so that the target lies at the start's place, height and
+heading, it is an observation of ``hover``, and a hover controller flies it. A target that is far
+away is approached through a point on the way, no farther than REACH: a linear controller asked for
+more would only saturate.
+"""
+
+import math
+
+import numpy as np
+
+from coax_env import hover, tasks
+from coax_env.sensors import slow_instruments, suite
+
+REACH = {"place": 0.5, "height": 0.15, "heading": math.radians(10.0)}
+"""Farthest point asked for at once [m, m, rad]."""
+
+
+class TargetView:
+    """The observations of a sensor suite, seen from the target where they have one."""
+
+    def __init__(self, sensors: str) -> None:
+        own = suite(sensors)
+        self.names = [sensor.name for sensor in own]
+        self.width = len(own) + len(slow_instruments(own))
+        aims = {"psi", "pn", "pe", "h"} <= set(self.names) or {"psi", "x", "y"} <= set(self.names)
+        self._places = tasks.places("position", own) if aims else None
+        self._up = -tasks.height_sign("position", own) if aims else 1.0
+        self._speed = [self.names.index(n) for n in ("vn", "ve") if n in self.names]
+
+    def aims(self, observations: np.ndarray) -> bool:
+        """Whether observations (count, n) have a target in them."""
+        return observations.shape[1] == self.width + tasks.N_AIM
+
+    def seen(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Observations (count, width + 4) as those of a hover at the target, or on the way to it.
+
+        Returns:
+            observations (count, width); the point asked for, x y z psi (count, 4); whether it is
+            the target itself, (count,) bool.
+        """
+        assert self._places is not None
+        seen = np.array(observations[:, : self.width], dtype=float)
+        way = np.array(observations[:, self.width :], dtype=float)
+        whole = way.copy()
+        distance = np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
+        way[:, :2] *= np.minimum(1.0, REACH["place"] / distance)[:, None]
+        way[:, 2] = np.clip(way[:, 2], -REACH["height"], REACH["height"])
+        way[:, 3] = np.clip(way[:, 3], -REACH["heading"], REACH["heading"])
+        x, y, z, psi = self._places
+        heading = seen[:, psi].copy()
+        asked = np.empty((len(seen), 4))
+        asked[:, :2] = seen[:, [x, y]] + _turned(way[:, :2], heading)
+        asked[:, 2] = -self._up * seen[:, z] - way[:, 2]
+        asked[:, 3] = heading + way[:, 3]
+        seen[:, psi] = -way[:, 3]
+        seen[:, [x, y]] = -_turned(way[:, :2], seen[:, psi])
+        seen[:, z] = self._up * (hover.HEIGHT - way[:, 2])
+        if self._speed:
+            seen[:, self._speed] = _turned(seen[:, self._speed], -asked[:, 3])
+        return seen, asked, (way == whole).all(axis=1)
+
+
+def _turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Horizontal vectors (count, 2) turned clockwise, seen from above, by angles [rad] (count,)."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    forward, right = vectors[:, 0], vectors[:, 1]
+    return np.column_stack([cosine * forward - sine * right, sine * forward + cosine * right])

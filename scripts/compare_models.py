@@ -1,0 +1,56 @@
+"""What mending the model is worth: controllers of the bare and of the mended model on one machine."""
+
+import os
+import shlex
+import sys
+from pathlib import Path
+
+import command_line
+
+from coax_env.files import make_folder, write_json, write_text
+from coax_env.vehicle import load_vehicle, vehicle_toml
+from controllers import mended
+
+
+def main() -> None:
+    parser = command_line.parser("compare_models", __doc__, seed=True)
+    parser.add_argument(
+        "--machine", metavar="FILE",
+        help="the true vehicle (default: --model with motor lag, servo lag and rotor drag)",
+    )  # fmt: skip
+    parser.add_argument("--model", default="lama400d", help="the bare model (default: %(default)s)")
+    parser.add_argument(
+        "--flight", type=Path, metavar="FOLDER", help="its flights (default: simulated)"
+    )
+    parser.add_argument("--episodes", type=int, default=100, help="(default: %(default)s)")
+    parser.add_argument(
+        "--steps", type=float, default=4e6, help="of each policy's training; 0: LQG only"
+    )
+    options = parser.parse_args()
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
+
+    mended.check_machine(options.machine, options.flight)
+    bare = load_vehicle(options.model)
+    machine = load_vehicle(options.machine) if options.machine else mended.default_machine(bare)
+    make_folder(options.out)
+    with command_line.progress("compare_models") as say:
+        content, result, controllers = mended.compare_models(
+            machine, bare, options.flight, options.out, options.episodes, round(options.steps),
+            options.seed, say,
+        )  # fmt: skip
+    write_json(options.out / "models.json", content)
+    write_text(options.out / "vehicle.toml", vehicle_toml(result.vehicle_after))
+    words = "scripts/compare_models.py " + shlex.join(sys.argv[1:])
+    page = mended.models_page(content, controllers, machine, words)
+    write_text(options.out / "report.html", page)
+
+    print("hidden:", ", ".join(content["hidden"]))
+    print("named: ", ", ".join(content["found"]) or "nothing")
+    command_line.print_columns([mended.ROW_HEADER, *mended.rows(content)])
+    for kind, factor in content["cost_ratio"].items():
+        print(f"{kind}: {factor:.2f} times less cost with the mended model")
+    print(f"report {options.out / 'report.html'}")
+
+
+if __name__ == "__main__":
+    command_line.run(main)

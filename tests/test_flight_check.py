@@ -1,0 +1,224 @@
+"""What a flight folder is said to hold: planted units, signs and faults, and what is known of hover."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coax_env.engine.model import Noise
+from coax_env.errors import InputError
+from coax_env.flight import Flight, read_flight, write_flight
+from coax_env.flight_check import (
+    FlightCheck,
+    _channel,
+    _next_step,
+    _sick,
+    _suspicions,
+    check_flight,
+)
+from coax_env.foreign_columns import draft_card, guesses
+from coax_env.search import Search, State
+from coax_env.sensors import log_suite
+from coax_env.simulation import fly_all, log_flight
+from coax_env.vehicle import load_vehicle
+
+LAMA = load_vehicle("lama400d")
+
+
+@cache
+def flown(*names: str) -> Flight:
+    """A simulated flight with the default sensors, as if logged."""
+    return log_flight(LAMA, fly_all(LAMA, names, seed=3), log_suite("onboard"), noise=True, seed=3)
+
+
+@cache
+def checked(*names: str) -> FlightCheck:
+    return check_flight(flown(*names), LAMA)
+
+
+def changed(flight: Flight, **factors: float) -> Flight:
+    """A flight whose channels were logged with another unit or sign."""
+    runs = []
+    for run in flight.runs:
+        measured = {c: y * factors.get(c, 1.0) for c, y in run.measured.items()}
+        speed = factors.get("rpm", 1.0)
+        command = run.command * [speed, speed, 1.0, 1.0]
+        runs.append(replace(run, measured=measured, command=command))
+    return replace(flight, runs=tuple(runs))
+
+
+def suspicions(flight: Flight) -> str:
+    return "; ".join(
+        [*_suspicions(flight, LAMA), *_sick([_channel(flight, c) for c in flight.channels])]
+    )
+
+
+# --- what is there --------------------------------------------------------------------------------
+
+
+def test_a_sound_flight_is_not_suspected():
+    found = checked("hover", "lon_3211")
+    assert found.suspicions == ()
+    assert found.missing == ("pn", "pe", "v")
+    assert [run.name for run in found.runs] == ["hover", "lon_3211"]
+    rates = {c.channel: c.rate for c in found.channels}
+    assert rates["p"] == pytest.approx(100.0, rel=0.01)
+    assert rates["h"] == pytest.approx(20.0, rel=0.02)
+    assert rates["vn"] == pytest.approx(10.0, rel=0.02)
+    noise = {s.name: s.noise for s in log_suite("onboard")}
+    for c in found.channels:
+        assert c.std == pytest.approx(noise[c.channel], rel=0.25), c.channel
+    json.dumps(found.as_json(), allow_nan=False)
+
+
+PLANTED: dict[str, tuple[dict[str, float], tuple[str, ...]]] = {
+    "rotors in rad/s": ({"rpm": math.pi / 30}, ("rpm_upper_cmd", '"rad/s"')),
+    "rotors in rev/s": ({"rpm": 1 / 60}, ("rpm_lower_cmd", '"rev/s"')),
+    "rotors stand": ({"rpm": 0.0}, ("rpm_upper_cmd is 0",)),
+    "z up": ({"az": -1.0, "ay": -1.0}, ("z points up",)),
+    "acceleration in g": ({"az": 1 / 9.80665}, ("az is -1", '"g"')),
+    "no gravity": ({"az": 3e-3}, ("gravity has been taken out",)),
+    "angles in degrees": ({"phi": 57.3, "theta": 57.3}, ("phi reaches", '"deg"')),
+    "gyros in degrees": ({"p": 57.3, "q": 57.3, "r": 57.3}, ("q reaches", '"deg/s"')),
+    "yaw gyro turned": ({"r": -1.0}, ("psi and r disagree", "scale = -1")),
+    "height downward": ({"h": -1.0}, ("h is -", "scale = -1")),
+    "climb as velocity down": ({"vd": -1.0}, ("h and vd disagree", "scale = -1")),
+}
+
+
+@pytest.mark.parametrize("what", PLANTED)
+def test_a_wrong_unit_or_sign_is_suspected(what):
+    factors, words = PLANTED[what]
+    flight = flown("heading_turn", "climb_descend", "lon_3211", "lat_3211")
+    assert suspicions(flight) == ""
+    told = suspicions(changed(flight, **factors))
+    for word in words:
+        assert word in told, told
+
+
+def test_a_frozen_and_a_saturated_sensor_are_told():
+    run = flown("heave_3211").runs[0]
+    still, limited = run.measured["p"].copy(), run.measured["az"].copy()
+    still[300:500] = still[300]
+    limited = np.clip(limited, np.nanquantile(limited, 0.05), None)
+    flight = Flight(
+        "lama400d", (replace(run, measured={**run.measured, "p": still, "az": limited}),)
+    )
+    told = suspicions(flight)
+    assert "p reads one and the same value for 2.0 s" in told
+    assert "az stands at its extreme value" in told
+    assert "frozen" not in told.replace("p reads", "", 1).partition("frozen")[2]
+
+
+# --- what can be learned --------------------------------------------------------------------------
+
+
+def test_what_is_not_excited_stays_hidden():
+    """At one height nothing tells ground effect from a constant; a descent to the ground does."""
+    hover = {e.effect: e for e in checked("hover").effects}
+    both = {e.effect: e for e in checked("hover", "low_hover").effects}
+    assert hover["ground_effect"].verdict == "hidden"
+    assert both["ground_effect"].verdict == "shows" and both["ground_effect"].run == "low_hover"
+    assert hover["yaw_inertia"].verdict == "hidden"
+    assert hover["gyro_bias"].verdict == "shows"
+
+
+def test_more_flight_tells_more(monkeypatch):
+    """Information adds up: the same run twice tells twice as much, where no noise level is fitted."""
+
+    def as_given(search: Search, noise: Noise) -> State:
+        off = {f.name: f.value for f in search.all}
+        return State([], {**off, **search.model.bare_values, "gust_memory": 0.5}, noise)
+
+    monkeypatch.setattr(Search, "begin", as_given)
+    run = flown("lon_3211").runs[0]
+    noise = {s.name: s.noise for s in log_suite("onboard")}
+    once, again = (
+        check_flight(Flight("lama400d", runs, noise=noise), LAMA)
+        for runs in ((run,), (run, replace(run, name="again")))
+    )
+    for e in once.effects:
+        other = next(o for o in again.effects if o.effect == e.effect)
+        for name, std in e.std.items():
+            assert std == math.inf or other.std[name] <= std * (1.0 + 1e-6), name
+    for a, b in zip(once.own_numbers, again.own_numbers, strict=True):
+        assert b.std_after <= a.std_after <= a.std_before * (1.0 + 1e-9)
+    bias = [next(e for e in f.effects if e.effect == "gyro_bias") for f in (once, again)]
+    ratio = bias[0].std["gyro_bias.x"] / bias[1].std["gyro_bias.x"]
+    assert ratio == pytest.approx(math.sqrt(2.0), rel=0.02)
+
+
+def test_look_alikes_of_a_hover():
+    """A scale error of az is a bias where nothing but gravity is felt."""
+    found = {e.effect: e for e in checked("hover").effects}
+    assert found["accel_scale"].verdict == "shows"
+    assert "accel_bias" in found["accel_scale"].alike
+    turned = {e.effect: e for e in checked("hover", "low_hover").effects}
+    assert "ground_effect" not in turned["accel_bias"].alike
+
+
+def test_the_next_step_is_a_command():
+    assert checked("hover", "lon_3211").next_step.startswith("scripts/diagnose.py FLIGHT")
+    assert "scripts/check_flight.py F again" in _next_step("F", "V", True, ())
+    assert "scripts/plan_flight.py --vehicle V" in _next_step("F", "V", False, ())
+
+
+# --- somebody else's log --------------------------------------------------------------------------
+
+FOREIGN = {  # channel: name there, and what its numbers are multiplied by
+    "t": ("Time [ms]", 1e3), "rpm_upper_cmd": ("upper_cmd", 1.0), "rpm_lower_cmd": ("lower_cmd", 1.0),
+    "p": ("gyro_x_dps", 57.29577951308232), "q": ("gyro_y_dps", 57.29577951308232),
+    "r": ("gyro_z_dps", 57.29577951308232), "az": ("acc_z (g)", 1 / 9.80665),
+    "phi": ("roll_deg", 57.29577951308232), "theta": ("Pitch", 1.0), "h": ("altitude_cm", 100.0),
+}  # fmt: skip
+
+
+def foreign(folder: Path, delimiter: str = ",") -> Flight:
+    """A simulated flight written with other names and units, without a card."""
+    flight = flown("lon_3211", "heave_3211")
+    own = write_flight(flight, folder / "own")
+    (folder / "theirs").mkdir()
+    for path in own.glob("*.csv"):
+        with path.open() as file:
+            rows = list(csv.DictReader(file))
+        with (folder / "theirs" / path.name).open("w", newline="") as file:
+            writer = csv.writer(file, delimiter=delimiter)
+            writer.writerow([name for name, _ in FOREIGN.values()] + ["mode"])
+            for row in rows:
+                cells = (row[c] and repr(float(row[c]) * k) for c, (_, k) in FOREIGN.items())
+                writer.writerow([*cells, "7"])
+    return read_flight(own)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_a_drafted_card_reads_a_foreign_log(tmp_path, delimiter):
+    own = foreign(tmp_path, delimiter)
+    with pytest.raises(InputError, match=r"check_flight\.py .*theirs --draft"):
+        read_flight(tmp_path / "theirs")
+    draft_card(tmp_path / "theirs", "lama400d")
+    theirs = read_flight(tmp_path / "theirs")
+    assert theirs.unread == ("mode",)
+    for name in own.run_names:
+        mine, other = own.run(name), theirs.run(name)
+        np.testing.assert_allclose(other.t, mine.t, atol=1e-9)
+        np.testing.assert_allclose(other.command[:, :2], mine.command[:, :2], rtol=1e-9)
+        assert set(other.measured) == {"p", "q", "r", "az", "phi", "theta", "h"}
+        for channel, values in other.measured.items():
+            np.testing.assert_allclose(values, mine.measured[channel], rtol=1e-7, atol=1e-9)
+    with pytest.raises(InputError, match="there already"):
+        draft_card(tmp_path / "theirs", "lama400d")
+
+
+def test_what_a_guess_knows_and_what_it_leaves():
+    found = {g.channel: (g.name, g.unit) for g in guesses(
+        ["TimeUS", "Roll (deg)", "GyrX", "wz", "accX_mss", "battery", "mode", "z", "rpm1"]
+    ).values()}  # fmt: skip
+    assert found == {
+        "t": ("TimeUS", "us"), "phi": ("Roll (deg)", "deg"), "p": ("GyrX", "rad/s"),
+        "r": ("wz", "rad/s"), "ax": ("accX_mss", "m/s2"), "rpm_upper": ("rpm1", "rev/min"),
+    }  # fmt: skip
