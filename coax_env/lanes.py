@@ -13,6 +13,8 @@ effect is on.
 Products and sums may be fused, so lanes agree with the scalar kernel to rounding, not to the bit.
 """
 
+import functools
+import itertools
 import math
 import operator
 from collections.abc import Callable
@@ -36,7 +38,7 @@ from numba.extending import (
 )
 from numba.np.arrayobj import make_array, populate_array
 
-from coax_env.jit import compiled
+from coax_env.jit import compiled, name_apart
 
 WIDTH = 8
 """Helicopters in one group, a multiple of four: the doubles of two AVX2 registers."""
@@ -216,6 +218,24 @@ for _name, _emit in {
     _define(getattr(operator, f"i{_name.strip('_')}"), (WORDS, WORDS), WORDS, _emit)
 
 
+_versions = itertools.count()
+
+
+def _by_kind(key: Any) -> Callable[[Callable], Callable]:
+    """`numba.extending.overload`, inlined; each version under a name of its own (jit.name_apart)."""
+
+    def enter(choose: Callable) -> Callable:
+        @functools.wraps(choose)
+        def version(*args: Any, **kws: Any) -> Callable | None:
+            chosen = choose(*args, **kws)
+            return chosen and name_apart(chosen, next(_versions))
+
+        overload(key, jit_options=_INLINE)(version)
+        return choose
+
+    return enter
+
+
 def select(flag: Any, yes: Any, no: Any) -> Any:
     """`yes` where the flag is true, else `no`: of one helicopter or of each lane."""
     return yes if flag else no
@@ -236,19 +256,19 @@ _define(negated, (FLAGS,), FLAGS, lambda b, x: b.not_(x))
 _define(anywhere, (FLAGS,), types.boolean, _any)
 
 
-@overload(select, jit_options=_INLINE)
+@_by_kind(select)
 def _select_one(flag, yes, no):
     if isinstance(flag, types.Boolean):
         return lambda flag, yes, no: yes if flag else no
     return None
 
 
-@overload(negated, jit_options=_INLINE)
+@_by_kind(negated)
 def _negated_one(flag):
     return (lambda flag: not flag) if isinstance(flag, types.Boolean) else None
 
 
-@overload(anywhere, jit_options=_INLINE)
+@_by_kind(anywhere)
 def _anywhere_one(flag):
     if isinstance(flag, types.Boolean):
         return lambda flag: flag
@@ -269,7 +289,7 @@ def sine_and_cosine(x):
     return math.sin(x), math.cos(x)
 
 
-@overload(sine_and_cosine, jit_options=_INLINE)
+@_by_kind(sine_and_cosine)
 def _sine_and_cosine_of(x):
     return (
         (lambda x: _lanes_sine_and_cosine(x))
@@ -308,17 +328,17 @@ def _lanes_sine_and_cosine(x):
     return select(swapped, c, s) * sign, select(swapped, s, c) * (sign - 2.0 * sign * odd)
 
 
-@overload(math.sin, jit_options=_INLINE)
+@_by_kind(math.sin)
 def _sine(x):
     return (lambda x: sine_and_cosine(x)[0]) if x == LANES else None
 
 
-@overload(math.cos, jit_options=_INLINE)
+@_by_kind(math.cos)
 def _cosine(x):
     return (lambda x: sine_and_cosine(x)[1]) if x == LANES else None
 
 
-@overload(math.tan, jit_options=_INLINE)
+@_by_kind(math.tan)
 def _tangent(x):
     def tangent(x):
         sine, cosine = sine_and_cosine(x)
@@ -348,7 +368,7 @@ _EXPONENT = np.uint64(52)
 _LN2_HIGH, _LN2_LOW = 0.693145751953125, 1.42860682030941723212e-6
 
 
-@overload(float, jit_options=_INLINE)
+@_by_kind(float)
 def _whole_number(words):
     """Words under 2^52 as lanes."""
     if words != WORDS:
@@ -356,7 +376,7 @@ def _whole_number(words):
     return lambda words: _from_bits(words | _WHOLE) - 2.0**52
 
 
-@overload(math.exp, jit_options=_INLINE)
+@_by_kind(math.exp)
 def _exponential(x):
     """exp, to 2e-16 of itself (Cephes, Moshier 1989); arguments are clipped to +-708."""
 
@@ -375,7 +395,7 @@ def _exponential(x):
     return exponential if x == LANES else None
 
 
-@overload(math.log, jit_options=_INLINE)
+@_by_kind(math.log)
 def _logarithm(x):
     """Natural logarithm of positive normal numbers, to 3e-16 (Cephes, Moshier 1989).
 
