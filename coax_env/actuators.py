@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coax_env.jit import compiled
+from coax_env.lanes import select
 from coax_env.layout import N_COMMANDS
 
 if TYPE_CHECKING:
@@ -49,8 +50,8 @@ def limit(command, before, limits, dt):
     for k in range(N_COMMANDS):
         most = limits[FASTEST, k] * dt
         value = command[k]
-        value = before[k] + most if value > before[k] + most else value
-        value = before[k] - most if value < before[k] - most else value
-        value = limits[LOWEST, k] if value < limits[LOWEST, k] else value
-        value = limits[HIGHEST, k] if value > limits[HIGHEST, k] else value
+        value = select(value > before[k] + most, before[k] + most, value)
+        value = select(value < before[k] - most, before[k] - most, value)
+        value = select(value < limits[LOWEST, k], limits[LOWEST, k], value)
+        value = select(value > limits[HIGHEST, k], limits[HIGHEST, k], value)
         command[k] = before[k] = value

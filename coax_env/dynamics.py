@@ -26,6 +26,7 @@ from coax_env import flow as F
 from coax_env import parameters as P
 from coax_env.errors import InputError
 from coax_env.jit import compiled
+from coax_env.lanes import anywhere, select, sine_and_cosine
 from coax_env.late import late
 from coax_env.layout import CHANNELS, N_CHANNELS, N_COMMANDS, N_FULL, N_INPUTS, N_STATES, TIME
 from coax_env.vehicle import Vehicle, load_vehicle
@@ -61,40 +62,49 @@ WORK_SIZE = F.N_FLOW + N_FULL + 2 * N_STATES
 """Doubles of scratch that `step` and `measure` need."""
 
 
-@compiled()
-def _properties(x, u, p, f):
-    """Vehicle file's numbers into the workspace, once a step. (15)-(20)."""
-    f[F.TIME] = u[TIME]
-    f[F.MASS] = p[P.MASS]
-    f[F.INERTIA_XX] = p[P.INERTIA_XX]
-    f[F.INERTIA_YY] = p[P.INERTIA_YY]
-    f[F.INERTIA_ZZ] = p[P.INERTIA_ZZ]
-    f[F.SWASH_TO_FLAP] = p[P.SWASH_TO_FLAP]
-    f[F.FLAP_TIME] = p[P.FLAP_TIME]
-    f[F.FLYBAR_TIME] = p[P.FLYBAR_TIME]
-    radius = p[P.ROTOR_RADIUS]
-    k_T = p[P.AIR_DENSITY] * math.pi * radius * radius * radius * radius
-    k_Q = k_T * radius
-    f[F.THRUST_FACTOR_U] = p[P.C_TU] * k_T
-    f[F.THRUST_FACTOR_L] = p[P.C_TL] * k_T
-    f[F.TORQUE_FACTOR_U] = p[P.C_QU] * k_Q
-    f[F.TORQUE_FACTOR_L] = p[P.C_QL] * k_Q
-    f[F.MOTOR_LAG_U] = 0.0
-    f[F.MOTOR_LAG_L] = 0.0
-    f[F.SERVO_LAG] = 0.0
-    f[F.SPEED_SCALE] = 1.0
-    f[F.OMEGA_U_DOT] = 0.0
-    f[F.OMEGA_L_DOT] = 0.0
-    if p[effects.PROPERTY] != 0.0:
-        _property_effects(x, f, p)
+def _properties_of(with_effects):
+    """`_properties` compiled with the effects' call, or without it; see `_rates_of`."""
+
+    def properties(x, u, p, f):
+        """Vehicle file's numbers into the workspace, once a step. (15)-(20)."""
+        f[F.TIME] = u[TIME]
+        f[F.MASS] = p[P.MASS]
+        f[F.INERTIA_XX] = p[P.INERTIA_XX]
+        f[F.INERTIA_YY] = p[P.INERTIA_YY]
+        f[F.INERTIA_ZZ] = p[P.INERTIA_ZZ]
+        f[F.SWASH_TO_FLAP] = p[P.SWASH_TO_FLAP]
+        f[F.FLAP_TIME] = p[P.FLAP_TIME]
+        f[F.FLYBAR_TIME] = p[P.FLYBAR_TIME]
+        radius = p[P.ROTOR_RADIUS]
+        k_T = p[P.AIR_DENSITY] * math.pi * radius * radius * radius * radius
+        k_Q = k_T * radius
+        f[F.THRUST_FACTOR_U] = p[P.C_TU] * k_T
+        f[F.THRUST_FACTOR_L] = p[P.C_TL] * k_T
+        f[F.TORQUE_FACTOR_U] = p[P.C_QU] * k_Q
+        f[F.TORQUE_FACTOR_L] = p[P.C_QL] * k_Q
+        f[F.MOTOR_LAG_U] = 0.0
+        f[F.MOTOR_LAG_L] = 0.0
+        f[F.SERVO_LAG] = 0.0
+        f[F.SPEED_SCALE] = 1.0
+        f[F.OMEGA_U_DOT] = 0.0
+        f[F.OMEGA_L_DOT] = 0.0
+        if with_effects and p[effects.PROPERTY] != 0.0:
+            _property_effects(x, f, p)
+
+    return compiled()(properties)
+
+
+_properties = _properties_of(True)
+_properties_bare = _properties_of(False)
 
 
 @compiled()
 def _follow(start, command, time, lag):
     """Exact first-order response to a held command; without a lag it is its own limit."""
-    if lag <= SHORTEST_LAG:
+    lags = lag > SHORTEST_LAG
+    if not anywhere(lags):
         return command
-    return command + (start - command) * math.exp(-time / lag)
+    return select(lags, command + (start - command) * math.exp(-time / lag), command)
 
 
 @compiled()
@@ -119,9 +129,9 @@ def _rates_of(with_effects):
         Needs `_properties` before it. Leaves loads and rates in the workspace `f`.
         """
         p_, q_, r_ = x[3], x[4], x[5]
-        sin_phi, cos_phi = math.sin(x[10]), math.cos(x[10])
-        sin_theta, cos_theta = math.sin(x[11]), math.cos(x[11])
-        sin_psi, cos_psi = math.sin(x[12]), math.cos(x[12])
+        sin_phi, cos_phi = sine_and_cosine(x[10])
+        sin_theta, cos_theta = sine_and_cosine(x[11])
+        sin_psi, cos_psi = sine_and_cosine(x[12])
         f[F.SIN_PHI], f[F.COS_PHI] = sin_phi, cos_phi
         f[F.SIN_THETA], f[F.COS_THETA] = sin_theta, cos_theta
         f[F.SIN_PSI], f[F.COS_PSI] = sin_psi, cos_psi
@@ -218,7 +228,7 @@ def _rates_of(with_effects):
 
 
 _rates_with_effects = late(_rates_of(True))
-_rates_bare = compiled()(_rates_of(False))
+_rates_bare = compiled(forceinline=True)(_rates_of(False))
 
 
 @compiled()
@@ -231,52 +241,67 @@ def _rates(x, p, f, dx):
         _rates_bare(x, p, f, dx)
 
 
-@compiled()
-def step(x, u, dt, p, work, out):
-    """Fly one row: full state (26,) after `dt` seconds of held input, into `out`.
+def _step_of(with_effects):
+    """`step` compiled with the effects, or for vehicles that have none."""
 
-    RK4 on the paper's states; actuators and gusts exactly, at each stage's own time.
+    def step(x, u, dt, p, work, out):
+        """Fly one row: full state (26,) after `dt` seconds of held input, into `out`.
 
-    Args:
-        x: full state, shape (26,). u: commands and time since the run's start, shape (5,).
-        dt: seconds; rows longer than LONGEST_STEP are split. p: parameter vector.
-        work: scratch, shape (WORK_SIZE,). out: full state, shape (26,); may be `x` itself.
-    """
-    f = work[: F.N_FLOW]
-    stage = work[F.N_FLOW : F.N_FLOW + N_FULL]
-    slope = work[F.N_FLOW + N_FULL : F.N_FLOW + N_FULL + N_STATES]
-    total = work[F.N_FLOW + N_FULL + N_STATES : WORK_SIZE]
-    parts = max(1, math.ceil(dt / LONGEST_STEP - 1e-9))
-    h = dt / parts
-    for i in range(N_FULL):
-        out[i] = x[i]
-    _properties(out, u, p, f)
-    for _ in range(parts):
-        # rotor acceleration: the mean over the step, so that angular momentum is kept exactly
-        f[F.OMEGA_U_DOT] = (
-            _follow(out[16], u[0] * f[F.SPEED_SCALE], h, f[F.MOTOR_LAG_U]) - out[16]
-        ) / h
-        f[F.OMEGA_L_DOT] = (
-            _follow(out[17], u[1] * f[F.SPEED_SCALE], h, f[F.MOTOR_LAG_L]) - out[17]
-        ) / h
-        half_gust = math.exp(-0.5 * h / p[P.GUST_MEMORY])
-        for k in range(4):
-            time = 0.0 if k == 0 else (h if k == 3 else 0.5 * h)
-            fade = 1.0 if k == 0 else (half_gust * half_gust if k == 3 else half_gust)
+        RK4 on the paper's states; actuators and gusts exactly, at each stage's own time.
+
+        Args:
+            x: full state, shape (26,). u: commands and time since the run's start, shape (5,).
+            dt: seconds; rows longer than LONGEST_STEP are split. p: parameter vector.
+            work: scratch, shape (WORK_SIZE,). out: full state, shape (26,); may be `x` itself.
+        """
+        f = work[: F.N_FLOW]
+        stage = work[F.N_FLOW : F.N_FLOW + N_FULL]
+        slope = work[F.N_FLOW + N_FULL : F.N_FLOW + N_FULL + N_STATES]
+        total = work[F.N_FLOW + N_FULL + N_STATES : WORK_SIZE]
+        parts = max(1, math.ceil(dt / LONGEST_STEP - 1e-9))
+        h = dt / parts
+        for i in range(N_FULL):
+            out[i] = x[i]
+        if with_effects:
+            _properties(out, u, p, f)
+        else:
+            _properties_bare(out, u, p, f)
+        for _ in range(parts):
+            # rotor acceleration: the mean over the step, so that angular momentum is kept exactly
+            f[F.OMEGA_U_DOT] = (
+                _follow(out[16], u[0] * f[F.SPEED_SCALE], h, f[F.MOTOR_LAG_U]) - out[16]
+            ) / h
+            f[F.OMEGA_L_DOT] = (
+                _follow(out[17], u[1] * f[F.SPEED_SCALE], h, f[F.MOTOR_LAG_L]) - out[17]
+            ) / h
+            half_gust = math.exp(-0.5 * h / p[P.GUST_MEMORY])
+            for k in range(4):
+                time = 0.0 if k == 0 else (h if k == 3 else 0.5 * h)
+                fade = 1.0 if k == 0 else (half_gust * half_gust if k == 3 else half_gust)
+                for i in range(N_STATES):
+                    stage[i] = out[i] if k == 0 else out[i] + time * slope[i]
+                _actuate(out, u, time + READING_DELAY, f, stage)
+                for i in range(20, N_FULL):
+                    stage[i] = fade * out[i]
+                if with_effects:
+                    _rates(stage, p, f, slope)
+                else:
+                    _rates_bare(stage, p, f, slope)
+                weight = 1.0 if k == 0 or k == 3 else 2.0
+                for i in range(N_STATES):
+                    total[i] = weight * slope[i] if k == 0 else total[i] + weight * slope[i]
             for i in range(N_STATES):
-                stage[i] = out[i] if k == 0 else out[i] + time * slope[i]
-            _actuate(out, u, time + READING_DELAY, f, stage)
+                out[i] += h / 6.0 * total[i]
+            _actuate(out, u, h, f, out)
             for i in range(20, N_FULL):
-                stage[i] = fade * out[i]
-            _rates(stage, p, f, slope)
-            weight = 1.0 if k == 0 or k == 3 else 2.0
-            for i in range(N_STATES):
-                total[i] = weight * slope[i] if k == 0 else total[i] + weight * slope[i]
-        for i in range(N_STATES):
-            out[i] += h / 6.0 * total[i]
-        _actuate(out, u, h, f, out)
-        for i in range(20, N_FULL):
-            out[i] *= half_gust * half_gust
+                out[i] *= half_gust * half_gust
+
+    return compiled()(step)
+
+
+step = _step_of(True)
+step_bare = _step_of(False)
+"""`step` for a vehicle whose effects are all off: less to compile, and fit for lanes (lanes.py)."""
 
 
 @compiled()
@@ -306,38 +331,56 @@ def drift(x, u, dt, p, work, out):
         out[i] = fade * x[i]
 
 
-@compiled()
-def measure(x, u, p, work, out):
-    """Readings of every canonical channel, contract units, shape (18,), into `out`. Eq. (45)."""
-    f = work[: F.N_FLOW]
-    now = work[F.N_FLOW : F.N_FLOW + N_FULL]
-    slope = work[F.N_FLOW + N_FULL : F.N_FLOW + N_FULL + N_STATES]
-    _properties(x, u, p, f)
-    for i in range(N_FULL):
-        now[i] = x[i]
-    _actuate(x, u, READING_DELAY, f, now)
-    # a lagging rotor still accelerates; one without lag has arrived
-    if f[F.MOTOR_LAG_U] > 10.0 * READING_DELAY:
-        f[F.OMEGA_U_DOT] = (u[0] * f[F.SPEED_SCALE] - now[16]) / f[F.MOTOR_LAG_U]
-    if f[F.MOTOR_LAG_L] > 10.0 * READING_DELAY:
-        f[F.OMEGA_L_DOT] = (u[1] * f[F.SPEED_SCALE] - now[17]) / f[F.MOTOR_LAG_L]
-    _rates(now, p, f, slope)
-    z = f[F.READING :]
-    z[0] = now[16] * (30.0 / math.pi)
-    z[1] = now[17] * (30.0 / math.pi)
-    z[2], z[3], z[4] = x[3], x[4], x[5]
-    z[5] = f[F.FORCE_X] / f[F.MASS]
-    z[6] = f[F.FORCE_Y] / f[F.MASS]
-    z[7] = f[F.FORCE_Z] / f[F.MASS]
-    z[8], z[9], z[10] = x[10], x[11], x[12]
-    z[11] = -x[15]
-    z[12], z[13], z[14] = slope[13], slope[14], slope[15]
-    z[15], z[16] = x[13], x[14]
-    z[17] = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
-    if p[effects.SENSOR] != 0.0:
-        _sensor_effects(x, f, p)
-    for i in range(N_CHANNELS):
-        out[i] = z[i]
+def _measure_of(with_effects):
+    """`measure` compiled with the effects, or for vehicles that have none."""
+
+    def measure(x, u, p, work, out):
+        """Readings of every canonical channel, contract units, shape (18,), into `out`. Eq. (45)."""
+        f = work[: F.N_FLOW]
+        now = work[F.N_FLOW : F.N_FLOW + N_FULL]
+        slope = work[F.N_FLOW + N_FULL : F.N_FLOW + N_FULL + N_STATES]
+        if with_effects:
+            _properties(x, u, p, f)
+        else:
+            _properties_bare(x, u, p, f)
+        for i in range(N_FULL):
+            now[i] = x[i]
+        _actuate(x, u, READING_DELAY, f, now)
+        # a lagging rotor still accelerates; one without lag has arrived
+        lag_u, lag_l = f[F.MOTOR_LAG_U], f[F.MOTOR_LAG_L]
+        slow_u, slow_l = lag_u > 10.0 * READING_DELAY, lag_l > 10.0 * READING_DELAY
+        if anywhere(slow_u):
+            rate = (u[0] * f[F.SPEED_SCALE] - now[16]) / lag_u
+            f[F.OMEGA_U_DOT] = select(slow_u, rate, f[F.OMEGA_U_DOT])
+        if anywhere(slow_l):
+            rate = (u[1] * f[F.SPEED_SCALE] - now[17]) / lag_l
+            f[F.OMEGA_L_DOT] = select(slow_l, rate, f[F.OMEGA_L_DOT])
+        if with_effects:
+            _rates(now, p, f, slope)
+        else:
+            _rates_bare(now, p, f, slope)
+        z = f[F.READING :]
+        z[0] = now[16] * (30.0 / math.pi)
+        z[1] = now[17] * (30.0 / math.pi)
+        z[2], z[3], z[4] = x[3], x[4], x[5]
+        z[5] = f[F.FORCE_X] / f[F.MASS]
+        z[6] = f[F.FORCE_Y] / f[F.MASS]
+        z[7] = f[F.FORCE_Z] / f[F.MASS]
+        z[8], z[9], z[10] = x[10], x[11], x[12]
+        z[11] = -x[15]
+        z[12], z[13], z[14] = slope[13], slope[14], slope[15]
+        z[15], z[16] = x[13], x[14]
+        z[17] = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+        if with_effects and p[effects.SENSOR] != 0.0:
+            _sensor_effects(x, f, p)
+        for i in range(N_CHANNELS):
+            out[i] = z[i]
+
+    return compiled()(measure)
+
+
+measure = _measure_of(True)
+measure_bare = _measure_of(False)
 
 
 @compiled()

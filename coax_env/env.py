@@ -322,8 +322,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         done = terminated | truncated
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             if waiting:
-                fresh = fleet.restart(ended)
-                observations[ended] = fresh[ended]
+                fleet.restart(ended, observations=observations)
                 info |= self._vehicles(ended)
             self._ended = done
         elif self.autoreset_mode == AutoresetMode.DISABLED:
@@ -333,7 +332,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             info["final_obs"] = observations.copy()
             info["final_info"] = self._step_info(outcome.terms)
             info["_final_obs"] = info["_final_info"] = done
-            observations[done] = fleet.restart(done)[done]
+            fleet.restart(done, observations=observations)
             info |= self._vehicles(done)
         info |= self._step_info(outcome.terms)
         self._screen.moved()

@@ -27,13 +27,13 @@ from coax_env.dynamics import WORK_SIZE, hover_trim, measure, step
 from coax_env.errors import InputError
 from coax_env.jit import compiled
 from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
+from coax_env.period import BIAS, BIAS_STD, DT, LATE, blow, command, read, seen, turned
 from coax_env.random_streams import stream_key, two_normals, uniform
 from coax_env.randomisation import Draws, Randomize
-from coax_env.sensors import Sensor, is_new, shake, slow_instruments, suite
+from coax_env.sensors import Sensor, shake, slow_instruments, suite
 from coax_env.turbulence import N_EDDIES, settle, stir, wind_at_6m
 from coax_env.vehicle import SHIPPED, Vehicle, load_vehicle
 
-DT = hover.CONTROL_PERIOD
 ROTOR_RANGE = 0.15  # of the nominal hover speed
 SWASH_RANGE = 0.2  # [rad]
 Nominal = str | Path | Vehicle | tuple[Any, Any] | None
@@ -41,10 +41,10 @@ Nominal = str | Path | Vehicle | tuple[Any, Any] | None
 
 ROWS_PER_THREAD = 256  # fewer are not worth a thread
 
-# columns of the sensor table the kernel reads
-(
-    _INDEX, _NOISE, _RATE, _LOW, _HIGH, _WRAPS, _FLAG, _LATE, _DROPOUT, _INSTRUMENT, _BIAS, _BIAS_STD
-) = range(12)  # fmt: skip
+LANES_FROM = 8
+"""Fewer helicopters fly one by one: lanes take seconds to compile."""
+
+STAGES = slice(P.N_FIXED, P.N_FIXED + len(effects.STAGES))
 _DELAY = effects.parameter_index("servo_delay.time")
 _VIBRATION = effects.parameter_index("vibration.amplitude")
 _WIND_NORTH = effects.parameter_index("wind.north")
@@ -76,7 +76,7 @@ def _advance(x, u, p, swash, at, work):
 @compiled()
 def _sense(
     x, u, p, row, azimuth, sensors, bias, target, places, height_sign,
-    stream, past, held, readings, work, out,
+    stream, past, held, readings, values, work, out,
 ):  # fmt: skip
     """New readings where they are due, into `held` (float64) and as an observation into `out`.
 
@@ -86,40 +86,13 @@ def _sense(
     measure(x, u, p, work, readings)
     if p[_VIBRATION] != 0.0:
         shake(readings, azimuth, p[_VIBRATION])
+    seen(x, readings, sensors, values)
     n = len(sensors)
-    slots = len(past)
+    if len(past) > 0:
+        for k in range(n):
+            values[k] = _late(values[k], past, row, k, sensors[k, LATE])
     aim = len(held) - len(places)
-    for k in range(n, aim):
-        held[k] = 0.0
-    spare = 0.0
-    has_spare = False
-    chance = 1.0
-    drawn = -1.0
-    for k in range(n):
-        index = int(sensors[k, _INDEX])
-        value = readings[index] if index < N_CHANNELS else x[index - N_CHANNELS]
-        if slots > 0:
-            value = _late(value, past, row, k, sensors[k, _LATE])
-        if is_new(row, sensors[k, _RATE]):
-            if sensors[k, _NOISE] > 0.0:
-                if has_spare:
-                    noise = spare
-                else:
-                    noise, spare = two_normals(stream)
-                has_spare = not has_spare
-                value += sensors[k, _NOISE] * noise
-            value += bias[k]
-            if sensors[k, _WRAPS] != 0.0:
-                value -= 2.0 * math.pi * math.floor((value + math.pi) / (2.0 * math.pi))
-            if sensors[k, _DROPOUT] > 0.0 and sensors[k, _INSTRUMENT] != drawn:
-                chance = uniform(stream, 0.0, 1.0)
-                drawn = sensors[k, _INSTRUMENT]
-            if row == 0 or sensors[k, _DROPOUT] <= 0.0 or chance >= sensors[k, _DROPOUT]:
-                if math.isfinite(value):
-                    held[k] = min(max(value, sensors[k, _LOW]), sensors[k, _HIGH])
-                flag = int(sensors[k, _FLAG])
-                if flag >= 0:
-                    held[flag] = 1.0
+    read(values, row, sensors, bias, stream, aim - n, held)
     if len(places) > 0:
         tasks.point(held, places, height_sign, target, held[aim:])
     for k in range(len(held)):
@@ -143,19 +116,6 @@ def _late(value, past, row, k, late):
 
 
 @compiled()
-def _blow(x, p, gust, stream):
-    """Move the gust states on by one period: exponential memory, stationary std `gust` (2,)."""
-    share = math.sqrt(1.0 - math.exp(-2.0 * DT / p[P.GUST_MEMORY]))
-    for half in range(2):
-        if gust[half] > 0.0:
-            a, b = two_normals(stream)
-            c, _ = two_normals(stream)
-            x[20 + 3 * half] += share * gust[half] * a
-            x[21 + 3 * half] += share * gust[half] * b
-            x[22 + 3 * half] += share * gust[half] * c
-
-
-@compiled()
 def _stir(x, p, stream, eddies, breeze, wind, air):
     """Turbulence for the coming period, along and across the steady wind `breeze` (2,), into `p`."""
     stir(stream, eddies, -x[15], wind, DT, air)
@@ -176,7 +136,7 @@ def _fly_rows(
 ):  # fmt: skip
     """One control period of the active rows first..last-1. See Fleet for the arrays."""
     work = np.empty(WORK_SIZE)
-    readings = np.empty(N_CHANNELS)
+    readings, values = np.empty(N_CHANNELS), np.empty(sensors.shape[1])
     air = np.empty(3)
     many = len(params) > 1
     for i in range(first, last):
@@ -186,22 +146,19 @@ def _fly_rows(
             continue
         p = params[i] if many else params[0]
         kind = kinds[i]
-        for k in range(4):
-            a = actions[i, k]
-            actions[i, k] = a = -1.0 if a < -1.0 else (1.0 if a > 1.0 else a)  # NaN stays
-            u[i, k] = trim[k] + scale[k] * a
+        command(actions[i], trim, scale, u[i])
         limit(u[i], asked[i], limits[kind], DT)
         slots = swash.shape[1]
         at = rows[i] % slots
         swash[i, at, 0], swash[i, at, 1] = u[i, 2], u[i, 3]
         u[i, TIME] = rows[i] * DT
         if gust[0] > 0.0 or gust[1] > 0.0:
-            _blow(x[i], p, gust, streams[i])
+            blow(x[i], p, gust, streams[i])
         if turbulence > 0.0:
             _stir(x[i], p, streams[i], eddies[i], breeze[i], turbulence, air)
         _advance(x[i], u[i], p, swash[i], at, work)
         rows[i] += 1
-        azimuth[i] = (azimuth[i] + DT * x[i, 16]) % (2.0 * math.pi)
+        azimuth[i] = turned(azimuth[i], x[i, 16])
         u[i, TIME] = rows[i] * DT
         rewards[i] = hover.reward(x[i], actions[i], targets[i], weights, scales, terms[i])
         over[i] = hover.is_over(x[i])
@@ -211,7 +168,8 @@ def _fly_rows(
             tasks.aim(streams[i], course, box, progress[i, tasks.REACHED], targets[i])
         _sense(
             x[i], u[i], p, rows[i], azimuth[i], sensors[kind], bias[i], targets[i],
-            places, height_sign, streams[i], past[i], held[i], readings, work, observations[i],
+            places, height_sign, streams[i], past[i], held[i], readings, values, work,
+            observations[i],
         )  # fmt: skip
 
 
@@ -224,7 +182,7 @@ def _restart_rows(
 ):  # fmt: skip
     """New flights for the rows of the mask `which`; with `keep_state` from what stands in `x`."""
     work = np.empty(WORK_SIZE)
-    readings = np.empty(N_CHANNELS)
+    readings, values = np.empty(N_CHANNELS), np.empty(sensors.shape[1])
     many = len(params) > 1
     for i in range(len(which)):
         if not which[i]:
@@ -236,9 +194,9 @@ def _restart_rows(
         p = params[i] if many else params[0]
         table = sensors[kinds[i]]
         for k in range(len(table)):
-            bias[i, k] = table[k, _BIAS]
-            if table[k, _BIAS_STD] > 0.0:
-                bias[i, k] += table[k, _BIAS_STD] * two_normals(streams[i])[0]
+            bias[i, k] = table[k, BIAS]
+            if table[k, BIAS_STD] > 0.0:
+                bias[i, k] += table[k, BIAS_STD] * two_normals(streams[i])[0]
         if not keep_state:
             hover.start(streams[i], trim, x[i])
         if turbulence > 0.0:
@@ -258,7 +216,8 @@ def _restart_rows(
             held[i, k] = 0.0
         _sense(
             x[i], u[i], p, 0, azimuth[i], table, bias[i], targets[i],
-            places, height_sign, streams[i], past[i], held[i], readings, work, observations[i],
+            places, height_sign, streams[i], past[i], held[i], readings, values, work,
+            observations[i],
         )  # fmt: skip
 
 
@@ -324,6 +283,7 @@ class Fleet:
         self._own = self.draws.random or self._wind_speed > 0.0 or self._turbulence > 0.0
         self._base = np.tile(self._in_wind(self.vehicle.vector), (count if self._own else 1, 1))
         self.params = self._base.copy()
+        self._switched_on = bool(self.params[:, STAGES].any())
         self.drawn = np.zeros((count, len(self.draws.names)))
         self.kinds = np.zeros(count, dtype=np.int64)
         self._allocate()
@@ -343,7 +303,7 @@ class Fleet:
         """The arrays of one row per helicopter; rings and the like only where something needs them."""
         count, width = self.count, len(self.sensors)
         delay = self.draws.most("servo_delay.time")
-        late = self._table[:, :, _LATE].max()
+        late = self._table[:, :, LATE].max()
         windy = count if self._turbulence > 0.0 else 1
         self.x = np.zeros((count, N_FULL))
         self.u = np.zeros((count, N_INPUTS))
@@ -363,12 +323,18 @@ class Fleet:
         """Give a row the stream of a seed, from its beginning."""
         self.streams[row] = stream_key(np.uint64(seed & 0xFFFFFFFFFFFFFFFF)), 0
 
-    def restart(self, which: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
+    def restart(
+        self,
+        which: np.ndarray,
+        states: np.ndarray | None = None,
+        observations: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Start new flights in the rows of a mask and return all observations, float32.
 
         Args:
             which: bool, shape (count,).
             states: paper or full states to start from, (count, 16 or 26); random when None.
+            observations: where to put the rows' observations, (count, n_observed).
         """
         if self.draws.random:
             streams = self.streams[which]
@@ -379,12 +345,14 @@ class Fleet:
             )
         if self._own:
             self.params[which] = self._base[which]
+            self._switched_on = bool(self.params[:, STAGES].any())
         if states is not None:
             x = np.zeros((self.count, N_FULL))
             x[:, 16:20] = self.trim
             x[:, : states.shape[-1]] = states
             self.x[which] = x[which]
-        observations = self.held.astype(np.float32)
+        if observations is None:
+            observations = self.held.astype(np.float32)
         _restart_rows(
             which, states is not None, self.trim, self.params, self.kinds, self._table, self._limits,
             self._wind_speed, self._turbulence,
@@ -405,22 +373,47 @@ class Fleet:
             np.zeros(n, dtype=np.bool_),
         )
 
+        task = (
+            self._weights, self._scales, self._places, self._height_sign, self._course, self._box,
+            self._dwell,
+        )  # fmt: skip
+        results = (outcome.observations, outcome.rewards, outcome.terms, outcome.over)
+
         def rows(first: int, last: int) -> None:
+            if self._side_by_side():
+                self._fly_lanes()(
+                    first, last, active, actions, self.trim, self.scale, self.params,
+                    self._table[0], self._limits[0], self._gust, *task,
+                    self.x, self.u, self.rows, self.azimuth, self.streams, self.asked, self.bias,
+                    self.targets, self.progress, self.held, *results,
+                )  # fmt: skip
+                return
             _fly_rows(
                 first, last, active, actions, self.trim, self.scale, self.params, self.kinds,
-                self._table, self._limits, self._gust, self._turbulence,
-                self._weights, self._scales, self._places, self._height_sign, self._course, self._box,
-                self._dwell,
+                self._table, self._limits, self._gust, self._turbulence, *task,
                 self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked,
                 self.bias, self.past, self.eddies, self.breeze, self.targets, self.progress,
-                self.held, outcome.observations, outcome.rewards, outcome.terms, outcome.over,
+                self.held, *results,
             )  # fmt: skip
 
-        if self._threads == 1:
-            rows(0, n)
-        else:
-            _in_threads(rows, n, self._threads)
+        in_threads(rows, n, self._threads)
         return outcome
+
+    def _side_by_side(self) -> bool:
+        """Whether the rows fly in lanes: enough of them, and nothing that lanes do not have."""
+        return (
+            self.count >= LANES_FROM
+            and len(self._table) == 1
+            and self.swash.shape[1] == 1
+            and self.past.shape[1] == 0
+            and not self._turbulence
+            and not self._switched_on
+        )
+
+    def _fly_lanes(self) -> Callable[..., None]:
+        from coax_env import fleet_lanes  # compiled where it is flown only
+
+        return fleet_lanes.fly_own if len(self.params) > 1 else fleet_lanes.fly_shared
 
     @property
     def air(self) -> np.ndarray:
@@ -503,8 +496,11 @@ def _wind(wind: float | Sequence[float] | None) -> tuple[np.ndarray, float]:
 _POOLS: dict[tuple[int, int], ThreadPoolExecutor] = {}
 
 
-def _in_threads(function: Callable[[int, int], None], count: int, threads: int) -> None:
+def in_threads(function: Callable[[int, int], None], count: int, threads: int) -> None:
     """Call function(first, last) on equal shares; the compiled kernel lets other threads run."""
+    if threads == 1:
+        function(0, count)
+        return
     key = (os.getpid(), threads)  # a forked child has no threads of its parent
     if key not in _POOLS:
         _POOLS[key] = ThreadPoolExecutor(threads)

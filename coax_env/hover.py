@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from coax_env.jit import compiled
+from coax_env.lanes import negated, select
 from coax_env.layout import N_FULL
 from coax_env.random_streams import uniform
 
@@ -100,42 +101,43 @@ def reward(x, action, target, weights, scales, terms):
     """
     north, east, turn = x[13] - target[0], x[14] - target[1], x[12] - target[3]
     heading = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
-    squares = (
-        0.0,  # alive
-        (x[15] - target[2]) ** 2,
-        north * north + east * east,
-        x[0] * x[0] + x[1] * x[1] + x[2] * x[2],
-        heading * heading,
-        x[3] * x[3] + x[4] * x[4] + x[5] * x[5],
-        action[0] ** 2 + action[1] ** 2 + action[2] ** 2 + action[3] ** 2,
-    )
-    total = 0.0
+    up = x[15] - target[2]
+    # errors squared, in REWARD_TERMS' order
+    terms[0] = 0.0  # alive
+    terms[1] = up * up
+    terms[2] = north * north + east * east
+    terms[3] = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
+    terms[4] = heading * heading
+    terms[5] = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
+    terms[6] = (
+        action[0] * action[0] + action[1] * action[1]
+        + action[2] * action[2] + action[3] * action[3]
+    )  # fmt: skip
+    total = 0.0 * up
     for k in range(N_TERMS):
-        terms[k] = weights[k] / (1.0 + math.sqrt(squares[k]) / scales[k])
+        terms[k] = weights[k] * scales[k] / (scales[k] + math.sqrt(terms[k]))
         total += terms[k]
-    if not math.isfinite(total):
-        total = 0.0
-        for k in range(N_TERMS):
-            terms[k] = 0.0
-    return total
+    fine = math.isfinite(total)
+    for k in range(N_TERMS):
+        terms[k] = select(fine, terms[k], 0.0)
+    return select(fine, total, 0.0)
 
 
 @compiled()
 def is_over(x):
     """Whether the flight has ended: ground, tilt, too fast, too far, too high, or not a number."""
+    nought = 0.0 * x[0]
+    for i in range(1, N_FULL):
+        nought += 0.0 * x[i]  # NaN where a state is not finite
     inside = (
-        -x[15] > LOWEST
-        and -x[15] < HIGHEST
-        and math.cos(x[10]) * math.cos(x[11]) > _COS_STEEPEST
-        and x[13] * x[13] + x[14] * x[14] < FARTHEST * FARTHEST
-        and x[0] * x[0] + x[1] * x[1] + x[2] * x[2] < FASTEST * FASTEST
+        (nought == 0.0)
+        & (-x[15] > LOWEST)
+        & (-x[15] < HIGHEST)
+        & (math.cos(x[10]) * math.cos(x[11]) > _COS_STEEPEST)
+        & (x[13] * x[13] + x[14] * x[14] < FARTHEST * FARTHEST)
+        & (x[0] * x[0] + x[1] * x[1] + x[2] * x[2] < FASTEST * FASTEST)
     )
-    if not inside:  # a comparison with NaN is false
-        return True
-    for i in range(N_FULL):  # noqa: SIM110 - compiled
-        if not math.isfinite(x[i]):
-            return True
-    return False
+    return negated(inside)  # a comparison with NaN is false
 
 
 def cost(states: np.ndarray, actions: np.ndarray, targets: np.ndarray | None = None) -> np.ndarray:

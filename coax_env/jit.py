@@ -23,6 +23,7 @@ KERNEL_SOURCES = (
     "parameters.py",
     "generic_terms.py",
     "effects.py",
+    "lanes.py",
     "late.py",
     "dynamics.py",
     "sensors.py",
@@ -32,7 +33,9 @@ KERNEL_SOURCES = (
     "hover.py",
     "tasks.py",
     "randomisation.py",
+    "period.py",
     "fleet.py",
+    "fleet_lanes.py",
     "engine/kalman.py",
 )
 

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from coax_env.jit import compiled
+from coax_env.lanes import sine_and_cosine
 
 KEY, COUNTER = 0, 1
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -47,10 +48,33 @@ def uniform(stream, low, high):
 
 
 @compiled()
-def two_normals(stream):
-    """Two independent standard normal numbers (Box and Muller 1958), from one draw of 64 bits."""
-    bits = next_bits(stream)
+def bits_ahead(stream, ahead):
+    """The random bits that come after `ahead` others; the stream stays where it is."""
+    return scrambled(stream[KEY] + (stream[COUNTER] + np.uint64(ahead + 1)) * _GOLDEN)
+
+
+@compiled()
+def skip(stream, n):
+    """Move a stream on by `n` numbers."""
+    stream[COUNTER] += np.uint64(n)
+
+
+@compiled()
+def normals_of(bits):
+    """Two independent standard normal numbers (Box and Muller 1958) from 64 random bits."""
     first = (float(bits >> _S32) + 0.5) * 2.0**-32
-    angle = float(bits & _LOW) * (2.0 * math.pi * 2.0**-32)
+    sine, cosine = sine_and_cosine(float(bits & _LOW) * (2.0 * math.pi * 2.0**-32))
     radius = math.sqrt(-2.0 * math.log(first))
-    return radius * math.cos(angle), radius * math.sin(angle)
+    return radius * cosine, radius * sine
+
+
+@compiled()
+def two_normals(stream):
+    """Two independent standard normal numbers, from one draw of 64 bits."""
+    return normals_of(next_bits(stream))
+
+
+@compiled()
+def chance_of(bits):
+    """Uniform in [0, 1) from 64 random bits."""
+    return float(bits >> _S32) * 2.0**-32

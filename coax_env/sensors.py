@@ -200,7 +200,7 @@ def is_new(row: int, rate: float) -> bool:
     """
     now = math.floor(row * (rate / BASE_RATE) + 1e-9)
     before = math.floor((row - 1) * (rate / BASE_RATE) + 1e-9)
-    return row <= 0 or now != before
+    return now > before
 
 
 def log_readings(

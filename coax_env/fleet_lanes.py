@@ -1,0 +1,245 @@
+"""The batch kernel for helicopters without effects: WIDTH rows of the fleet at a time, in lanes.
+
+The same control period as fleet.py's for one row, made of the same parts (period.py); here each part
+is compiled for lanes. Any active rows make a group; the last group is filled up with copies, whose
+results are dropped.
+"""
+
+import numpy as np
+
+from coax_env import effects, hover, tasks
+from coax_env import parameters as P
+from coax_env.actuators import limit
+from coax_env.dynamics import WORK_SIZE, measure_bare, step_bare
+from coax_env.errors import InputError
+from coax_env.fleet import STAGES, in_threads
+from coax_env.jit import compiled
+from coax_env.lanes import WIDTH, gather, lanes_of, scatter, select, words_of
+from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
+from coax_env.period import BIAS, BIAS_STD, DT, blow, command, read, seen, turned
+from coax_env.vehicle import Vehicle
+
+CHUNK = 64
+"""Rows that are flown, and then sense: the code of either stays at hand for some groups."""
+
+_N_PARAMETERS = P.N_FIXED + len(effects.STAGES)
+_ROW, _AZIMUTH, _REWARD, _OVER = range(4)
+_N_SINGLES = 4
+
+
+@compiled()
+def _next_group(i, last, active, which):
+    """The next WIDTH active rows from row `i` on into `which`; how many they are, and the row after."""
+    n = 0
+    while i < last and n < WIDTH:
+        if active[i]:
+            which[n] = i
+            n += 1
+        i += 1
+    for j in range(n, WIDTH):
+        which[j] = which[0]
+    return n, i
+
+
+def _step_of(own):
+    """Command, flight and judgement, for parameters of each row's own, or for one vehicle."""
+
+    def step_rows(
+        first, last, active, actions, trim, scale, params, limits, gust, weights, scales,
+        x, u, rows, azimuth, streams, asked, targets, rewards, terms, over,
+    ):  # fmt: skip
+        """Fly the active rows first..last-1 for one control period. See fleet.Fleet for the arrays."""
+        which = np.empty(WIDTH, np.int64)
+        x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
+        action_block, asked_block = np.empty((4, WIDTH)), np.empty((4, WIDTH))
+        target_block, term_block = np.empty((4, WIDTH)), np.zeros((len(weights), WIDTH))
+        stream_block, work_block = np.empty((2, WIDTH), np.uint64), np.empty((WORK_SIZE, WIDTH))
+        row_block = np.empty((_N_SINGLES, WIDTH))
+        x_, u_, action_ = lanes_of(x_block), lanes_of(u_block), lanes_of(action_block)
+        asked_, target_, terms_ = (
+            lanes_of(asked_block),
+            lanes_of(target_block),
+            lanes_of(term_block),
+        )
+        single_, work, stream_ = lanes_of(row_block), lanes_of(work_block), words_of(stream_block)
+        if own:
+            p_block = np.empty((_N_PARAMETERS, WIDTH))
+            p = lanes_of(p_block)
+        else:
+            p = params[0]
+        gusty = gust[0] > 0.0 or gust[1] > 0.0
+        limited = np.isfinite(limits).any()
+        n, after = _next_group(first, last, active, which)
+        while n > 0:
+            gather(x, which, x_block)
+            gather(actions, which, action_block)
+            gather(targets, which, target_block)
+            if own:
+                gather(params, which, p_block)
+            for j in range(WIDTH):
+                row_block[_ROW, j] = rows[which[j]]
+                row_block[_AZIMUTH, j] = azimuth[which[j]]
+            command(action_, trim, scale, u_)
+            if limited:
+                gather(asked, which, asked_block)
+                limit(u_, asked_, limits, DT)
+                scatter(asked_block, which, n, asked)
+            if gusty:
+                gather(streams, which, stream_block)
+                blow(x_, p, gust, stream_)
+                scatter(stream_block, which, n, streams)
+            u_[TIME] = single_[_ROW] * DT
+            step_bare(x_, u_, DT, p, work, x_)
+            u_[TIME] = (single_[_ROW] + 1.0) * DT
+            single_[_AZIMUTH] = turned(single_[_AZIMUTH], x_[16])
+            single_[_REWARD] = hover.reward(x_, action_, target_, weights, scales, terms_)
+            single_[_OVER] = select(hover.is_over(x_), 1.0, 0.0)
+            scatter(x_block, which, n, x)
+            scatter(u_block, which, n, u)
+            scatter(term_block, which, n, terms)
+            for j in range(n):
+                row = which[j]
+                rows[row] += 1
+                azimuth[row] = row_block[_AZIMUTH, j]
+                rewards[row] = row_block[_REWARD, j]
+                over[row] = row_block[_OVER, j] != 0.0
+            n, after = _next_group(after, last, active, which)
+
+    return compiled()(step_rows)
+
+
+def _sense_of(own):
+    """Readings, for parameters of each row's own, or for one vehicle."""
+
+    def sense_rows(
+        first, last, active, params, sensors, places, height_sign,
+        x, u, rows, streams, bias, targets, held, observations,
+    ):  # fmt: skip
+        """New readings of the active rows first..last-1. See fleet.Fleet for the arrays."""
+        which = np.empty(WIDTH, np.int64)
+        count = len(sensors)
+        x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
+        target_block, held_block = np.empty((4, WIDTH)), np.empty((held.shape[1], WIDTH))
+        bias_block, value_block = np.zeros((count, WIDTH)), np.empty((count, WIDTH))
+        reading_block, work_block = np.empty((N_CHANNELS, WIDTH)), np.empty((WORK_SIZE, WIDTH))
+        stream_block, row_block = np.empty((2, WIDTH), np.uint64), np.empty((1, WIDTH))
+        x_, u_, target_, held_ = (
+            lanes_of(x_block), lanes_of(u_block), lanes_of(target_block), lanes_of(held_block)
+        )  # fmt: skip
+        bias_, values_, readings_ = (
+            lanes_of(bias_block), lanes_of(value_block), lanes_of(reading_block)
+        )  # fmt: skip
+        row_, work, stream_ = lanes_of(row_block), lanes_of(work_block), words_of(stream_block)
+        if own:
+            p_block = np.empty((_N_PARAMETERS, WIDTH))
+            p = lanes_of(p_block)
+        else:
+            p = params[0]
+        biased = False
+        for k in range(count):
+            biased = biased or sensors[k, BIAS] != 0.0 or sensors[k, BIAS_STD] != 0.0
+        flags = len(held_) - len(places) - count
+        n, after = _next_group(first, last, active, which)
+        while n > 0:
+            gather(x, which, x_block)
+            gather(u, which, u_block)
+            gather(held, which, held_block)
+            gather(streams, which, stream_block)
+            if biased:
+                gather(bias, which, bias_block)
+            if own:
+                gather(params, which, p_block)
+            for j in range(WIDTH):
+                row_block[0, j] = rows[which[j]]
+            measure_bare(x_, u_, p, work, readings_)
+            seen(x_, readings_, sensors, values_)
+            read(values_, row_[0], sensors, bias_, stream_, flags, held_)
+            if len(places) > 0:
+                gather(targets, which, target_block)
+                tasks.point(held_, places, height_sign, target_, held_[count + flags :])
+            scatter(held_block, which, n, held)
+            scatter(held_block, which, n, observations)
+            scatter(stream_block, which, n, streams)
+            n, after = _next_group(after, last, active, which)
+
+    return compiled()(sense_rows)
+
+
+_step_shared, _step_own = _step_of(False), _step_of(True)
+_sense_shared, _sense_own = _sense_of(False), _sense_of(True)
+
+
+def _fly_of(own):
+    """The batch kernel for parameters of each row's own, or for one vehicle."""
+
+    def fly(
+        first, last, active, actions, trim, scale, params, sensors, limits, gust,
+        weights, scales, places, height_sign, course, box, dwell,
+        x, u, rows, azimuth, streams, asked, bias, targets, progress, held,
+        observations, rewards, terms, over,
+    ):  # fmt: skip
+        """One control period of the active rows first..last-1. See fleet.Fleet for the arrays."""
+        for start in range(first, last, CHUNK):
+            end = min(start + CHUNK, last)
+            if own:
+                _step_own(
+                    start, end, active, actions, trim, scale, params, limits, gust, weights, scales,
+                    x, u, rows, azimuth, streams, asked, targets, rewards, terms, over,
+                )  # fmt: skip
+            else:
+                _step_shared(
+                    start, end, active, actions, trim, scale, params, limits, gust, weights, scales,
+                    x, u, rows, azimuth, streams, asked, targets, rewards, terms, over,
+                )  # fmt: skip
+            for i in range(start, end):
+                if not active[i]:
+                    for k in range(held.shape[1]):
+                        observations[i, k] = held[i, k]
+                elif dwell > 0 and tasks.arrive(x[i], targets[i], dwell, progress[i], course):
+                    terms[i, hover.N_TERMS] = weights[hover.N_TERMS]
+                    rewards[i] += weights[hover.N_TERMS]
+                    tasks.aim(streams[i], course, box, progress[i, tasks.REACHED], targets[i])
+            if own:
+                _sense_own(
+                    start, end, active, params, sensors, places, height_sign,
+                    x, u, rows, streams, bias, targets, held, observations,
+                )  # fmt: skip
+            else:
+                _sense_shared(
+                    start, end, active, params, sensors, places, height_sign,
+                    x, u, rows, streams, bias, targets, held, observations,
+                )  # fmt: skip
+
+    return compiled()(fly)
+
+
+fly_shared = _fly_of(False)
+fly_own = _fly_of(True)
+
+
+@compiled()
+def _dynamics_rows(first, last, x, u, p):
+    which, active = np.empty(WIDTH, np.int64), np.ones(len(x), np.bool_)
+    x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
+    work_block = np.empty((WORK_SIZE, WIDTH))
+    x_, u_, work = lanes_of(x_block), lanes_of(u_block), lanes_of(work_block)
+    n, after = _next_group(first, last, active, which)
+    while n > 0:
+        gather(x, which, x_block)
+        gather(u, which, u_block)
+        step_bare(x_, u_, DT, p, work, x_)
+        scatter(x_block, which, n, x)
+        n, after = _next_group(after, last, active, which)
+
+
+def fly_dynamics(x: np.ndarray, u: np.ndarray, vehicle: Vehicle, threads: int = 1) -> None:
+    """The dynamics alone, of one vehicle without effects, over one control period and in place.
+
+    No sensors, no task, no ends: what the env's speed is measured against.
+
+    Args:
+        x: full states, (count, 26). u: commands and time, (count, 5).
+    """
+    if vehicle.vector[STAGES].any():
+        raise InputError(f"vehicle {vehicle.name!r} has effects: lanes are for those without")
+    in_threads(lambda a, b: _dynamics_rows(a, b, x, u, vehicle.vector), len(x), threads)
