@@ -8,8 +8,6 @@ the table states. Absolute times depend on the machine and its neighbours; compa
 
 import json
 import os
-import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -28,7 +26,6 @@ SCRIPTS = Path(__file__).resolve().parent
 PACKAGE = SCRIPTS.parent / "coax_env"
 PROGRAMS = SCRIPTS / "speed"
 OURS = "coax"
-EFFECT_ROUNDS = 3
 LIMIT = 300.0  # [s] for one program
 
 TIMER = """
@@ -37,27 +34,28 @@ import numba, numpy as np
 from coax_env import dynamics
 from coax_env.vehicle import load_vehicle
 
-@numba.njit
-def many(x, u, p, work, n):
-    for _ in range(n):
-        dynamics.step(x, u, 0.01, p, work, x)
-
-def seconds(vehicle, n=100_000):
-    state, command = dynamics.hover_trim(vehicle)
-    u, work = dynamics.kernel_input(command), np.zeros(dynamics.WORK_SIZE)
-    x = dynamics.full_state(state, command, vehicle)
-    best = np.inf
-    for _ in range(15):
-        y = x.copy()
-        start = time.perf_counter()
-        many(y, u, vehicle.vector, work, n)
-        best = min(best, time.perf_counter() - start)
-    return best / n * 1e6
+def many_of(step):
+    @numba.njit
+    def many(x, u, p, work, n):
+        for _ in range(n):
+            step(x, u, 0.01, p, work, x)
+    return many
 
 bare = load_vehicle("lama400d")
-many(dynamics.full_state(*dynamics.hover_trim(bare), bare),
-     dynamics.kernel_input(dynamics.hover_trim(bare)[1]), bare.vector, np.zeros(dynamics.WORK_SIZE), 1)
-print(json.dumps(seconds(bare)))
+state, command = dynamics.hover_trim(bare)
+u, work = dynamics.kernel_input(command), np.zeros(dynamics.WORK_SIZE)
+x = dynamics.full_state(state, command, bare)
+kinds = {"step": many_of(dynamics.step), "step_bare": many_of(dynamics.step_bare)}
+best = dict.fromkeys(kinds, np.inf)
+n = 50_000
+for k in range(40):
+    for name, many in kinds.items():
+        y = x.copy()
+        start = time.perf_counter()
+        many(y, u, bare.vector, work, n if k else 1)
+        if k:
+            best[name] = min(best[name], (time.perf_counter() - start) / n * 1e6)
+print(json.dumps(best))
 """
 
 
@@ -234,45 +232,16 @@ def cold_start() -> float:
 
 
 def effects_off() -> dict[str, Any]:
-    """What a step costs with all effects off, and with their calls cut out of a copy of the kernel."""
-    with tempfile.TemporaryDirectory() as folder:
-        stripped = Path(folder) / "coax_env"
-        shutil.copytree(PACKAGE, stripped, ignore=shutil.ignore_patterns("__pycache__", "flights"))
-        strip_effects(stripped / "dynamics.py")
-        times: dict[str, list[float]] = {"with": [], "without": []}
-        for _ in range(EFFECT_ROUNDS):
-            times["with"].append(step_microseconds(PACKAGE.parent))
-            times["without"].append(step_microseconds(Path(folder)))
-    return {"step_us": times, "effects_off_ratio": min(times["with"]) / min(times["without"])}
-
-
-def strip_effects(path: Path) -> None:
-    """Cut every call of a stage of effects out of a copy of the kernel."""
-    text = path.read_text()
-    cut, count = re.subn(
-        r"\n +if (with_effects and )?p\[effects\.[A-Z]+\] != 0\.0:"
-        r"\n +_[a-z]+_(effects|terms)\(x, f, p\)",
-        "",
-        text,
-    )
-    if count != 7:
-        raise RuntimeError(f"expected 7 stages of effects in {path.name}, found {count}")
-    switch = "if flown + p[effects.UNLISTED] != 0.0:"
-    if switch not in cut:
-        raise RuntimeError(f"the switch between the two rates is not in {path.name}")
-    path.write_text(cut.replace(switch, "if False:"))
-
-
-def step_microseconds(root: Path) -> float:
-    """Best time of one step in a fresh interpreter that sees this copy of the package."""
-    environment = {**os.environ, "PYTHONPATH": str(root), "COAX_CACHE_DIR": str(root / ".cache")}
-    if root == PACKAGE.parent:
-        environment.pop("COAX_CACHE_DIR")
+    """What a step costs with all effects off, and without their calls (one source, compiled twice)."""
     done = subprocess.run(
-        [sys.executable, "-c", TIMER], env=environment, cwd=root, capture_output=True, text=True,
-        check=True,
+        [sys.executable, "-c", TIMER], capture_output=True, text=True, check=True,
+        env=peers.clean_environment() | {"PYTHONPATH": str(PACKAGE.parent)},
     )  # fmt: skip
-    return float(done.stdout)
+    microseconds = json.loads(done.stdout)
+    return {
+        "step_us": microseconds,
+        "effects_off_ratio": microseconds["step"] / microseconds["step_bare"],
+    }
 
 
 if __name__ == "__main__":

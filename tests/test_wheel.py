@@ -75,7 +75,14 @@ def test_the_verbs_work_from_the_wheel(wheel, tmp_path):
         return done
 
     said = coax("--help").stdout
-    for verb in ("simulate", "check_flight", "diagnose", "identify", "design_lqr", "compare_models"):
+    for verb in (
+        "simulate",
+        "check_flight",
+        "diagnose",
+        "identify",
+        "design_lqr",
+        "compare_models",
+    ):
         assert f"\n  {verb} " in said
     assert coax("--version").stdout == f"coax {coax_env.__version__}\n"
     assert coax("diagnose", "--help").stdout.startswith("usage: coax diagnose")

@@ -29,32 +29,21 @@ def open_env(count: int | None) -> Flown:
 
 
 def open_kernel(count: int | None) -> Flown:
-    """`dynamics.step` alone over rows in threads: no sensors, no reward, no end."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    import numba
+    """The dynamics alone: no sensors, no reward, no end."""
     import numpy as np
 
     import coax_env
-    from coax_env import dynamics, hover
+    from coax_env import dynamics
+    from coax_env.fleet_lanes import fly_dynamics
 
     vehicle = coax_env.load_vehicle("lama400d")
     state, command = dynamics.hover_trim(vehicle)
     rows = count or 1
     x = np.tile(dynamics.full_state(state, command, vehicle), (rows, 1))
-    u, p, dt = dynamics.kernel_input(command), vehicle.vector, hover.CONTROL_PERIOD
-
-    @numba.njit(nogil=True)
-    def fly(x: Any, work: Any) -> None:
-        for i in range(len(x)):
-            dynamics.step(x[i], u, dt, p, work, x[i])
-
-    shares = [x[rows * k // THREADS : rows * (k + 1) // THREADS] for k in range(THREADS)]
-    works = [np.zeros(dynamics.WORK_SIZE) for _ in shares]
-    pool = ThreadPoolExecutor(THREADS)
+    u = np.tile(dynamics.kernel_input(command), (rows, 1))
 
     def step(action: Any) -> None:
-        list(pool.map(fly, shares, works))
+        fly_dynamics(x, u, vehicle, THREADS)
 
     return Flown(step, [None] * BATCHES, rows, **FACTS, version=coax_env.__version__,
                  note=f"RK4, {THREADS} threads")  # fmt: skip
