@@ -378,3 +378,25 @@ def test_stable_baselines_check_passes_without_a_warning(sensors):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         checker.check_env(gymnasium.make("CoaxHeli-v0", sensors=sensors).unwrapped)
+
+
+@pytest.mark.slow
+def test_gymnasiums_own_vector_env_flies_the_same():
+    """AsyncVectorEnv, a process per helicopter, against the batch; without a warning."""
+    program = (
+        "import gymnasium, numpy as np, coax_env\n"
+        "kinds = ('async', 'vector_entry_point')\n"
+        "both = [gymnasium.make_vec('CoaxHeli-v0', num_envs=2, vectorization_mode=k) for k in kinds]\n"
+        "seen = [env.reset(seed=3)[0] for env in both]\n"
+        "for k in range(20):\n"
+        "    action = np.full((2, 4), 0.01 * k, dtype=np.float32)\n"
+        "    seen += [part for env in both for part in env.step(action)[:2]]\n"
+        "assert np.array_equal(seen[0], seen[1])\n"
+        "for k in range(2, len(seen), 4):\n"
+        "    assert np.array_equal(seen[k], seen[k + 2]) and np.allclose(seen[k + 1], seen[k + 3])\n"
+        "both[0].close()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
