@@ -5,7 +5,7 @@ The policy that comes out is controllers/policy.py's. Torch is imported only to 
 
 import io
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +175,7 @@ def train(
     tensorboard: str | Path | None = None,
     checkpoint_steps: int = 500_000,
     command_line: str = "",
+    settings: Mapping[str, Any] | None = None,
     **env_arguments: Any,
 ) -> Path:
     """Train a policy; OUT/policy.zip is there from the first checkpoint on, and after Ctrl-C.
@@ -186,6 +187,7 @@ def train(
         progress: called after every rollout with the steps so far and the mean episode's figures.
         tensorboard: folder for TensorBoard's logs; its package is the extra ``tensorboard``.
         command_line: what made the policy, for its description.
+        settings: where not SETTINGS.
         env_arguments: further ones of CoaxVectorEnv, such as ``randomize="posterior"``.
 
     Returns:
@@ -201,7 +203,9 @@ def train(
     vehicle = load_vehicle(vehicle)
     old = load_policy(resume) if resume else None
     design = old.estimator if old else design_estimator(vehicle, nominal, sensors)
-    settings = dict(SETTINGS)
+    settings = {**SETTINGS, **(settings or {})}
+    if settings.keys() > SETTINGS.keys():
+        raise InputError(f"no setting {', '.join(settings.keys() - SETTINGS.keys())} of PPO")
     content = {
         "vehicle": vehicle.name,
         "command": command_line,
