@@ -203,26 +203,26 @@ def train(
     vehicle = load_vehicle(vehicle)
     old = load_policy(resume) if resume else None
     design = old.estimator if old else design_estimator(vehicle, nominal, sensors)
-    settings = {**SETTINGS, **(settings or {})}
-    if settings.keys() > SETTINGS.keys():
-        raise InputError(f"no setting {', '.join(settings.keys() - SETTINGS.keys())} of PPO")
+    chosen = {**SETTINGS, **(settings or {})}
+    if chosen.keys() > SETTINGS.keys():
+        raise InputError(f"no setting {', '.join(chosen.keys() - SETTINGS.keys())} of PPO")
     content = {
         "vehicle": vehicle.name,
         "command": command_line,
         "seed": seed,
         "steps": steps,
-        "settings": settings,
+        "settings": chosen,
         "cost": {"weights": hover.COST_WEIGHTS, "limits": hover.LIMITS},
         "reward": {"weights": hover.REWARD_WEIGHTS, "scales": hover.REWARD_SCALES},
     }
     env = hover_vec_env(
-        vehicle, design, settings["n_envs"], settings["episode_s"],
-        reward_scale=(1.0 - settings["gamma"]) / settings["hold"], hold=settings["hold"],
-        cost_weight=settings["cost_weight"], **env_arguments,
+        vehicle, design, chosen["n_envs"], chosen["episode_s"],
+        reward_scale=(1.0 - chosen["gamma"]) / chosen["hold"], hold=chosen["hold"],
+        cost_weight=chosen["cost_weight"], **env_arguments,
     )  # fmt: skip
     env.seed(seed)
-    torch.set_num_threads(settings["threads"])
-    model = _old_model(resume, env) if resume else _new_model(env, settings, seed, tensorboard)
+    torch.set_num_threads(chosen["threads"])
+    model = _old_model(resume, env) if resume else _new_model(env, chosen, seed, tensorboard)
 
     def save() -> None:
         save_policy(path, network(model), design, feature_scales(design), content, _file_of(model))
@@ -242,13 +242,13 @@ def train(
                     "return": float(np.mean([e["r"] for e in episodes])) if episodes else 0.0,
                     "seconds": DT * float(np.mean([e["l"] for e in episodes])) if episodes else 0.0,
                 }
-                progress(self.num_timesteps * settings["hold"], mean)
-            if settings["hold"] * (self.num_timesteps - self.saved) >= checkpoint_steps:
+                progress(self.num_timesteps * chosen["hold"], mean)
+            if chosen["hold"] * (self.num_timesteps - self.saved) >= checkpoint_steps:
                 self.saved = self.num_timesteps
                 save()
 
     try:
-        model.learn(max(steps // settings["hold"], 1), callback=Watch(), progress_bar=False)
+        model.learn(max(steps // chosen["hold"], 1), callback=Watch(), progress_bar=False)
     finally:
         save()
         env.close()
