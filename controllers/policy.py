@@ -32,7 +32,7 @@ VERSION = 2
 DESCRIPTION = "policy.json"
 WEIGHTS = "weights.npz"
 SHIPPED = Path(__file__).parent / "policies" / "hover.zip"
-"""Trained on lama400d, default sensors; the command that made it is in its description."""
+"""Trained on vehicles drawn from lama400d, default sensors; its description has the command."""
 
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "tanh": np.tanh,

@@ -42,7 +42,7 @@ SETTINGS: dict[str, Any] = {
     "log_std_init": -1.0,
     "net_arch": {"pi": [32, 32], "vf": [64]},
     "activation": "tanh",
-    "episode_s": 5.0,
+    "episode_s": 10.0,
     "hold": 4,
     "cost_weight": 0.03,
     "threads": 1,
