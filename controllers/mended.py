@@ -120,10 +120,10 @@ def models_page(
 ) -> str:
     """The report as HTML text."""
     scores, gains = content["scores"], content["cost_ratio"]
-    words = " and ".join(f"{k.upper()} **{g:.1f} times** less" for k, g in gains.items())
+    words = " and ".join(f"**{g:.1f} times** less with {k.upper()}" for k, g in gains.items())
     lead = [
-        f"Designed on the mended model instead of the bare one, the same machine flies better: "
-        f"{words} cost.",
+        f"The same machine costs {words} to fly where the controller comes from the mended model "
+        "instead of the bare one.",
         f"Hidden in it: {', '.join(content['hidden'])}; named by the diagnosis: "
         f"{', '.join(content['found']) or 'nothing'}.",
     ]

@@ -196,7 +196,7 @@ def train(
     callbacks = require("stable_baselines3.common.callbacks", "rl")
     torch = require("torch", "rl")
     if tensorboard:
-        require("torch.utils.tensorboard", "tensorboard")
+        require("tensorboard", "tensorboard")
     if steps < 1:
         raise InputError(f"steps must be at least 1, found {steps}")
     path = make_folder(out) / "policy.zip"
@@ -222,7 +222,11 @@ def train(
     )  # fmt: skip
     env.seed(seed)
     torch.set_num_threads(chosen["threads"])
-    model = _old_model(resume, env) if resume else _new_model(env, chosen, seed, tensorboard)
+    model = (
+        _old_model(resume, env, tensorboard)
+        if resume
+        else _new_model(env, chosen, seed, tensorboard)
+    )
 
     def save() -> None:
         save_policy(path, network(model), design, feature_scales(design), content, _file_of(model))
@@ -272,12 +276,13 @@ def _new_model(env: Any, settings: dict[str, Any], seed: int, tensorboard: Any) 
     )  # fmt: skip
 
 
-def _old_model(path: str | Path, env: Any) -> Any:
+def _old_model(path: str | Path, env: Any, tensorboard: Any) -> Any:
     ppo = require("stable_baselines3", "rl")
     with zipfile.ZipFile(path) as archive:
         if "policy.pth" not in archive.namelist():
             raise InputError(f"{path}: cannot be trained on: it holds the plain arrays only")
-    return ppo.PPO.load(path, env, device="cpu")
+    folder = str(tensorboard) if tensorboard else None
+    return ppo.PPO.load(path, env, device="cpu", tensorboard_log=folder)
 
 
 def _file_of(model: Any) -> bytes:
