@@ -82,8 +82,8 @@ def compare(
 ) -> dict[str, Any]:
     """Fly every controller in every condition.
 
-    All but `ppo` are designed on `vehicle`; none is told of wind, gusts or draws. ``lqi`` is given the exact
-    state: what it does better than ``lqg`` is what the sensors' noise costs.
+    All but `ppo` are designed on `vehicle`; none is told of wind, gusts or draws. ``lqi`` is given
+    the exact state: what it does better than ``lqg`` is what the sensors' noise costs.
 
     Args:
         ppo: the trained policy; default the shipped one.
