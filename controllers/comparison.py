@@ -82,8 +82,8 @@ def compare(
 ) -> dict[str, Any]:
     """Fly every controller in every condition.
 
-    All are designed on `vehicle`; none is told of wind, gusts or draws. ``lqi`` is given the exact
-    state: what it does better than ``lqg`` is what the sensors' noise costs.
+    All but `ppo` are designed on `vehicle`; none is told of wind, gusts or draws. ``lqi`` is given
+    the exact state: what it does better than ``lqg`` is what the sensors' noise costs.
 
     Args:
         ppo: the trained policy; default the shipped one.
@@ -180,8 +180,9 @@ def comparison_page(content: Mapping[str, Any], command_line: str = "") -> str:
     if command_line:
         parts.append(Section("How this was computed", [command(command_line)]))
     lead = [
-        f"{content['episodes']} flights each from the same seeds, on {content['vehicle']}; all "
-        "designed or trained on the file as it is, and told nothing of wind, gusts or draws."
+        f"{content['episodes']} flights each from the same seeds, on {content['vehicle']}. LQG, LQI "
+        "and PID are designed on the file as it is, the policy is trained as its description says; "
+        "none is told of wind, gusts or what was drawn."
     ]
     return page("Controllers side by side", lead, parts, kicker="Comparison")
 

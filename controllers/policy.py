@@ -32,7 +32,7 @@ VERSION = 2
 DESCRIPTION = "policy.json"
 WEIGHTS = "weights.npz"
 SHIPPED = Path(__file__).parent / "policies" / "hover.zip"
-"""Trained on lama400d, default sensors; the command that made it is in its description."""
+"""Trained on vehicles drawn from lama400d, default sensors; its description has the command."""
 
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "tanh": np.tanh,
@@ -40,6 +40,7 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 _LARGEST = 16 * 2**20  # bytes of a member that is read; ours have some 200 kB
 _FEATURE_LIMIT = 10.0
+_INTEGRAL_SHARE = 0.25  # of what counts 1 in LQG's cost: a slow drift must show
 
 FEATURE_SCALES = {
     "u": 0.1, "v": 0.1, "w": 0.1, "p": 0.3, "q": 0.3, "r": 0.3,
@@ -127,7 +128,8 @@ def feature_scales(design: EstimatorDesign) -> np.ndarray:
             sizes.append(float(design.action_scale[0 if name == "omega_u" else 1]))
         else:
             sizes.append(FEATURE_SCALES.get(name, max(3.0 * float(spread), 1e-6)))
-    return np.array(sizes + list(integrated_readings(design).values()))
+    integrals = [_INTEGRAL_SHARE * size for size in integrated_readings(design).values()]
+    return np.array(sizes + integrals)
 
 
 def n_features(design: EstimatorDesign) -> int:

@@ -5,7 +5,7 @@ The policy that comes out is controllers/policy.py's. Torch is imported only to 
 
 import io
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ SETTINGS: dict[str, Any] = {
     "log_std_init": -1.0,
     "net_arch": {"pi": [32, 32], "vf": [64]},
     "activation": "tanh",
-    "episode_s": 5.0,
+    "episode_s": 10.0,
     "hold": 4,
     "cost_weight": 0.03,
     "threads": 1,
@@ -175,6 +175,7 @@ def train(
     tensorboard: str | Path | None = None,
     checkpoint_steps: int = 500_000,
     command_line: str = "",
+    settings: Mapping[str, Any] | None = None,
     **env_arguments: Any,
 ) -> Path:
     """Train a policy; OUT/policy.zip is there from the first checkpoint on, and after Ctrl-C.
@@ -186,6 +187,7 @@ def train(
         progress: called after every rollout with the steps so far and the mean episode's figures.
         tensorboard: folder for TensorBoard's logs; its package is the extra ``tensorboard``.
         command_line: what made the policy, for its description.
+        settings: where not SETTINGS.
         env_arguments: further ones of CoaxVectorEnv, such as ``randomize="posterior"``.
 
     Returns:
@@ -194,31 +196,37 @@ def train(
     callbacks = require("stable_baselines3.common.callbacks", "rl")
     torch = require("torch", "rl")
     if tensorboard:
-        require("torch.utils.tensorboard", "tensorboard")
+        require("tensorboard", "tensorboard")
     if steps < 1:
         raise InputError(f"steps must be at least 1, found {steps}")
     path = make_folder(out) / "policy.zip"
     vehicle = load_vehicle(vehicle)
     old = load_policy(resume) if resume else None
     design = old.estimator if old else design_estimator(vehicle, nominal, sensors)
-    settings = dict(SETTINGS)
+    chosen = {**SETTINGS, **(settings or {})}
+    if chosen.keys() > SETTINGS.keys():
+        raise InputError(f"no setting {', '.join(chosen.keys() - SETTINGS.keys())} of PPO")
     content = {
         "vehicle": vehicle.name,
         "command": command_line,
         "seed": seed,
         "steps": steps,
-        "settings": settings,
+        "settings": chosen,
         "cost": {"weights": hover.COST_WEIGHTS, "limits": hover.LIMITS},
         "reward": {"weights": hover.REWARD_WEIGHTS, "scales": hover.REWARD_SCALES},
     }
     env = hover_vec_env(
-        vehicle, design, settings["n_envs"], settings["episode_s"],
-        reward_scale=(1.0 - settings["gamma"]) / settings["hold"], hold=settings["hold"],
-        cost_weight=settings["cost_weight"], **env_arguments,
+        vehicle, design, chosen["n_envs"], chosen["episode_s"],
+        reward_scale=(1.0 - chosen["gamma"]) / chosen["hold"], hold=chosen["hold"],
+        cost_weight=chosen["cost_weight"], **env_arguments,
     )  # fmt: skip
     env.seed(seed)
-    torch.set_num_threads(settings["threads"])
-    model = _old_model(resume, env) if resume else _new_model(env, settings, seed, tensorboard)
+    torch.set_num_threads(chosen["threads"])
+    model = (
+        _old_model(resume, env, tensorboard)
+        if resume
+        else _new_model(env, chosen, seed, tensorboard)
+    )
 
     def save() -> None:
         save_policy(path, network(model), design, feature_scales(design), content, _file_of(model))
@@ -238,13 +246,13 @@ def train(
                     "return": float(np.mean([e["r"] for e in episodes])) if episodes else 0.0,
                     "seconds": DT * float(np.mean([e["l"] for e in episodes])) if episodes else 0.0,
                 }
-                progress(self.num_timesteps * settings["hold"], mean)
-            if settings["hold"] * (self.num_timesteps - self.saved) >= checkpoint_steps:
+                progress(self.num_timesteps * chosen["hold"], mean)
+            if chosen["hold"] * (self.num_timesteps - self.saved) >= checkpoint_steps:
                 self.saved = self.num_timesteps
                 save()
 
     try:
-        model.learn(max(steps // settings["hold"], 1), callback=Watch(), progress_bar=False)
+        model.learn(max(steps // chosen["hold"], 1), callback=Watch(), progress_bar=False)
     finally:
         save()
         env.close()
@@ -268,12 +276,13 @@ def _new_model(env: Any, settings: dict[str, Any], seed: int, tensorboard: Any) 
     )  # fmt: skip
 
 
-def _old_model(path: str | Path, env: Any) -> Any:
+def _old_model(path: str | Path, env: Any, tensorboard: Any) -> Any:
     ppo = require("stable_baselines3", "rl")
     with zipfile.ZipFile(path) as archive:
         if "policy.pth" not in archive.namelist():
             raise InputError(f"{path}: cannot be trained on: it holds the plain arrays only")
-    return ppo.PPO.load(path, env, device="cpu")
+    folder = str(tensorboard) if tensorboard else None
+    return ppo.PPO.load(path, env, device="cpu", tensorboard_log=folder)
 
 
 def _file_of(model: Any) -> bytes:

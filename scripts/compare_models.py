@@ -16,7 +16,7 @@ def main() -> None:
     parser = command_line.parser("compare_models", __doc__, seed=True)
     parser.add_argument(
         "--machine", metavar="FILE",
-        help="the true vehicle (default: --model with motor lag, servo lag and rotor drag)",
+        help="the true vehicle (default: --model with motor lag, torque out of balance, rotor drag)",
     )  # fmt: skip
     parser.add_argument("--model", default="lama400d", help="the bare model (default: %(default)s)")
     parser.add_argument(

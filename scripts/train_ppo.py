@@ -1,5 +1,6 @@
 """Train a hover policy with PPO on the Kalman filter's estimate. Ctrl-C keeps what is learnt."""
 
+import json
 import os
 import shlex
 import sys
@@ -29,6 +30,10 @@ def main() -> None:
     parser.add_argument(
         "--resume", metavar="PATH", help="policy.zip to go on from; it may run code: trust it"
     )
+    parser.add_argument(
+        "--set", nargs="+", metavar="NAME=VALUE", default=[],
+        help=f"hyperparameters, as JSON (default: {json.dumps(ppo.SETTINGS)})",
+    )  # fmt: skip
     parser.add_argument("--tensorboard", metavar="DIR", help="write TensorBoard's logs there")
     options = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
@@ -46,7 +51,8 @@ def main() -> None:
         path = ppo.train(
             vehicle, options.out, round(options.steps), options.seed, options.nominal,
             options.sensors, options.resume, progress, options.tensorboard,
-            command_line=shlex.join(["scripts/train_ppo.py", *sys.argv[1:]]), **more,
+            command_line=shlex.join(["scripts/train_ppo.py", *sys.argv[1:]]),
+            settings=dict(setting(text) for text in options.set), **more,
         )  # fmt: skip
     score = evaluate(load_controller(path), vehicle, episodes=100, seed=10_000 + options.seed)
     write_json(options.out / "score.json", score)
@@ -55,6 +61,15 @@ def main() -> None:
         f"{100 * score['success_rate']:.0f} % succeed, mean cost {score['mean_cost']:.3g}"
     )
     print(f"policy {path}, score {options.out / 'score.json'}")
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """NAME=VALUE, the value as JSON where it is that, else as it stands."""
+    name, _, value = text.partition("=")
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        return name, value
 
 
 if __name__ == "__main__":

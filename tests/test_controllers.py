@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -18,7 +19,7 @@ from coax_env.dynamics import WORK_SIZE, kernel_input, step
 from coax_env.errors import InputError
 from coax_env.fleet import DT
 from coax_env.linear import sampled
-from controllers import comparison, load_controller, lqr, pid, policy, state_feedback
+from controllers import comparison, load_controller, lqr, mended, pid, policy, state_feedback
 from controllers.estimator import Tracker, design_estimator, integrated_readings
 from controllers.evaluation import evaluate, evaluate_spread
 from controllers.loading import make_controller
@@ -100,6 +101,14 @@ def test_the_closed_loop_is_stable_and_has_the_margins_it_states(onboard):
     rng = np.random.default_rng(0)
     for _ in range(8):  # any mix of gains inside the disk margin leaves it stable
         assert stable(factor ** rng.choice([-1.0, 1.0], 4))
+
+
+def test_margins_on_a_vehicle_without_spread_are_those_of_the_design(onboard):
+    exact = LAMA.with_parameters({n: replace(p, std=0.0) for n, p in LAMA.parameters.items()})
+    _, disk = lqr.margins(onboard)
+    assert lqr.margins_over_spread(onboard, exact, draws=1) == pytest.approx([disk], rel=1e-6)
+    drawn = lqr.margins_over_spread(onboard, LAMA, draws=2)
+    assert len(set(drawn)) == 2 and drawn.min() > 0.3
 
 
 # --- filter ---------------------------------------------------------------------------------------
@@ -423,6 +432,17 @@ def test_controllers_come_by_name_and_from_their_files(name, tmp_path):
         action = controller.act(observation)
         assert np.array_equal(action, again.act(observation))
         observation = env.step(action)[0]
+
+
+@pytest.mark.slow
+def test_a_design_on_the_diagnosed_model_halves_the_cost_of_flying_the_machine():
+    content, _, controllers = mended.compare_models(episodes=5)
+    assert content["hidden"] == ["motor_lag", "rotor_drag", "torque_balance"]
+    assert {"motor_lag", "rotor_drag"} <= set(content["found"])
+    assert content["cost_ratio"]["lqg"] > 2.0
+    before, after = (controllers[f"lqg {model}"] for model in mended.MODELS)
+    assert np.array_equal(before.nominal[0], after.nominal[0])  # no trim is given away
+    json.dumps(content, allow_nan=False)
 
 
 # --- policies as plain arrays --------------------------------------------------------------------
