@@ -11,10 +11,8 @@ from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode
 
 from coax_env import hover
-from coax_env.env import CoaxVectorEnv
 from coax_env.errors import InputError, require
 from coax_env.files import make_folder
 from coax_env.fleet import DT, Nominal
@@ -76,37 +74,27 @@ def hover_vec_env(
     scale, each with `cost_weight` * (MOST_COST - cost) where the flight goes on.
     Each env gets its own ``terminal_observation`` and ``TimeLimit.truncated`` as it ends.
     """
-    base = require("stable_baselines3.common.vec_env", "rl")
+    from controllers.vec_env import FleetVecEnv  # imports Stable-Baselines3, and with it torch
 
-    class HoverVecEnv(base.VecEnv):  # type: ignore[name-defined]
+    class HoverVecEnv(FleetVecEnv):
         """See hover_vec_env."""
 
         def __init__(self) -> None:
-            self.env = CoaxVectorEnv(
-                n_envs, vehicle, (design.action_trim, design.action_scale), design.sensors,
-                max_episode_steps=round(episode_s / DT),
-                autoreset_mode=AutoresetMode.SAME_STEP, **env_arguments,
-            )  # fmt: skip
             self.eyes = Eyes(design, n_envs, feature_scales(design))
-            self.episode_return, self.episode_length = np.zeros(n_envs), np.zeros(n_envs)
-            width = n_features(design)
             super().__init__(
-                n_envs, Box(-10.0, 10.0, (width,), np.float32), self.env.single_action_space
-            )
+                n_envs, round(episode_s / DT), reward_scale,
+                Box(-10.0, 10.0, (n_features(design),), np.float32),
+                vehicle=vehicle, nominal=(design.action_trim, design.action_scale),
+                sensors=design.sensors, **env_arguments,
+            )  # fmt: skip
 
-        def reset(self) -> np.ndarray:
-            seed = self._seeds[0]
-            observations, _ = self.env.reset(seed=seed)
-            self._reset_seeds()
-            self._reset_options()
-            self.eyes.reset(np.ones(n_envs, dtype=bool))
-            self.episode_return[:] = self.episode_length[:] = 0.0
-            return self.eyes.features(self.eyes.see(observations))
+        def begin(self, which: np.ndarray) -> None:
+            self.eyes.reset(which)
 
-        def step_async(self, actions: np.ndarray) -> None:
-            self._actions = np.clip(actions, -1.0, 1.0)
+        def view(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
+            return self.eyes.features(self.eyes.see(observations, which))
 
-        def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict]]:
+        def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
             actions, total = self._actions, np.zeros(n_envs)
             over = np.zeros(n_envs, dtype=bool)
             infos: list[dict[str, Any]] = [{} for _ in range(n_envs)]
@@ -118,47 +106,20 @@ def hover_vec_env(
                 saved = MOST_COST - np.nan_to_num(hover.cost(ended, actions), nan=MOST_COST)
                 bonus = np.where(terminated, 0.0, cost_weight * np.maximum(saved, 0.0))
                 total += np.where(over, 0.0, rewards + bonus)
-                self.episode_return += np.where(over, 0.0, rewards)
-                self.episode_length += ~over
+                self._return += np.where(over, 0.0, rewards)
+                self._length += ~over
                 if not done.any():
                     known = self.eyes.see(observations)
                     continue
-                known = self.eyes.see(info["final_obs"])
-                last = self.eyes.features(known)
-                self.eyes.reset(done)
+                last = self.view(info["final_obs"])
+                self.begin(done)
                 known = self.eyes.see(observations, done)
-                for i in np.flatnonzero(done & ~over):
-                    infos[i] = {
-                        "terminal_observation": last[i],
-                        "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                        "episode": {
-                            "r": float(self.episode_return[i]),
-                            "l": int(self.episode_length[i]),
-                            "t": 0.0,
-                        },
-                    }
+                self.tell_the_end(infos, done & ~over, truncated & ~terminated, last)
                 over |= done
                 actions = np.where(over[:, None], 0.0, actions)  # until the next decision
-            self.episode_return[over] = self.episode_length[over] = 0.0
+            self._return[over], self._length[over] = 0.0, 0
             rewards = (reward_scale * total).astype(np.float32)
             return self.eyes.features(known), rewards, over, infos
-
-        def close(self) -> None:
-            self.env.close()
-
-        def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-            return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
-
-        def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-            setattr(self.env, attr_name, value)
-
-        def env_method(
-            self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
-        ) -> list[Any]:
-            raise NotImplementedError("the envs of the batch have no methods of their own")
-
-        def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-            return [False] * len(list(self._get_indices(indices)))
 
     return HoverVecEnv()
 

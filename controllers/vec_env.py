@@ -97,19 +97,26 @@ class FleetVecEnv(_base.VecEnv):  # type: ignore[name-defined]
             last = self.view(info["final_obs"])
             self.begin(done)
             seen = np.where(done[:, None], self.view(observations, done), last)
+            self.tell_the_end(infos, done, truncated & ~terminated, last)
             for i in np.flatnonzero(done).tolist():
-                infos[i] = {
-                    "terminal_observation": last[i],
-                    "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                    "episode": {
-                        "r": float(self._return[i]),
-                        "l": int(self._length[i]),
-                        "t": time.time() - self._begun,
-                    },
-                    **_of_row(info["final_info"], i),
-                }
+                infos[i] |= _of_row(info["final_info"], i)
             self._return[done], self._length[done] = 0.0, 0
         return seen, (self._reward_scale * rewards).astype(np.float32), done, infos
+
+    def tell_the_end(
+        self, infos: list[dict[str, Any]], which: np.ndarray, by_time: np.ndarray, last: np.ndarray
+    ) -> None:
+        """What Stable-Baselines3 wants to know of the flights that have ended, into their `infos`."""
+        for i in np.flatnonzero(which).tolist():
+            infos[i] = {
+                "terminal_observation": last[i],
+                "TimeLimit.truncated": bool(by_time[i]),
+                "episode": {
+                    "r": float(self._return[i]),
+                    "l": int(self._length[i]),
+                    "t": time.time() - self._begun,
+                },
+            }
 
     def get_images(self) -> list[np.ndarray | None]:
         """One picture per env."""
