@@ -217,6 +217,7 @@ class Tracker:
         self._asked = np.zeros((count, 4))
         self._there = np.ones(count, dtype=np.bool_)
         self._heading = names.index("psi") if "psi" in names else -1
+        self._turn = design.index("psi") if "psi" in design.states else -1
         self.offset = design.action_trim - design.command_trim
         self._first = np.zeros(len(design.states))
         for k, name in enumerate(_NAMES[16:20]):
@@ -285,7 +286,7 @@ class Tracker:
     def acted(self, actions: np.ndarray) -> None:
         """Move on by one control period under actions (count, 4)."""
         self._command = self.offset + self.design.action_scale * actions
-        _predict(self._command, self._A, self._B, self.state)
+        _predict(self._command, self._A, self._B, self._turn, self.state)
         self.integrals += DT * self._readings[:, self._integrated] * self._there[:, None]
         np.clip(self.integrals, -self._most, self._most, out=self.integrals)
         self._rows += 1
@@ -352,14 +353,20 @@ def _correct(
 
 
 @compiled(fastmath={"contract"})
-def _predict(command, A_by_state, B_by_command, state):
-    """Move states (count, n) on by one control period, in place: x = A x + B du."""
+def _predict(command, A_by_state, B_by_command, turn, state):
+    """Move states (count, n) on by one control period, in place: x = A x + B du.
+
+    The heading, state number `turn` (-1: none), stays within -pi .. pi: whatever a compass has made
+    of it, nobody shall fly a whole turn back.
+    """
     before = np.empty(state.shape[1])
     for i in range(len(state)):
         before[:] = state[i]
         state[i] = 0.0
         _add_product(A_by_state, before, state[i])
         _add_product(B_by_command, command[i], state[i])
+        if turn >= 0:
+            state[i, turn] = _wrapped(state[i, turn])
 
 
 def _trim_readings(vehicle: Vehicle, x: np.ndarray, u: np.ndarray) -> np.ndarray:
