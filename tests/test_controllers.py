@@ -103,6 +103,7 @@ def test_the_closed_loop_is_stable_and_has_the_margins_it_states(onboard):
         assert stable(factor ** rng.choice([-1.0, 1.0], 4))
 
 
+@pytest.mark.slow
 def test_margins_on_a_vehicle_without_spread_are_those_of_the_design(onboard):
     exact = LAMA.with_parameters({n: replace(p, std=0.0) for n, p in LAMA.parameters.items()})
     _, disk = lqr.margins(onboard)
@@ -407,6 +408,7 @@ def test_drawn_vehicles_are_judged_by_the_worst(onboard):
     json.dumps(score, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_comparison_has_every_controller_in_every_condition():
     content = comparison.compare(LAMA, episodes=5, seconds=4.0, vehicles=2)
     for name, row in content["conditions"].items():

@@ -230,6 +230,7 @@ def test_a_name_that_is_taken_is_left_alone(sound_text, here, tmp_path):
 # --- good input ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_simulate_then_replay_then_identify(tmp_path):
     """A simulated flight goes through the other scripts as a measured one does."""
     done = script("simulate.py", "--maneuver", "lon_3211,heave_3211", "--out", "sim", "--seed", "3",
@@ -351,6 +352,7 @@ def test_every_peer_has_its_program_and_its_pins():
             compile((ROOT / "scripts/speed" / peer.program).read_text(), peer.program, "exec")
 
 
+@pytest.mark.slow
 def test_a_peer_that_cannot_be_installed_has_a_reason_and_no_number(tmp_path):
     from speed import peers
 
