@@ -49,11 +49,13 @@ def listen(search: Search, state: State) -> bool:
     """Fit the gains of the commands' news, where that is worth more than TIE. Changes `state`.
 
     Only where the innovations are white: what a model gets wrong follows the commands too, and news
-    would explain it away.
+    would explain it away. Once they are fitted, they stay: called again, it does nothing.
 
     Returns:
         whether the gains are fitted from now on.
     """
+    if any(f.name in P.COMMAND_GAINS for f in search.base):
+        return True
     passes = _passes(search.engine, state)
     if not is_white(passes, search.model.channels):
         return False
