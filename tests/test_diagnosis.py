@@ -135,6 +135,7 @@ def test_signatures_are_what_moving_the_parameter_does(tmp_path, also):
     assert shown > 30
 
 
+@pytest.mark.slow
 def test_a_polished_fit_is_at_the_top_of_the_likelihood(tmp_path):
     """Also in gusts, where holding the gains still leaves a slope in the lever arm."""
     folder = injector.fly(

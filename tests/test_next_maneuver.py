@@ -140,6 +140,7 @@ def test_flights_bring_the_evidence_that_was_expected():
 # --- the winner -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_bias_and_scale_of_az_are_parted_by_vertical_acceleration():
     found = design([alternative("accel_scale", z=0.03), alternative("accel_bias", z=-0.3)],
                    STILL, RATES)  # fmt: skip
