@@ -348,7 +348,7 @@ def test_state_feedback_costs_what_its_riccati_solution_says(integral):
         action = design.act(x[:20])
         simulated += known @ Q @ known + action @ R @ action
         step(x, kernel_input(command + design.action_scale * action), DT, LAMA.vector, work, x)
-        known = np.concatenate([x[:20] - trim[:20], design._integrals[0]])
+        known = np.concatenate([x[:20] - trim[:20], design.integrals[0]])
     assert simulated == pytest.approx(predicted, rel=2e-3)
 
 
