@@ -13,7 +13,7 @@ import numpy as np
 
 from coax_env.jit import compiled
 from coax_env.lanes import negated, select
-from coax_env.layout import N_FULL
+from coax_env.layout import N_FULL, PLACE, RATE, VELOCITY
 from coax_env.random_streams import uniform
 
 HEIGHT = 1.5  # [m] of the centre of gravity above ground
@@ -154,10 +154,10 @@ def squared_errors(states: np.ndarray, targets: np.ndarray | None = None) -> dic
     heading = (states[..., 12] - goal[..., 3] + math.pi) % (2.0 * math.pi) - math.pi
     return {
         "height": (states[..., 15] - goal[..., 2]) ** 2,
-        "position": ((states[..., 13:15] - goal[..., 0:2]) ** 2).sum(-1),
-        "speed": (states[..., 0:3] ** 2).sum(-1),
+        "position": ((states[..., PLACE] - goal[..., 0:2]) ** 2).sum(-1),
+        "speed": (states[..., VELOCITY] ** 2).sum(-1),
         "heading": heading**2,
-        "rates": (states[..., 3:6] ** 2).sum(-1),
+        "rates": (states[..., RATE] ** 2).sum(-1),
     }
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from coax_env import hover
 from coax_env.errors import InputError
 from coax_env.jit import compiled
+from coax_env.layout import PLACE
 from coax_env.random_streams import uniform
 from coax_env.sensors import Sensor
 
@@ -264,10 +265,10 @@ def succeeded(
     x, goal = states[FIRST_JUDGED - 1 :], targets[FIRST_JUDGED - 1 :]
     errors = dict.fromkeys(SUCCESS, np.array([np.inf]))
     if len(x):
-        place = x[0, 13:15] if name == "hover" else goal[:, 0:2]
+        place = x[0, PLACE] if name == "hover" else goal[:, 0:2]
         squares = hover.squared_errors(x, goal)
         errors = {k: np.sqrt([squares[k].mean()]) for k in ("height", "speed", "heading")}
-        errors["drift"] = np.linalg.norm(x[:, 13:15] - place, axis=1).max(keepdims=True)
+        errors["drift"] = np.linalg.norm(x[:, PLACE] - place, axis=1).max(keepdims=True)
     return bool(judge(name, flown, errors, reached, wanted)[0])
 
 

@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from coax_env import hover, tasks
 from coax_env.env import CoaxVectorEnv
 from coax_env.errors import InputError
+from coax_env.layout import PLACE
 from coax_env.vehicle import Vehicle, load_vehicle
 from controllers.loading import Controller
 
@@ -156,13 +157,13 @@ class _Tally:
         if not late:
             return
         if self.place is None:
-            self.place = states[:, 13:15].copy()
+            self.place = states[:, PLACE].copy()
         place = self.place if self.task == "hover" else targets[:, 0:2]
         errors = hover.squared_errors(states, targets)
         for name, total in self.squares.items():
             total += np.where(finite, errors[name], 0.0)
         self.judged += finite
-        away = np.linalg.norm(states[:, 13:15] - place, axis=1)
+        away = np.linalg.norm(states[:, PLACE] - place, axis=1)
         self.drift = np.maximum(self.drift, np.where(finite, away, 0.0))
 
     def score(self, steps: int) -> dict[str, Any]:
