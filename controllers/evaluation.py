@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from coax_env.env import CoaxVectorEnv
 from coax_env.errors import InputError
 from coax_env.layout import PLACE
 from coax_env.vehicle import Vehicle, load_vehicle
+from coax_env.workers import each
 from controllers.loading import Controller
 
 
@@ -89,9 +91,16 @@ def evaluate_spread(
     seconds: float = 20.0,
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
+    jobs: int = 1,
+    backend: str = "loky",
     **env_arguments: Any,
 ) -> dict[str, Any]:
     """`evaluate` on vehicles drawn from a vehicle's spread, the same seeds on each.
+
+    Args:
+        progress: called with the number of vehicles flown.
+        jobs, backend: vehicles at once, and where, as in `coax_env.workers.each`; the figures are
+            the same.
 
     Returns:
         score.json of the vehicle with the lowest success rate (the highest cost among equals), with
@@ -101,19 +110,30 @@ def evaluate_spread(
         raise InputError(f"need at least one drawn vehicle, found {vehicles}")
     vehicle = load_vehicle(vehicle)
     rng = np.random.default_rng(seed)
-    scores, drawn = [], []
-    for _ in range(vehicles):
-        one = vehicle.draw(rng)
-        scores.append(evaluate(controller, one, episodes, seconds, seed, **env_arguments))
-        drawn.append(one.values())
+    drawn = [vehicle.draw(rng) for _ in range(vehicles)]
+    judge = partial(_one_drawn, controller, (episodes, seconds, seed), env_arguments)
+    found = {}
+    for (number, _), score in each(judge, list(enumerate(drawn)), jobs, backend):
+        found[number] = score
         if progress:
             progress(1)
+    scores = [found[number] for number in range(vehicles)]
     worst = min(scores, key=lambda score: (score["success_rate"], -score["mean_cost"]))
     table = [
-        {name: score[name] for name in FIGURES} | {"values": values}
-        for score, values in zip(scores, drawn, strict=True)
+        {name: score[name] for name in FIGURES} | {"values": one.values()}
+        for score, one in zip(scores, drawn, strict=True)
     ]
     return worst | {"vehicles": table}
+
+
+def _one_drawn(
+    controller: Controller,
+    flights: tuple[int, float, int],
+    env_arguments: dict[str, Any],
+    numbered: tuple[int, Vehicle],
+) -> dict[str, Any]:
+    """The score on one of the drawn vehicles, which come with their numbers."""
+    return evaluate(controller, numbered[1], *flights, **env_arguments)
 
 
 FIGURES = (

@@ -14,7 +14,6 @@ integrals of controllers/estimator.py, scaled.
 
 import io
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from coax_env.errors import InputError
+from coax_env.files import write_bytes
 from controllers.estimator import Estimating, EstimatorDesign, integrated_readings
 
 FORMAT = "coax-policy"
@@ -121,7 +121,6 @@ def save_policy(
         content: further entries of the description.
         training: a zip file of Stable-Baselines3, whose members join the plain ones.
     """
-    path = Path(path)
     arrays: dict[str, Any] = {}
     for k, (weight, bias) in enumerate(network.layers):
         arrays[f"weight_{k}"], arrays[f"bias_{k}"] = weight, bias
@@ -137,15 +136,7 @@ def save_policy(
     with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(_dated(DESCRIPTION), json.dumps(content, allow_nan=False))
         archive.writestr(_dated(WEIGHTS), weights.getvalue())
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(buffer.getvalue())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
+    return write_bytes(path, buffer.getvalue())
 
 
 def _dated(name: str) -> zipfile.ZipInfo:

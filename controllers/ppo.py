@@ -4,8 +4,10 @@ The policy that comes out is controllers/policy.py's. Torch is imported only to 
 """
 
 import io
+import tempfile
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,10 @@ from gymnasium.spaces import Box
 
 from coax_env import hover
 from coax_env.errors import InputError, require
-from coax_env.files import make_folder
+from coax_env.files import make_folder, write_bytes
 from coax_env.fleet import DT, Nominal
 from coax_env.vehicle import Vehicle, load_vehicle
+from coax_env.workers import each
 from controllers.estimator import EstimatorDesign, Tracker, design_estimator
 from controllers.policy import (
     Network,
@@ -218,6 +221,42 @@ def train(
         save()
         env.close()
     return path
+
+
+def train_seeds(
+    vehicle: str | Vehicle,
+    out: str | Path,
+    seeds: Sequence[int],
+    jobs: int = 1,
+    backend: str = "loky",
+    **training: Any,
+) -> Iterator[tuple[int, Path]]:
+    """`train` once for each seed, several at a time; a seed gives the policy it would give alone.
+
+    Every policy is trained in a temporary folder and comes back as bytes, so that the machines of a
+    cluster need no disk in common; one that is interrupted is lost.
+
+    Args:
+        jobs, backend: as in `coax_env.workers.each`.
+        training: further arguments of `train`, but for ``progress``.
+
+    Returns:
+        each seed with its OUT/seed_N/policy.zip, as they are done.
+    """
+    training["vehicle"] = load_vehicle(vehicle)
+    if isinstance(training.get("nominal"), str | Path):
+        training["nominal"] = load_vehicle(training["nominal"])
+    for name in ("resume", "tensorboard"):  # a worker may stand in another folder
+        if training.get(name):
+            training[name] = Path(training[name]).resolve()
+    for seed, content in each(partial(_trained, training), list(seeds), jobs, backend):
+        yield seed, write_bytes(Path(out) / f"seed_{seed}" / "policy.zip", content)
+
+
+def _trained(training: Mapping[str, Any], seed: int) -> bytes:
+    """The policy.zip of a seed."""
+    with tempfile.TemporaryDirectory(prefix="coax-ppo-") as folder:
+        return train(out=folder, seed=seed, **training).read_bytes()
 
 
 def _new_model(env: Any, settings: dict[str, Any], seed: int, tensorboard: Any) -> Any:
