@@ -53,10 +53,9 @@ def add_workers(parser: Parser, what: str, default: int) -> None:
 
 
 def _jobs(text: str) -> int:
-    jobs = int(text)
-    if jobs == 0:
-        raise argparse.ArgumentTypeError("must not be 0")
-    return jobs
+    if not re.fullmatch(r"[+-]?\d+", text) or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"must be a whole number and not 0, found {text!r}")
+    return int(text)
 
 
 def as_called(text: str) -> str:

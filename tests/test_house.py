@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("coax_env", "controllers")
 
-GROUND = "errors files layout log_units"
+GROUND = "errors files layout log_units workers"
 MODEL = "parameters flow effects dynamics generic_terms jit late random_streams"
 RECORDS = "flight foreign_columns outliers autopilot_logs"
 MACHINE = "vehicle maneuvers multisine sensors"
