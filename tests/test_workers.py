@@ -1,6 +1,10 @@
 """Many pieces of work at once: what comes back is what one worker alone would have made."""
 
+import json
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +15,7 @@ from controllers import pid, policy
 from controllers.evaluation import evaluate_spread
 
 BACKENDS = ("loky", pytest.param("ray", marks=pytest.mark.slow))  # a cluster takes a while to start
+SCRIPTS = Path(__file__).parents[1] / "scripts"
 LAMA = coax_env.load_vehicle("lama400d")
 
 
@@ -68,3 +73,21 @@ def test_seeds_trained_side_by_side_are_those_trained_alone(backend, tmp_path):
         for a, b in zip(theirs.network.layers, ours.network.layers, strict=True):
             assert (a[0] == b[0]).all() and (a[1] == b[1]).all()
     assert (tmp_path / "seed_3" / "policy.zip").read_bytes() != found[4].read_bytes()
+
+
+@pytest.mark.slow
+def test_the_best_of_several_seeds_is_judged_on_flights_it_was_not_chosen_on(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    words = ["--seeds", "2", "--seed", "5", "--steps", "2048", "--out", "out"]
+    done = subprocess.run(
+        [sys.executable, SCRIPTS / "train_ppo.py", *words, "--set", "n_envs=16", "batch_size=256"],
+        cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "out"
+    scores = {s: json.loads((out / f"seed_{s}" / "score.json").read_text()) for s in (5, 6)}
+    best = min(scores, key=lambda s: (-scores[s]["success_rate"], scores[s]["mean_cost"]))
+    assert (out / "policy.zip").read_bytes() == (out / f"seed_{best}/policy.zip").read_bytes()
+    seeds = {s["seed"] for s in scores.values()}
+    assert len(seeds) == 1 and json.loads((out / "score.json").read_text())["seed"] not in seeds
+    assert f"the best, seed {best}," in done.stdout
