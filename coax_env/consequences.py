@@ -75,17 +75,25 @@ def _axes(words: str, otherwise: str, unit: str, factor: float, **names: str) ->
     ]
 
 
-def _hover_speed(v: Values) -> float:
-    """Of both rotors alike [rad/s]."""
+def _speeds_squared(v: Values) -> tuple[float, float]:
+    """Of the upper and the lower rotor in hover [rad2/s2]: their torques cancel, (15)-(20)."""
+    ratio = v["torque_coefficient_upper"] / v["torque_coefficient_lower"]
     k_T = v["air_density"] * math.pi * v["rotor_radius"] ** 4
-    lift = v["thrust_coefficient_upper"] + v["thrust_coefficient_lower"]
-    return math.sqrt(v["mass"] * v["gravity"] / (k_T * lift))
+    lift = v["thrust_coefficient_upper"] + ratio * v["thrust_coefficient_lower"]
+    upper = v["mass"] * v["gravity"] / (k_T * lift)
+    return upper, ratio * upper
+
+
+def _drag_of_rotors(e: Values, v: Values) -> float:
+    """Deceleration by the rotors' drag at 1 m/s [m/s2]."""
+    return e["coefficient"] * sum(map(math.sqrt, _speeds_squared(v))) / v["mass"]
 
 
 def _upper_share(v: Values) -> float:
-    """Share of the thrust that the upper rotor carries where both turn alike."""
-    upper = v["thrust_coefficient_upper"]
-    return upper / (upper + v["thrust_coefficient_lower"])
+    """Share of the thrust that the upper rotor carries in hover."""
+    upper, lower = _speeds_squared(v)
+    lift = v["thrust_coefficient_upper"] * upper
+    return lift / (lift + v["thrust_coefficient_lower"] * lower)
 
 
 def _ground(height: float) -> Callable[[Values, Values], float]:
@@ -95,7 +103,7 @@ def _ground(height: float) -> Callable[[Values, Values], float]:
 def _left_turn(e: Values, v: Values) -> float:
     """Yaw acceleration at the bare model's trim, to the left [deg/s2]; (20) and (36)."""
     k_Q = v["air_density"] * math.pi * v["rotor_radius"] ** 5 * v["torque_coefficient_lower"]
-    return math.degrees(e["scale"] * k_Q * _hover_speed(v) ** 2 / v["inertia_zz"])
+    return math.degrees(e["scale"] * k_Q * _speeds_squared(v)[1] / v["inertia_zz"])
 
 
 def _brake(axis: str) -> Callable[[Values, Values], float]:
@@ -191,8 +199,7 @@ _CONSEQUENCES: dict[str, list[Consequence]] = {
         Consequence("by {} up and down", "m/s²", _brake("z")),
     ],
     "rotor_drag": [
-        Consequence("the rotors brake it by {} at 1 m/s", "m/s²",
-                    lambda e, v: e["coefficient"] * 2.0 * _hover_speed(v) / v["mass"]),
+        Consequence("the rotors brake it by {} at 1 m/s", "m/s²", _drag_of_rotors),
     ],
     "flap_blowback": [
         _own("the lower disc tilts back by {} at 1 m/s", "°", "gain", math.degrees(1.0)),

@@ -291,7 +291,7 @@ def gain_bars(channels: Mapping[str, Mapping[str, Any]]) -> Figure:
         bargap=0.35,
         hovermode="closest",
         xaxis={
-            "title": {"text": "prediction error, % of the bare model's"},
+            "title": {"text": "error, % of the bare model's"},
             "range": [0, min(1.05 * top, 400)],
         },
         yaxis={"ticklabelstandoff": 6},

@@ -29,6 +29,7 @@ from coax_env.report.flight_view import flight_view
 from coax_env.report.flown import data_blocks, ordered, points_each, prediction_figure
 from coax_env.report.page import (
     Section,
+    bullets,
     callout,
     chooser,
     command,
@@ -243,20 +244,31 @@ def _improvement(before: RunReplay, after: RunReplay | None, channel: str) -> fl
 # --- what is left ---------------------------------------------------------------------------------
 
 
+LOADS = {
+    "p": "rolling moment", "q": "pitching moment", "r": "yawing moment",
+    "ax": "forward force", "ay": "sideways force", "az": "vertical force",
+}  # fmt: skip
+"""What is missing where a channel of findings.json's `unexplained` has a form."""
+
+
 def _left(findings: Findings, vehicle: Vehicle) -> list[str]:
-    rows = [
-        [
-            channel_name(u["channel"]),
-            f"{100 * u['share']:.0f} %",
-            ", ".join(channel_name(d) for d in u["depends_on"]) or "not known",
-            u.get("form") or "not known",
-        ]
-        for u in findings["unexplained"]
+    described = [u for u in findings["unexplained"] if u["depends_on"]]
+    rest = [u for u in findings["unexplained"] if not u["depends_on"]]
+    lines = [
+        f"A **{LOADS.get(u['channel'], channel_name(u['channel']))}** that follows "
+        f"{and_list([channel_name(d) for d in u['depends_on']])}: {u['form']}. It is "
+        f"{100 * u['share']:.0f} % of what moves the machine there beyond the model."
+        for u in described
     ]
-    caption = "Structure beyond noise and gusts that no effect of the catalogue explains"
+    if rest:
+        shares = and_list([f"{channel_name(u['channel'])} {100 * u['share']:.0f} %" for u in rest])
+        lines.append(
+            "**Without a known form:** so much of what the model did not expect could have been "
+            f"expected from its own past: {shares}. Of noise that would be none."
+        )
     return [
-        table(["channel", "share", "follows", "form"], rows, caption)
-        if rows
+        bullets(lines)
+        if lines
         else callout("Nothing beyond noise and gusts is left in the innovations.", "good"),
         prose(_gust_words(findings["gusts"], vehicle)),
     ]

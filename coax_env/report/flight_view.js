@@ -67,7 +67,7 @@ function replayFlight(root) {
   function lens(centre, width, height) {
     const [ct, st] = [Math.cos(camera.turn), Math.sin(camera.turn)];
     const [cr, sr] = [Math.cos(camera.rise), Math.sin(camera.rise)];
-    const away = run.room / camera.zoom, focus = 0.95 * Math.min(width, 1.5 * height);
+    const away = run.room / camera.zoom, focus = Math.min(0.62 * width, 1.5 * height);
     return point => {
       const [n, e, u] = [point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]];
       const depth = away + cr * (ct * n + st * e) - sr * u;
@@ -156,7 +156,7 @@ function replayFlight(root) {
   }
 
   function compass(pen, width, height) {
-    const [x, y, long] = [34, height - 34, 20];
+    const [x, y, long] = [38, height - 44, 20];
     const tip = [x - Math.sin(camera.turn) * long, y - Math.cos(camera.turn) * long];
     line(pen, [[x, y], tip], ink(), 2, 0.7);
     pen.fillStyle = ink();
@@ -166,7 +166,7 @@ function replayFlight(root) {
     pen.font = '14px system-ui, sans-serif';
     pen.textAlign = 'right'; pen.textBaseline = 'alphabetic'; pen.globalAlpha = 0.7;
     const larger = drawnRadius() / content.radius;
-    const words = larger > 1.05 ? `, machines drawn ${larger.toFixed(1)} times as large` : '';
+    const words = larger > 1.05 ? `, machines × ${larger.toFixed(1)}` : '';
     pen.fillText('grid 1 m' + words, width - 12, height - 12);
     pen.globalAlpha = 1;
   }

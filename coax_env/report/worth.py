@@ -136,8 +136,15 @@ def controller_blocks(flown: FlownControllers) -> list[str]:
         name: [100.0 * score[key] / any_score[key] for _, key in drawn]
         for name, score in scores.items()
     }
+    successes = [
+        f"**{_score(score.get('success_rate'), '{:.0f} %', 100.0)}** with the {name} model's"
+        for name, score in scores.items()
+    ]
     return [
-        prose(f"{flown.design} Flown on {flown.machine}, {times} each from the same seeds."),
+        prose(
+            f"{flown.design} Flown on {flown.machine}, {times} each from the same seeds: success "
+            f"{and_list(successes)}."
+        ),
         figure(
             figures.side_by_side(
                 [words for words, _ in drawn],
