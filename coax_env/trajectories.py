@@ -17,7 +17,7 @@ from coax_env.heli_model import HeliModel, record_of, starting_noise
 from coax_env.layout import ATTITUDE, CHANNELS, GUST_FORCE, GUST_MOMENT, POSITION
 from coax_env.vehicle import Vehicle
 
-FRAME = 0.05  # s
+FRAME = 0.1  # s
 RESTART = 3.0  # s
 SETTLED = 1.5  # s of filtering before the first frame
 MOST_FRAMES = 12_000  # of all runs together; longer flights have fewer a second

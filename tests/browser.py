@@ -23,7 +23,7 @@ def missing() -> str:
     except ImportError:
         return "choreographer is not installed (pip install kaleido)"
     if not Chromium.find_browser(skip_local=False):
-        return "no Chromium or Chrome found (scripts/test installs one where it can)"
+        return "no Chromium or Chrome found (.ci/run installs one where it can)"
     return ""
 
 

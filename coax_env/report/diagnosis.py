@@ -51,6 +51,7 @@ Findings = Mapping[str, Any]
 MOST_INNOVATION_FIGURES = 60
 MOST_NAMED = 4
 """Causes in the headline; of more, the strongest."""
+MOST_RUNS_NAMED = 12
 
 
 def diagnosis_page(
@@ -132,6 +133,9 @@ def _flown(result: "Diagnosis") -> list[str]:
     """The flights in a sentence, and to be looked at."""
     flight, before, after = result.flight, result.vehicle_before, result.vehicle_after
     total = sum(run.duration for run in flight.runs)
+    names = list(flight.run_names[:MOST_RUNS_NAMED])
+    if len(flight.runs) > MOST_RUNS_NAMED:
+        names.append(f"{len(flight.runs) - MOST_RUNS_NAMED} more")
     held = {run.name for run in result.replay_before}
     models = {"bare": before} | ({"extended": after} if after.effects != before.effects else {})
     shown = trajectories(flight, after, models)
@@ -144,7 +148,7 @@ def _flown(result: "Diagnosis") -> list[str]:
     sensors = and_list([channel_name(c) for c in ordered(flight.channels)])
     count = f"{capital(count_word(len(flight.runs)))} run" + ("s" if len(flight.runs) > 1 else "")
     return [
-        prose(f"{count} of a {before.name}, {total:.0f} s in all."),
+        prose(f"{count} of a {before.name}, {total:.0f} s in all: {and_list(names)}."),
         flight_view(
             shown,
             dict(zip(models, (figures.BEFORE, figures.AFTER), strict=False)),

@@ -4,7 +4,7 @@ const TRAIL = 5;     // s of the measured path that are shown
 const GRID = 1;      // m between the lines on the ground
 const SEEN = 8;      // m of ground around the machine
 const LEAST = 0.07;  // of the camera's distance: the radius at which a machine is drawn at least
-const PAPER_HEIGHT = {scene: 300, strip: 74}; // px
+const PAPER_HEIGHT = {scene: 240, strip: 60}; // px
 const BODY = {       // of the rotor's radius, in body axes: forward, right, down
   hull: [[[0.5, 0, 0], [0, 0, 0.24]], [[0.5, 0, 0], [0, 0.2, 0]], [[0, 0.2, 0], [0, 0, 0.24]]], // ellipses
   tail: [[-0.4, 0, -0.02], [-1.15, 0, -0.06]],

@@ -1,6 +1,6 @@
 // Unpacks plotly and draws the page's figures when they come near the screen, in the reader's colours.
 const dark = matchMedia('(prefers-color-scheme: dark)');
-const PAPER_WIDTH = 680; // px between the margins of a printed page
+const PAPER_WIDTH = 680, PAPER_SHARE = 0.75; // px between the margins of a printed page; of a height
 let printing = false;
 const theme = () => THEMES[dark.matches && !printing ? 'dark' : 'light'];
 const restyled = []; // what else is to be drawn again when the colours change
@@ -8,6 +8,8 @@ const restyled = []; // what else is to be drawn again when the colours change
 const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
 const packed = document.getElementById('plotly');
 const library = packed && unpack(packed.textContent);
+if (library) library.catch(() => document.querySelectorAll('.plot').forEach(
+  plot => { plot.textContent = 'This browser is too old to draw the figures.'; }));
 
 async function unpack(text) {
   const stream = new Blob([bytes(text)]).stream().pipeThrough(new DecompressionStream('gzip'));
@@ -16,22 +18,26 @@ async function unpack(text) {
   document.head.append(script);
 }
 
-function shape() {
-  return printing ? {width: PAPER_WIDTH, autosize: false} : {width: null, autosize: true};
+function shape(plot) {
+  const height = Number(plot.dataset.height);
+  return printing
+    ? {width: PAPER_WIDTH, height: PAPER_SHARE * height, autosize: false}
+    : {width: null, height, autosize: true};
 }
 
 function draw(plot) {
   if (plot.dataset.drawn || plot.closest('[hidden]') || plot.closest('details:not([open])')) return;
   plot.dataset.drawn = '1';
   const content = JSON.parse(plot.nextElementSibling.textContent);
-  const layout = Object.assign({}, content.layout, {template: theme()}, printing ? shape() : {});
+  plot.dataset.height = content.layout.height;
+  const layout = Object.assign({}, content.layout, {template: theme()}, printing ? shape(plot) : {});
   Plotly.newPlot(plot, content.data, layout, {responsive: true, displayModeBar: false});
 }
 const drawIn = part => library && library.then(() => part.querySelectorAll('.plot').forEach(draw));
 
 function restyle() {
   document.querySelectorAll('.plot[data-drawn]').forEach(
-    plot => Plotly.relayout(plot, Object.assign({template: theme()}, shape())));
+    plot => Plotly.relayout(plot, Object.assign({template: theme()}, shape(plot))));
   restyled.forEach(again => again());
 }
 dark.addEventListener('change', restyle);
