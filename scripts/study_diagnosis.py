@@ -26,7 +26,7 @@ PORTION = 4  # flights per worker between two savings on Ray
 def main() -> None:
     options = parse()
     runs = None if options.full else plan.RICH
-    flights = plan.plan(options.clean, options.effects, options.seed, runs)
+    flights = plan.plan(options.clean, options.effects, options.seed, runs, options.many)
     if options.calibrate:
         flights = [f for f in flights if f.kind in ("still", "gusty")]
     make_folder(options.out)
@@ -52,6 +52,10 @@ def parse() -> Any:
     parser.set_defaults(out=Path("runs/study"))
     parser.add_argument("--clean", type=int, default=200, help="flights without effects")
     parser.add_argument("--effects", type=int, default=400, help="flights with effects")
+    parser.add_argument(
+        "--many", type=int, default=0,
+        help=f"gusty flights with {plan.MANY} effects each, for the intervals",
+    )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="24 flights in all")
     parser.add_argument(
         "--full",
@@ -75,7 +79,8 @@ def parse() -> Any:
     options = parser.parse_args()
     if options.quick:
         options.clean, options.effects = QUICK["clean"], QUICK["effects"]
-    if options.clean < 0 or options.effects < 0 or options.clean + options.effects == 0:
+    counts = (options.clean, options.effects, options.many)
+    if min(counts) < 0 or sum(counts) == 0:
         raise InputError("a study needs at least one flight")
     if options.adopt and not options.calibrate:
         raise InputError("--adopt goes with --calibrate")
