@@ -40,10 +40,8 @@ def main() -> None:
     waiting = [m for m in drawn if m.name not in known]
     try:
         with tqdm(total=len(drawn), initial=len(known), desc="mutate", unit="mutation") as bar:
-            for mutation, result in trials(waiting, options):
-                row = described(mutation) | result | fingerprints(options.root, mutation)
-                write_json(place_of(options, mutation), row)
-                known[mutation.name] = row
+            for row in trials(waiting, options):
+                known[row["name"]] = row
                 bar.update()
                 bar.set_postfix(caught=f"{100.0 * score.share(list(known.values())):.0f} %")
     finally:
@@ -70,7 +68,7 @@ def parse() -> Any:
     parser = command_line.parser("mutate", __doc__, seed=True)
     parser.add_argument("--count", type=int, default=60, help="mutations (default: 60)")
     parser.add_argument("--only", nargs="+", default=[], metavar="WORD",
-                        help="of those drawn, only in files with such a word in their path")  # fmt: skip
+                        help="of those drawn, only in files whose path has such a word")  # fmt: skip
     parser.add_argument("--own", action="store_true",
                         help="only the tests of the mutation's file, not the rest")  # fmt: skip
     parser.add_argument("--jobs", type=int, default=1, help="mutations at once (default: 1)")
@@ -81,8 +79,8 @@ def parse() -> Any:
     return options
 
 
-def trials(waiting: Sequence[Mutation], options: Any) -> Iterator[tuple[Mutation, dict[str, Any]]]:
-    """Results as they come, from as many copies of the tree as there are jobs."""
+def trials(waiting: Sequence[Mutation], options: Any) -> Iterator[dict[str, Any]]:
+    """Rows as they come, from as many copies of the tree as there are jobs; each is stored at once."""
     if not waiting:
         return
     jobs = min(options.jobs, len(waiting))
@@ -97,15 +95,18 @@ def trials(waiting: Sequence[Mutation], options: Any) -> Iterator[tuple[Mutation
     def one(mutation: Mutation) -> dict[str, Any]:
         tree = free.get()
         try:
-            return tree.try_out(mutation, rest=not options.own)
+            row = described(mutation) | tree.try_out(mutation, rest=not options.own)
         finally:
             free.put(tree)
+        row |= fingerprints(options.root, mutation)
+        write_json(place_of(options, mutation), row)
+        return row
 
     with ThreadPoolExecutor(jobs) as pool:
-        begun = {pool.submit(one, mutation): mutation for mutation in waiting}
+        begun = [pool.submit(one, mutation) for mutation in waiting]
         try:
             for future in as_completed(begun):
-                yield begun[future], future.result()
+                yield future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for tree in trees:
