@@ -40,7 +40,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/tasks.py": _ENV,
     "coax_env/engine/kalman.py": ("tests/test_engine.py",),
     "coax_env/heli_model.py": (
-        "tests/test_closed_loop.py",
+        "tests/test_heli_model.py", "tests/test_closed_loop.py",
     ),
     "controllers/estimator.py": ("tests/test_faulty_sensors.py", "tests/test_controllers.py"),
     "coax_env/engine/fit.py": ("tests/test_engine.py",),
