@@ -85,9 +85,7 @@ def trials(waiting: Sequence[Mutation], options: Any) -> Iterator[dict[str, Any]
         return
     jobs = min(options.jobs, len(waiting))
     trees = [Tree(options.root, options.out.resolve() / f"job_{k}") for k in range(jobs)]
-    tests = dict.fromkeys(t for m in waiting for t in OWN[m.file] if (options.root / t).exists())
-    if by := trees[0].test(list(tests)):
-        raise InputError(f"{by} fails before anything is broken")
+    check_whole(trees[0], waiting, options)
     free: queue.SimpleQueue[Tree] = queue.SimpleQueue()
     for tree in trees:
         free.put(tree)
@@ -112,6 +110,23 @@ def trials(waiting: Sequence[Mutation], options: Any) -> Iterator[dict[str, Any]
             for tree in trees:
                 tree.stop()
             raise
+
+
+def check_whole(tree: Tree, waiting: Sequence[Mutation], options: Any) -> None:
+    """Make sure that the tests pass while nothing is broken; what has passed is not run again."""
+    needed = dict.fromkeys(t for m in waiting for t in OWN[m.file] if (options.root / t).exists())
+    sources = [
+        p for folder in ("coax_env", "controllers") for p in (options.root / folder).rglob("*.py")
+    ]
+    state = {name: fingerprint(*sources, options.root / name) for name in needed}
+    path = options.out / "whole.json"
+    passed: dict[str, str] = json.loads(path.read_text()) if path.exists() else {}
+    for name in needed:
+        if passed.get(name) != state[name]:
+            if by := tree.test([name]):
+                raise InputError(f"{by} fails before anything is broken")
+            passed[name] = state[name]
+            write_json(path, passed)
 
 
 def place_of(options: Any, mutation: Mutation) -> Path:

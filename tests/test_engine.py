@@ -537,3 +537,10 @@ def test_an_empty_channel_is_not_judged():
     e = np.random.default_rng(3).standard_normal((500, 2))
     e[:, 1] = np.nan
     assert set(whiteness([a_pass(e)], ("a", "b"))) == {"a"}
+
+
+def test_a_channel_with_few_readings_is_not_judged():
+    """Twenty lags of fifty readings are no statistic, whatever they look like."""
+    e = 3.0 * np.random.default_rng(4).standard_normal((1000, 2))
+    e[150:, 1] = np.nan  # fifty are left after the first second
+    assert set(whiteness([a_pass(e)], ("a", "b"))) == {"a"}

@@ -36,7 +36,7 @@ LEVELS = {
 QUIET = dict.fromkeys(GUST_LEVELS, 0.0) | {"memory": 1.0}
 
 
-# --- noise ------------------------------------------------------------------------------------------
+# --- noise ----------------------------------------------------------------------------------------
 
 
 def test_gust_states_are_stationary_at_their_levels():
@@ -76,7 +76,7 @@ def test_without_gusts_the_model_is_nearly_believed():
             assert q[X[name]] < 0.2 * least, name
 
 
-# --- the start --------------------------------------------------------------------------------------
+# --- the start ------------------------------------------------------------------------------------
 
 
 def record(seconds=2.0, dt=0.02, **readings) -> Record:
@@ -126,7 +126,7 @@ def test_what_is_not_measured_starts_anywhere_a_hover_can_be():
     assert std[[X["x"], X["y"], X["z"]]] == pytest.approx(0.5, rel=1e-6)
 
 
-# --- inputs -----------------------------------------------------------------------------------------
+# --- inputs ---------------------------------------------------------------------------------------
 
 
 def test_inputs_are_commands_time_and_news():
@@ -198,7 +198,7 @@ def test_a_fit_does_not_change_what_gusts_do():
         assert vector[reference] == LAMA.vector[own]
 
 
-# --- where a search starts --------------------------------------------------------------------------
+# --- where a search starts ------------------------------------------------------------------------
 
 
 def a_flight(noise=None, **measured) -> Flight:

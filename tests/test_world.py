@@ -182,6 +182,17 @@ def test_a_flight_folder_is_seen_by_the_same_tables():
     assert np.isfinite(truth.readings).all()
 
 
+def test_a_wind_of_random_direction_has_its_speed():
+    env = CoaxVectorEnv(800, DRAGGED, wind=2.0)
+    env.reset(seed=0)
+    air = env.fleet.air
+    np.testing.assert_allclose(np.hypot(air[:, 0], air[:, 1]), 2.0, rtol=1e-12)
+    assert not air[:, 2].any()
+    angle = np.arctan2(air[:, 1], air[:, 0])
+    share = np.histogram(angle, bins=8, range=(-math.pi, math.pi))[0] / 800
+    assert np.abs(share - 1 / 8).max() < 4.5 * math.sqrt(7 / 64 / 800)
+
+
 def test_the_layout_of_observations_is_the_suites_whatever_the_file_says():
     assert CoaxEnv(EYED).observation_names == CoaxEnv(LAMA).observation_names
 

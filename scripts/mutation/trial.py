@@ -25,7 +25,7 @@ from mutation.sites import Mutation
 COPIED = ("coax_env", "controllers", "scripts", "tests", "pyproject.toml", "README.md")
 LIMIT = 900.0  # [s] for the tests of one mutation; who needs longer is caught in an endless loop
 
-_ENV = ("tests/test_world.py", "tests/test_env.py")
+_ENV = ("tests/test_sensors.py", "tests/test_hover.py", "tests/test_world.py", "tests/test_env.py")
 OWN: dict[str, tuple[str, ...]] = {
     "coax_env/dynamics.py": ("tests/test_dynamics.py", "tests/test_linear.py", "tests/test_env.py"),
     "coax_env/effects.py": ("tests/test_dynamics.py", "tests/test_vehicle.py", "tests/test_world.py"),
@@ -34,15 +34,17 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/vehicle.py": ("tests/test_vehicle.py", "tests/test_world.py"),
     "coax_env/sensors.py": _ENV,
     "coax_env/actuators.py": _ENV,
-    "coax_env/period.py": _ENV[::-1],
-    "coax_env/fleet.py": _ENV[::-1],
-    "coax_env/hover.py": _ENV[::-1],
+    "coax_env/period.py": _ENV,
+    "coax_env/fleet.py": _ENV,
+    "coax_env/hover.py": _ENV,
     "coax_env/tasks.py": _ENV,
     "coax_env/engine/kalman.py": ("tests/test_engine.py",),
     "coax_env/heli_model.py": (
         "tests/test_heli_model.py", "tests/test_closed_loop.py",
     ),
-    "controllers/estimator.py": ("tests/test_faulty_sensors.py", "tests/test_controllers.py"),
+    "controllers/estimator.py": (
+        "tests/test_estimator.py", "tests/test_faulty_sensors.py", "tests/test_controllers.py",
+    ),
     "coax_env/engine/fit.py": ("tests/test_engine.py",),
     "coax_env/engine/whiteness.py": ("tests/test_engine.py",),
     "coax_env/two_step/method.py": ("tests/test_two_step.py",),
