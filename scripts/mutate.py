@@ -157,7 +157,8 @@ def stored(options: Any, mutation: Mutation) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     now = fingerprints(options.root, mutation)
-    holds = row["source"] == now["source"] and (row["caught"] or row["all"] == now["all"])
+    as_far = row["all"] == now["all"] and (options.own or row["rest"])
+    holds = row["source"] == now["source"] and (row["caught"] or as_far)
     return row | {"line": mutation.line} if holds else None
 
 

@@ -128,8 +128,9 @@ def toy(tmp_path, monkeypatch):
 
     def call(*words: str) -> dict:
         out = tmp_path / "out"
+        own = [] if "--rest" in words else ["--own"]
         monkeypatch.setattr(
-            sys, "argv", ["mutate.py", "--root", str(root), "--out", str(out), "--own", *words]
+            sys, "argv", ["mutate.py", "--root", str(root), "--out", str(out), *own]
         )
         try:
             mutate.main()
@@ -156,6 +157,7 @@ def test_what_the_tests_ask_for_is_caught_and_the_rest_is_not(toy):
     assert caught["by"] == "tests/test_toy.py::test_area"
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_stopped(toy, monkeypatch):
     root, call = toy
     tried, most = [], [2]
@@ -182,6 +184,20 @@ def test_a_run_goes_on_where_it_stopped(toy, monkeypatch):
     rows = call()["rows"]
     assert len(tried) == 3, "what survived is tried again with better tests, what was caught is not"
     assert sum(row["caught"] for row in rows) == 2
+
+
+@pytest.mark.slow
+def test_the_rest_of_the_tests_catch_what_the_own_do_not(toy):
+    """And what survived the own ones alone is tried again with the rest."""
+    root, call = toy
+    (root / "tests/test_zero.py").write_text(
+        TEST.replace("area(2.0, 3.0) == 6.0", "area(0.0, 2.0) == 0.0")
+    )
+    assert sum(row["caught"] for row in call()["rows"]) == 1
+    rows = call("--rest")["rows"]
+    assert {row["by"] for row in rows if row["caught"]} == {
+        "tests/test_toy.py::test_area", "tests/test_zero.py::test_area",
+    }  # fmt: skip
 
 
 def test_a_tree_whose_tests_fail_as_it_is_has_no_score(toy):

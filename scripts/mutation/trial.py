@@ -90,7 +90,7 @@ class Tree:
             os.killpg(running.pid, signal.SIGKILL)
 
     def try_out(self, mutation: Mutation, rest: bool) -> dict[str, Any]:
-        """Break the code, test it, and mend it: ``caught``, ``by`` which test, ``seconds``."""
+        """Break the code, test it (and by the `rest` of the tests), and mend it: the row's result."""
         path = self.place / mutation.file
         kept = self._machine_code()
         path.write_text(mutation.applied(path.read_text(encoding="utf-8")), encoding="utf-8")
@@ -108,7 +108,8 @@ class Tree:
                 compiled.unlink()
             for folder in self._machine_code() - kept:
                 shutil.rmtree(folder, ignore_errors=True)
-        return {"caught": bool(by), "by": by, "seconds": round(time.monotonic() - start, 1)}
+        seconds = round(time.monotonic() - start, 1)
+        return {"caught": bool(by), "by": by, "rest": rest, "seconds": seconds}
 
     def test(self, tests: Sequence[str]) -> str:
         """The first of the quick tests that fails in the tree as it stands; empty where all pass."""
@@ -116,11 +117,11 @@ class Tree:
             return ""
         environment = os.environ | {
             "PYTHONPATH": str(self.place), "COAX_CACHE_DIR": str(self.cache),
-            "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "HYPOTHESIS_MAX_EXAMPLES": "20",
+            "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
         }  # fmt: skip
         command = [
             sys.executable, "-m", "pytest", "-x", "-q", "--tb=line", "-m", "not slow",
-            "-p", "no:cacheprovider", "-p", "no:xdist", *tests,
+            "-p", "no:cacheprovider", *tests,
         ]  # fmt: skip
         if self._stopped.is_set():
             raise KeyboardInterrupt
