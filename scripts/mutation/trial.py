@@ -29,7 +29,7 @@ _ENV = ("tests/test_sensors.py", "tests/test_hover.py", "tests/test_world.py", "
 OWN: dict[str, tuple[str, ...]] = {
     "coax_env/dynamics.py": ("tests/test_dynamics.py", "tests/test_linear.py", "tests/test_env.py"),
     "coax_env/effects.py": ("tests/test_dynamics.py", "tests/test_vehicle.py", "tests/test_world.py"),
-    "coax_env/turbulence.py": _ENV,
+    "coax_env/turbulence.py": ("tests/test_turbulence.py", "tests/test_world.py"),
     "coax_env/linear.py": ("tests/test_linear.py", "tests/test_controllers.py"),
     "coax_env/vehicle.py": ("tests/test_vehicle.py", "tests/test_world.py"),
     "coax_env/sensors.py": _ENV,
