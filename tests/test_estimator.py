@@ -239,3 +239,42 @@ def test_channels_of_the_log_are_the_readings_of_the_filter(onboard):
     assert set(onboard.readings) <= set(CHANNELS)
     names = [s.name for s in suite("onboard")]
     assert [names[k] for k in onboard.reading_places] == list(onboard.readings)
+
+
+def seen_from(design, place: np.ndarray, psi: float, target: np.ndarray) -> np.ndarray:
+    """What a machine that hangs level at x y z with this heading sees (``mocap``), its target too."""
+    names = [s.name for s in suite("mocap")]
+    row = np.ones(len(names) + 3 + 4)
+    for k, name in enumerate(design.readings):
+        row[names.index(name)] = design.reading_trim[k]
+    north, east = target[:2] - place[:2]
+    row[[names.index(n) for n in ("pn", "pe", "h", "psi")]] = *place[:2], -place[2], psi
+    ahead = north * math.cos(psi) + east * math.sin(psi)
+    right = east * math.cos(psi) - north * math.sin(psi)
+    row[-4:] = ahead, right, place[2] - target[2], target[3] - psi
+    return row[None]
+
+
+@pytest.mark.parametrize("psi", [0.0, 0.8, -2.0])
+def test_where_the_target_moves_the_estimate_moves_and_the_machine_does_not(psi):
+    """In the heading's axes, from one target to the next: a machine at rest brings no surprise."""
+    design = design_estimator(LAMA, sensors="mocap")
+    tracker = Tracker(design)
+    place = np.array([2.0, -1.0, -1.4])
+    known = []
+    for target in ([2.1, -1.2, -1.5, psi + 0.1], [1.85, -0.9, -1.3, psi - 0.15]):
+        for _ in range(400 if not known else 1):
+            estimate = tracker.see(seen_from(design, place, psi, np.array(target)))
+            found = dict(zip(design.states, estimate[0], strict=False))
+            tracker.acted(-tracker.offset[None] / design.action_scale)
+        away = place - target[:3]
+        known.append((found, {
+            "x": away[0] * math.cos(psi) + away[1] * math.sin(psi),
+            "y": away[1] * math.cos(psi) - away[0] * math.sin(psi),
+            "z": away[2], "psi": psi - target[3],
+        }))  # fmt: skip
+    for found, expected in known:
+        for name, value in expected.items():
+            assert found[name] == pytest.approx(value, abs=2e-3), name
+    for name in ("u", "v", "w", "p", "q", "r", "phi", "theta"):
+        assert abs(known[1][0][name] - known[0][0][name]) < 1e-4, name
