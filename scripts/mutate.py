@@ -94,9 +94,9 @@ def trials(waiting: Sequence[Mutation], options: Any) -> Iterator[dict[str, Any]
         tree = free.get()
         try:
             row = described(mutation) | tree.try_out(mutation, rest=not options.own)
+            row |= fingerprints(tree.place, mutation)  # of the copy: the tree may have gone on
         finally:
             free.put(tree)
-        row |= fingerprints(options.root, mutation)
         write_json(place_of(options, mutation), row)
         return row
 

@@ -278,3 +278,15 @@ def test_where_the_target_moves_the_estimate_moves_and_the_machine_does_not(psi)
             assert found[name] == pytest.approx(value, abs=2e-3), name
     for name in ("u", "v", "w", "p", "q", "r", "phi", "theta"):
         assert abs(known[1][0][name] - known[0][0][name]) < 1e-4, name
+
+
+def test_a_heading_that_crosses_the_seam_brings_no_surprise(onboard):
+    """From just east of south to just west of it: the estimate goes on, within a turn."""
+    tracker = Tracker(onboard)
+    at = onboard.index("psi")
+    for k in range(300):
+        psi = (3.0 + 0.001 * k + math.pi) % (2.0 * math.pi) - math.pi
+        known = tracker.see(observation_of(onboard, psi=psi))[0, at]
+        tracker.acted(-tracker.offset[None] / onboard.action_scale)
+        assert -math.pi <= tracker.state[0, at] < math.pi
+        assert abs((known - psi + math.pi) % (2.0 * math.pi) - math.pi) < 0.1, k

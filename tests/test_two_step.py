@@ -25,7 +25,7 @@ from coax_env.two_step.processing import (
     spectral_amplitude_filter,
 )
 from coax_env.two_step.published import direction, lift_artefact, predicted, table_viii
-from coax_env.two_step.reconstruction import BIAS, THETA, H, W, flapping, longitudinal
+from coax_env.two_step.reconstruction import BIAS, THETA, H, W, _filter, flapping, longitudinal
 from coax_env.two_step.regression import (
     _memory,
     _over_lags,
@@ -284,6 +284,53 @@ def test_what_a_residual_remembers_is_bartletts_sum():
         expected = (1.0 + pole**2) / (1.0 - pole**2)
         assert _memory(rows, [200_000]) == pytest.approx(expected, rel=0.06)
         assert _memory(rows, [100_000] * 2) == pytest.approx(expected, rel=0.06)
+
+
+def test_independent_rows_are_those_that_are_not_remembered():
+    rng = np.random.default_rng(10)
+    X = np.column_stack([np.ones(20_000), rng.standard_normal(20_000)])
+    coloured = lfilter([1.0], [1.0, -0.8], rng.standard_normal(20_000))
+    assert least_squares(X, rng.standard_normal(20_000), "ab").rows == pytest.approx(
+        20_000, rel=0.05
+    )
+    expected = 20_000 * (1 - 0.64) / (1 + 0.64)
+    assert least_squares(X, coloured, "ab").rows == pytest.approx(expected, rel=0.15)
+
+
+def test_the_weakest_direction_is_measured_against_its_errors():
+    """numerics.md: r = smin(X) / smin([X y]); (r^2 - 1) in its own standard errors, sqrt(2 / rows)."""
+    rng = np.random.default_rng(11)
+    X = rng.standard_normal((800, 2)) @ np.array([[1.0, 0.2], [0.0, 0.5]])
+    y = X @ [1.0, -1.0] + 0.3 * rng.standard_normal(800)
+    found = total_least_squares(X, y, "ab", np.eye(3), (False, False))
+    smallest = [np.linalg.svd(M, compute_uv=False)[-1] for M in (X, np.column_stack([X, y]))]
+    expected = ((smallest[0] / smallest[1]) ** 2 - 1.0) * np.sqrt(found.rows / 2.0)
+    assert found.weakest == pytest.approx(expected)
+
+
+def test_a_tilted_thrust_lifts_by_its_upright_share():
+    """The third component of [-tan a, tan b, -1] made a unit vector, (13)-(14)."""
+    rng = np.random.default_rng(12)
+    alpha, beta = rng.uniform(-0.5, 0.5, (2, 20))
+    vectors = np.stack([-np.tan(alpha), np.tan(beta), -np.ones(20)])
+    np.testing.assert_allclose(
+        modes._upright(alpha, beta), -(vectors / np.linalg.norm(vectors, axis=0))[2]
+    )
+
+
+def test_the_filters_transition_is_the_slope_of_its_own_prediction():
+    """By central differences of the first state, with steady readings and the sonar silent."""
+    q, ax, az = np.full(4, 0.4), np.full(4, -0.6), np.full(4, -9.3)
+    start, dt = np.array([0.3, 1.0, -0.7, 1.5, 0.2]), 0.01
+    shake, silent = np.array([1e-4, 1e-2, 1e-2]), np.full(4, np.nan)
+
+    def flown(x: np.ndarray):
+        return _filter(q, ax, az, silent, dt, 9.8, shake, 0.01, x, np.ones(5))
+
+    *_, transition = flown(start)
+    for column, step in enumerate(1e-5 * np.eye(5)):
+        slope = (flown(start + step)[0][1] - flown(start - step)[0][1]) / 2e-5
+        np.testing.assert_allclose(transition[0][:, column], slope, atol=5e-5)
 
 
 def test_intervals_are_students():

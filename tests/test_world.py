@@ -277,6 +277,38 @@ def test_every_effect_flies_in_the_env_as_in_the_scalar_simulation(effect):
         assert np.allclose(observations[row, seen], readings[rates], atol=1e-5)
 
 
+@pytest.mark.parametrize("delay", [0.004, 0.01, 0.027])
+def test_a_servos_delay_splits_the_period_where_it_must(delay):
+    """Flown by hand: each command of the plate arrives that much later, on both axes."""
+    env = CoaxEnv(LAMA.with_effect("servo_delay", time=delay), nominal=LAMA, sensors="state")
+    env.reset(seed=0, options={"state": TRIM[0]})
+    fleet, work = env.fleet, np.zeros(dynamics.WORK_SIZE)
+    x = dynamics.full_state(*TRIM, LAMA)
+    given = np.vstack([np.zeros((4, 4)), actions(4, 40, 4, size=0.3)]).astype(float)
+    commands = fleet.trim + fleet.scale * given
+    whole = math.floor(delay / DT + 1e-9)
+    rest = delay - whole * DT
+    for k in range(4, len(given)):
+        state = env.step(given[k])[4]["state"]
+        for back, seconds in ((whole + 1, rest), (whole, DT - rest)):
+            command = commands[k].copy()
+            command[2:] = commands[k - back, 2:]
+            if seconds > 1e-9:
+                dynamics.step(x, dynamics.kernel_input(command), seconds, LAMA.vector, work, x)
+        np.testing.assert_allclose(state[:16], x[:16], atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [3, 19], ids=["one by one", "in lanes"])
+@pytest.mark.parametrize("gusts", [(0.2, 0.0), (0.0, 0.01)])
+def test_gusts_of_force_or_of_moment_alone_blow(gusts, count):
+    env = CoaxVectorEnv(count, gusts=gusts)
+    env.reset(seed=0)
+    for _ in range(5):
+        state = env.step(np.zeros((count, 4)))[4]["state"]
+    assert state[:, 20:23].any(axis=0).all() == (gusts[0] > 0.0)
+    assert state[:, 23:26].any(axis=0).all() == (gusts[1] > 0.0)
+
+
 # --- turbulence -------------------------------------------------------------------------------------
 
 

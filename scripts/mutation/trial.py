@@ -35,7 +35,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/sensors.py": _ENV,
     "coax_env/actuators.py": _ENV,
     "coax_env/period.py": _ENV,
-    "coax_env/fleet.py": _ENV,
+    "coax_env/fleet.py": (*_ENV, "tests/test_lanes.py"),
     "coax_env/hover.py": _ENV,
     "coax_env/tasks.py": _ENV,
     "coax_env/engine/kalman.py": ("tests/test_engine.py",),
