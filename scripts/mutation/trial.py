@@ -68,7 +68,7 @@ class Tree:
     """A copy of the project in which code is broken and tested, one trial after the other."""
 
     def __init__(self, root: Path, place: Path) -> None:
-        self.root, self.place = root, place / "tree"
+        self.place = place / "tree"
         self.cache = place / "cache"
         shutil.rmtree(self.place, ignore_errors=True)
         make_folder(self.place)
@@ -93,7 +93,8 @@ class Tree:
         """Break the code, test it (and by the `rest` of the tests), and mend it: the row's result."""
         path = self.place / mutation.file
         kept = self._machine_code()
-        path.write_text(mutation.applied(path.read_text(encoding="utf-8")), encoding="utf-8")
+        whole, stamp = path.read_text(encoding="utf-8"), path.stat().st_mtime_ns
+        path.write_text(mutation.applied(whole), encoding="utf-8")
         start = time.monotonic()
         try:
             own = OWN[mutation.file]
@@ -103,7 +104,8 @@ class Tree:
                 others = sorted(p.name for p in (self.place / "tests").glob("test_*.py"))
                 by = self.test([n for n in (f"tests/{o}" for o in others) if n not in left_out])
         finally:
-            shutil.copy2(self.root / mutation.file, path)
+            path.write_text(whole, encoding="utf-8")
+            os.utime(path, ns=(stamp, stamp))  # numba knows its machine code by this
             for compiled in path.parent.glob(f"__pycache__/{path.stem}.*"):
                 compiled.unlink()
             for folder in self._machine_code() - kept:
