@@ -24,7 +24,10 @@ if __name__ == "__main__" and sys.argv[1:2] == [
         include=["coax_env.flight", "coax_env.vehicle", "coax_env.log_units", "coax_env.outliers",
                  "coax_env.foreign_columns", "coax_env.autopilot_logs", "pyulog.core"],
     ):  # fmt: skip
-        pass
+        import pyulog.core  # noqa: F401
+
+        import coax_env.autopilot_logs
+        import coax_env.vehicle  # noqa: F401
 
 import numpy as np
 

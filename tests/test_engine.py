@@ -264,6 +264,26 @@ def test_noise_score_is_the_gradient_of_the_likelihood():
         assert found == pytest.approx(exact, rel=0.02, abs=0.02)
 
 
+@pytest.mark.parametrize("state", [ANGLE, RATE])
+def test_start_score_is_the_gradient_in_the_first_variances(state):
+    """Exact too, where the pendulum is linear; with uncertain starts too small, right and too large."""
+    record = with_holes(swing(9, n=120), 0.2, 5)
+
+    def engine_at(std: float) -> Engine:
+        model = Pendulum()
+        model.start_std = Pendulum.start_std.copy()
+        model.start_std[state] = std
+        return Engine(model, [record])
+
+    for std in Pendulum.start_std[state] * np.array([0.3, 1.0, 3.0]):
+        *_, by_start = engine_at(std).noise_score(TRUTH, NOISE)
+        more, less = 1.02 * std, std / 1.02
+        found = by_start[0, state] * (more**2 - less**2)
+        exact = engine_at(more).log_likelihood(TRUTH, NOISE)
+        exact -= engine_at(less).log_likelihood(TRUTH, NOISE)
+        assert found == pytest.approx(exact, rel=0.02, abs=2e-4)
+
+
 def test_angles_wrap():
     """A pendulum that goes over the top many times is followed as if its encoder never jumped."""
     values = {**TRUTH, "sine": 1.0, "damping": 0.05}
@@ -536,4 +556,11 @@ def test_noise_that_is_too_large_is_not_white():
 def test_an_empty_channel_is_not_judged():
     e = np.random.default_rng(3).standard_normal((500, 2))
     e[:, 1] = np.nan
+    assert set(whiteness([a_pass(e)], ("a", "b"))) == {"a"}
+
+
+def test_a_channel_with_few_readings_is_not_judged():
+    """Twenty lags of fifty readings are no statistic, whatever they look like."""
+    e = 3.0 * np.random.default_rng(4).standard_normal((1000, 2))
+    e[150:, 1] = np.nan  # fifty are left after the first second
     assert set(whiteness([a_pass(e)], ("a", "b"))) == {"a"}

@@ -7,8 +7,9 @@ of their intervals for the regressions, and what design/paper.md found in Table 
 import gymnasium
 import numpy as np
 import pytest
-from scipy.signal import butter, sosfiltfilt
+from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import binom
+from scipy.stats import t as student
 
 from coax_env import identify, load_vehicle, simulate
 from coax_env.errors import InputError
@@ -24,8 +25,11 @@ from coax_env.two_step.processing import (
     spectral_amplitude_filter,
 )
 from coax_env.two_step.published import direction, lift_artefact, predicted, table_viii
-from coax_env.two_step.reconstruction import BIAS, THETA, H, W, flapping, longitudinal
+from coax_env.two_step.reconstruction import BIAS, THETA, H, W, _filter, flapping, longitudinal
 from coax_env.two_step.regression import (
+    _memory,
+    _over_lags,
+    _parzen,
     collinearity,
     least_squares,
     total_least_squares,
@@ -242,6 +246,112 @@ def test_without_excitation_it_is_not_trusted():
     y = rng.standard_normal(400)
     assert not total(X, y).trusted
     assert total(*noisy_rows(0, 1000, False)).trusted
+
+
+def test_with_draws_the_std_is_the_scatter_in_gusts_too():
+    """A gust in y remembers twenty rows: what the errors alone make is then far too small a std."""
+    errors = np.diag([0.1, 0.1]) ** 2
+    rng = np.random.default_rng(7)
+    values, stds = [], []
+    for _ in range(30):
+        slow = lfilter([np.sqrt(1.0 - 0.95**2)], [1.0, -0.95], rng.standard_normal(700))[300:]
+        shake = lfilter([np.sqrt(1.0 - 0.95**2)], [1.0, -0.95], rng.standard_normal(700))[300:]
+        made = 0.1 * rng.standard_normal((400, 2))
+        X = np.column_stack([np.ones(400), slow + made[:, 0]])
+        y = 1.0 + 2.0 * slow + 0.5 * shake + made[:, 1]
+        draws = 0.1 * rng.standard_normal((60, 400, 2))
+        found = total_least_squares(X, y, "ab", errors, (True, False), draws=draws)
+        values.append(found.values)
+        stds.append(found.std)
+    ratio = np.std(values, axis=0) / np.sqrt(np.mean(np.square(stds), axis=0))
+    assert ((ratio > 0.6) & (ratio < 1.5)).all(), ratio
+
+
+def test_parzens_weights():
+    """1 at no lag, a quarter half way, smooth, and nothing at the end (Parzen 1961)."""
+    weights = _parzen(40)
+    assert weights[0] == 1.0 and weights[20] == pytest.approx(0.25) and weights[-1] < 1e-3
+    assert (np.diff(weights) < 0.0).all() and np.abs(np.diff(weights, 2)).max() < 12.0 / 40**2
+    assert np.array_equal(_parzen(0), [1.0])
+
+
+def test_what_a_residual_remembers_is_bartletts_sum():
+    """An autoregression of pole a has squared correlations a^2k: they sum to (1 + a^2) / (1 - a^2)."""
+    rng = np.random.default_rng(8)
+    assert _memory(rng.standard_normal(20_000), [20_000]) == pytest.approx(1.0, abs=0.05)
+    for pole in (0.5, 0.9):
+        rows = lfilter([1.0], [1.0, -pole], rng.standard_normal(200_000))
+        expected = (1.0 + pole**2) / (1.0 - pole**2)
+        assert _memory(rows, [200_000]) == pytest.approx(expected, rel=0.06)
+        assert _memory(rows, [100_000] * 2) == pytest.approx(expected, rel=0.06)
+
+
+def test_independent_rows_are_those_that_are_not_remembered():
+    rng = np.random.default_rng(10)
+    X = np.column_stack([np.ones(20_000), rng.standard_normal(20_000)])
+    coloured = lfilter([1.0], [1.0, -0.8], rng.standard_normal(20_000))
+    assert least_squares(X, rng.standard_normal(20_000), "ab").rows == pytest.approx(
+        20_000, rel=0.05
+    )
+    expected = 20_000 * (1 - 0.64) / (1 + 0.64)
+    assert least_squares(X, coloured, "ab").rows == pytest.approx(expected, rel=0.15)
+
+
+def test_the_weakest_direction_is_measured_against_its_errors():
+    """numerics.md: r = smin(X) / smin([X y]); (r^2 - 1) in its own standard errors, sqrt(2 / rows)."""
+    rng = np.random.default_rng(11)
+    X = rng.standard_normal((800, 2)) @ np.array([[1.0, 0.2], [0.0, 0.5]])
+    y = X @ [1.0, -1.0] + 0.3 * rng.standard_normal(800)
+    found = total_least_squares(X, y, "ab", np.eye(3), (False, False))
+    smallest = [np.linalg.svd(M, compute_uv=False)[-1] for M in (X, np.column_stack([X, y]))]
+    expected = ((smallest[0] / smallest[1]) ** 2 - 1.0) * np.sqrt(found.rows / 2.0)
+    assert found.weakest == pytest.approx(expected)
+
+
+def test_a_tilted_thrust_lifts_by_its_upright_share():
+    """The third component of [-tan a, tan b, -1] made a unit vector, (13)-(14)."""
+    rng = np.random.default_rng(12)
+    alpha, beta = rng.uniform(-0.5, 0.5, (2, 20))
+    vectors = np.stack([-np.tan(alpha), np.tan(beta), -np.ones(20)])
+    np.testing.assert_allclose(
+        modes._upright(alpha, beta), -(vectors / np.linalg.norm(vectors, axis=0))[2]
+    )
+
+
+def test_the_filters_transition_is_the_slope_of_its_own_prediction():
+    """By central differences of the first state, with steady readings and the sonar silent."""
+    q, ax, az = np.full(4, 0.4), np.full(4, -0.6), np.full(4, -9.3)
+    start, dt = np.array([0.3, 1.0, -0.7, 1.5, 0.2]), 0.01
+    shake, silent = np.array([1e-4, 1e-2, 1e-2]), np.full(4, np.nan)
+
+    def flown(x: np.ndarray):
+        return _filter(q, ax, az, silent, dt, 9.8, shake, 0.01, x, np.ones(5))
+
+    *_, transition = flown(start)
+    for column, step in enumerate(1e-5 * np.eye(5)):
+        slope = (flown(start + step)[0][1] - flown(start - step)[0][1]) / 2e-5
+        np.testing.assert_allclose(transition[0][:, column], slope, atol=5e-5)
+
+
+def test_intervals_are_students():
+    X = np.column_stack([np.ones(12), np.arange(12.0)])
+    y = 1.0 + 0.5 * np.arange(12.0) + 0.1 * (-1.0) ** np.arange(12)
+    found = least_squares(X, y, "ab")
+    low, high = found.interval(0.9).T
+    np.testing.assert_allclose((low + high) / 2, found.values)
+    degrees = max(found.rows - 2, 1.0)
+    np.testing.assert_allclose((high - low) / 2, student.ppf(0.95, degrees) * found.std)
+
+
+def test_scores_are_summed_over_lags_as_their_covariance_says():
+    """Newey and West on an autoregression: the variance of a sum of n rows is n times (1+a)/(1-a)."""
+    rng = np.random.default_rng(9)
+    pole = 0.6
+    rows = np.sqrt(1 - pole**2) * lfilter([1.0], [1.0, -pole], rng.standard_normal(200_000))
+    total = _over_lags(rows[:, None], [200_000], 60)[0, 0] / 200_000
+    assert total == pytest.approx((1 + pole) / (1 - pole), rel=0.08)
+    halves = _over_lags(rows[:, None], [100_000] * 2, 60)[0, 0] / 200_000
+    assert halves == pytest.approx(total, rel=0.02)
 
 
 def test_collinearity_is_named_in_words():

@@ -1,0 +1,166 @@
+"""One mutation at a time: a copy of the tree, the change, the tests.
+
+The copy lies at one place for all trials of a job, so that numba's machine code of what is not broken
+is found again. A change of the kernel (`coax_env.jit.KERNEL_SOURCES`) has machine code of its own, in
+a folder that is removed afterwards.
+"""
+
+import hashlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from coax_env.errors import InputError
+from coax_env.files import make_folder
+from mutation.sites import Mutation
+
+COPIED = ("coax_env", "controllers", "scripts", "tests", "pyproject.toml", "README.md")
+LIMIT = 900.0  # [s] for the tests of one mutation; who needs longer is caught in an endless loop
+
+_ENV = ("tests/test_sensors.py", "tests/test_hover.py", "tests/test_world.py", "tests/test_env.py")
+OWN: dict[str, tuple[str, ...]] = {
+    "coax_env/dynamics.py": ("tests/test_dynamics.py", "tests/test_linear.py", "tests/test_env.py"),
+    "coax_env/effects.py": ("tests/test_dynamics.py", "tests/test_vehicle.py", "tests/test_world.py"),
+    "coax_env/turbulence.py": ("tests/test_turbulence.py", "tests/test_world.py"),
+    "coax_env/linear.py": ("tests/test_linear.py", "tests/test_controllers.py"),
+    "coax_env/vehicle.py": ("tests/test_vehicle.py", "tests/test_world.py"),
+    "coax_env/sensors.py": _ENV,
+    "coax_env/actuators.py": _ENV,
+    "coax_env/period.py": _ENV,
+    "coax_env/fleet.py": (*_ENV, "tests/test_lanes.py"),
+    "coax_env/hover.py": _ENV,
+    "coax_env/tasks.py": _ENV,
+    "coax_env/engine/kalman.py": ("tests/test_engine.py",),
+    "coax_env/heli_model.py": (
+        "tests/test_heli_model.py", "tests/test_closed_loop.py",
+    ),
+    "controllers/estimator.py": (
+        "tests/test_estimator.py", "tests/test_faulty_sensors.py", "tests/test_controllers.py",
+    ),
+    "coax_env/engine/fit.py": ("tests/test_engine.py",),
+    "coax_env/engine/whiteness.py": ("tests/test_engine.py",),
+    "coax_env/two_step/method.py": ("tests/test_two_step.py",),
+    "coax_env/two_step/modes.py": ("tests/test_two_step.py",),
+    "coax_env/two_step/processing.py": ("tests/test_two_step.py",),
+    "coax_env/two_step/reconstruction.py": ("tests/test_two_step.py",),
+    "coax_env/two_step/regression.py": ("tests/test_two_step.py",),
+}  # fmt: skip
+"""File -> the tests that belong to it, tried first, in this order."""
+
+APART = (
+    "tests/test_house.py", "tests/test_wheel.py", "tests/test_mutation.py", "tests/test_killed.py",
+    "tests/test_fuzz.py",
+)  # fmt: skip
+"""Tests of the house and not of its numbers: what they catch is not counted."""
+
+_FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+
+
+class Tree:
+    """A copy of the project in which code is broken and tested, one trial after the other."""
+
+    def __init__(self, root: Path, place: Path) -> None:
+        self.place = place / "tree"
+        self.cache = place / "cache"
+        shutil.rmtree(self.place, ignore_errors=True)
+        make_folder(self.place)
+        for name in COPIED:
+            source = root / name
+            if source.is_dir():
+                ignored = shutil.ignore_patterns("__pycache__", "runs", ".*")
+                shutil.copytree(source, self.place / name, ignore=ignored)
+            elif source.exists():
+                shutil.copy2(source, self.place / name)
+        self._running: subprocess.Popen | None = None
+        self._stopped = threading.Event()
+
+    def stop(self) -> None:
+        """End the tests that run, and start no more."""
+        self._stopped.set()
+        running = self._running
+        if running and running.poll() is None:
+            os.killpg(running.pid, signal.SIGKILL)
+
+    def try_out(self, mutation: Mutation, rest: bool) -> dict[str, Any]:
+        """Break the code, test it (and by the `rest` of the tests), and mend it: the row's result."""
+        path = self.place / mutation.file
+        kept = self._machine_code()
+        whole, stamp = path.read_text(encoding="utf-8"), path.stat().st_mtime_ns
+        path.write_text(mutation.applied(whole), encoding="utf-8")
+        start = time.monotonic()
+        try:
+            own = OWN[mutation.file]
+            by = self.test([name for name in own if (self.place / name).exists()])
+            if not by and rest:
+                left_out = {*own, *APART}
+                others = sorted(p.name for p in (self.place / "tests").glob("test_*.py"))
+                by = self.test([n for n in (f"tests/{o}" for o in others) if n not in left_out])
+        finally:
+            path.write_text(whole, encoding="utf-8")
+            os.utime(path, ns=(stamp, stamp))  # numba knows its machine code by this
+            for compiled in path.parent.glob(f"__pycache__/{path.stem}.*"):
+                compiled.unlink()
+            for folder in self._machine_code() - kept:
+                shutil.rmtree(folder, ignore_errors=True)
+        seconds = round(time.monotonic() - start, 1)
+        return {"caught": bool(by), "by": by, "rest": rest, "seconds": seconds}
+
+    def test(self, tests: Sequence[str]) -> str:
+        """The first of the quick tests that fails in the tree as it stands; empty where all pass."""
+        if not tests:
+            return ""
+        environment = os.environ | {
+            "PYTHONPATH": str(self.place), "COAX_CACHE_DIR": str(self.cache),
+            "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
+        }  # fmt: skip
+        command = [
+            sys.executable, "-m", "pytest", "-x", "-q", "--tb=line", "-m", "not slow",
+            "-p", "no:cacheprovider", *tests,
+        ]  # fmt: skip
+        if self._stopped.is_set():
+            raise KeyboardInterrupt
+        self._running = subprocess.Popen(
+            command, cwd=self.place, env=environment, start_new_session=True, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        try:
+            said, _ = self._running.communicate(timeout=LIMIT)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._running.pid, signal.SIGKILL)
+            self._running.communicate()
+            return f"no end within {LIMIT:.0f} s"
+        except BaseException:
+            os.killpg(self._running.pid, signal.SIGKILL)
+            raise
+        if self._stopped.is_set():
+            raise KeyboardInterrupt
+        return _verdict(self._running.returncode, said)
+
+    def _machine_code(self) -> set[Path]:
+        return set(self.cache.iterdir()) if self.cache.exists() else set()
+
+
+def _verdict(code: int, said: str) -> str:
+    """What pytest's exit code means: the failing test; empty where all passed."""
+    if code == 0:
+        return ""
+    if code in (3, 4, 5):  # pytest's own fault, its command line's, or nothing to test
+        raise InputError(f"pytest ended with {code}: {said.strip().splitlines()[-1]:.200}")
+    found = _FAILED.search(said)
+    return found[1] if found else f"pytest ended with {code}"
+
+
+def fingerprint(*paths: Path) -> str:
+    """Twelve hex digits over files."""
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
