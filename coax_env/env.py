@@ -301,6 +301,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 self.fleet.seed(i, row_seed)
         self._seeded = True
         self._ended &= ~which
+        self.fleet.x = self.fleet.x.copy()
         observations = self.fleet.restart(which, _start_states(options, self.num_envs))
         self._screen.moved()
         return observations, self._told(which) | self._vehicles(which)
@@ -312,7 +313,9 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         fleet, ended = self.fleet, self._ended
         waiting = ended.any()
         active = ~ended if waiting else self._every
-        outcome = fleet.fly(np.array(actions, dtype=np.float64).reshape(self.num_envs, 4), active)
+        anew = ended if waiting and self.autoreset_mode == AutoresetMode.NEXT_STEP else None
+        commands = np.array(actions, dtype=np.float64).reshape(self.num_envs, 4)
+        outcome = fleet.fly(commands, active, anew)
         terminated = outcome.over
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         if self.max_episode_steps is not None:
@@ -322,7 +325,6 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         done = terminated | truncated
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             if waiting:
-                fleet.restart(ended, observations=observations)
                 info |= self._vehicles(ended)
             self._ended = done
         elif self.autoreset_mode == AutoresetMode.DISABLED:
@@ -332,6 +334,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             info["final_obs"] = observations.copy()
             info["final_info"] = self._step_info(outcome.terms)
             info["_final_obs"] = info["_final_info"] = done
+            fleet.x = fleet.x.copy()
             fleet.restart(done, observations=observations)
             info |= self._vehicles(done)
         info |= self._step_info(outcome.terms)
@@ -354,7 +357,9 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _told(self, which: np.ndarray) -> dict[str, Any]:
         fleet = self.fleet
-        info: dict[str, np.ndarray] = {"state": fleet.x.copy()}
+        state = fleet.x.view()
+        state.flags.writeable = False
+        info: dict[str, np.ndarray] = {"state": state}
         if fleet.task.aims:
             info["target"] = fleet.targets.copy()
         if fleet.task.moves_on:

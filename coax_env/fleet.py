@@ -128,22 +128,36 @@ def _stir(x, p, stream, eddies, breeze, wind, air):
 
 
 @compiled()
+def rest(i, x, held, flown, observations, rewards, terms, over):
+    """What a row brings that is not flown: it stays as it is."""
+    for k in range(N_FULL):
+        flown[i, k] = x[i, k]
+    for k in range(held.shape[1]):
+        observations[i, k] = held[i, k]
+    for k in range(terms.shape[1]):
+        terms[i, k] = 0.0
+    rewards[i] = 0.0
+    over[i] = False
+
+
+@compiled()
 def _fly_rows(
     first, last, active, actions, trim, scale, params, kinds, sensors, limits, gust, turbulence,
     weights, scales, places, height_sign, course, box, dwell,
-    x, u, rows, azimuth, streams, swash, asked, bias, past, eddies, breeze, targets, progress, held,
-    observations, rewards, terms, over,
+    before, u, rows, azimuth, streams, swash, asked, bias, past, eddies, breeze, targets, progress,
+    held, x, observations, rewards, terms, over,
 ):  # fmt: skip
-    """One control period of the active rows first..last-1. See Fleet for the arrays."""
+    """One control period of the active rows first..last-1, from `before` into `x`. See Fleet."""
     work = np.empty(WORK_SIZE)
     readings, values = np.empty(N_CHANNELS), np.empty(sensors.shape[1])
     air = np.empty(3)
     many = len(params) > 1
     for i in range(first, last):
         if not active[i]:
-            for k in range(held.shape[1]):
-                observations[i, k] = held[i, k]
+            rest(i, before, held, x, observations, rewards, terms, over)
             continue
+        for k in range(N_FULL):
+            x[i, k] = before[i, k]
         p = params[i] if many else params[0]
         kind = kinds[i]
         command(actions[i], trim, scale, u[i])
@@ -162,6 +176,8 @@ def _fly_rows(
         u[i, TIME] = rows[i] * DT
         rewards[i] = hover.reward(x[i], actions[i], targets[i], weights, scales, terms[i])
         over[i] = hover.is_over(x[i])
+        for k in range(hover.N_TERMS, terms.shape[1]):
+            terms[i, k] = 0.0
         if dwell > 0 and tasks.arrive(x[i], targets[i], dwell, progress[i], course):
             terms[i, hover.N_TERMS] = weights[hover.N_TERMS]
             rewards[i] += weights[hover.N_TERMS]
@@ -175,16 +191,16 @@ def _fly_rows(
 
 @compiled()
 def _restart_rows(
-    which, keep_state, trim, params, kinds, sensors, limits, wind_speed, turbulence,
+    first, last, which, keep_state, trim, params, kinds, sensors, limits, wind_speed, turbulence,
     places, height_sign, course, box,
     x, u, rows, azimuth, streams, swash, asked, bias, past, eddies, breeze, targets, progress, held,
     observations,
 ):  # fmt: skip
-    """New flights for the rows of the mask `which`; with `keep_state` from what stands in `x`."""
+    """New flights for the rows first..last-1 of a mask; with `keep_state` from what stands in `x`."""
     work = np.empty(WORK_SIZE)
     readings, values = np.empty(N_CHANNELS), np.empty(sensors.shape[1])
     many = len(params) > 1
-    for i in range(len(which)):
+    for i in range(first, last):
         if not which[i]:
             continue
         if wind_speed > 0.0:
@@ -281,8 +297,8 @@ class Fleet:
             raise InputError("gusts must be (force std in N, moment std in N m), both >= 0")
         self.count = count
         self._own = self.draws.random or self._wind_speed > 0.0 or self._turbulence > 0.0
-        self._base = np.tile(self._in_wind(self.vehicle.vector), (count if self._own else 1, 1))
-        self.params = self._base.copy()
+        self._vector = self._in_wind(self.vehicle.vector)
+        self.params = np.tile(self._vector, (count if self._own else 1, 1))
         self._switched_on = bool(self.params[:, STAGES].any())
         self.drawn = np.zeros((count, len(self.draws.names)))
         self.kinds = np.zeros(count, dtype=np.int64)
@@ -336,16 +352,7 @@ class Fleet:
             states: paper or full states to start from, (count, 16 or 26); random when None.
             observations: where to put the rows' observations, (count, n_observed).
         """
-        if self.draws.random:
-            streams = self.streams[which]
-            self.drawn[which], self.kinds[which] = self.draws.draw(streams)
-            self.streams[which] = streams
-            self._base[which] = self._in_wind(
-                self.draws.vectors(self.drawn[which], self.kinds[which])
-            )
-        if self._own:
-            self.params[which] = self._base[which]
-            self._switched_on = bool(self.params[:, STAGES].any())
+        self._draw(which)
         if states is not None:
             x = np.zeros((self.count, N_FULL))
             x[:, 16:20] = self.trim
@@ -353,48 +360,77 @@ class Fleet:
             self.x[which] = x[which]
         if observations is None:
             observations = self.held.astype(np.float32)
+        self._start(0, self.count, which, states is not None, observations)
+        return observations
+
+    def _draw(self, which: np.ndarray) -> None:
+        """Vehicles for new flights in the rows of a mask, in still air or the env's steady wind."""
+        if self.draws.random:
+            streams = self.streams[which]
+            self.drawn[which], self.kinds[which] = self.draws.draw(streams)
+            self.streams[which] = streams
+            vectors = self.draws.vectors(self.drawn[which], self.kinds[which])
+            self.params[which] = self._in_wind(vectors)
+            self._switched_on = bool(self.params[:, STAGES].any())
+        elif self._own:
+            self.params[which] = self._vector
+
+    def _start(
+        self, first: int, last: int, which: np.ndarray, keep_state: bool, observations: np.ndarray
+    ) -> None:
         _restart_rows(
-            which, states is not None, self.trim, self.params, self.kinds, self._table, self._limits,
-            self._wind_speed, self._turbulence,
+            first, last, which, keep_state, self.trim, self.params, self.kinds, self._table,
+            self._limits, self._wind_speed, self._turbulence,
             self._places, self._height_sign, self._course, self._box,
             self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked, self.bias,
             self.past, self.eddies, self.breeze, self.targets, self.progress, self.held,
             observations,
         )  # fmt: skip
-        return observations
 
-    def fly(self, actions: np.ndarray, active: np.ndarray) -> Outcome:
-        """One control period. `actions` (count, 4) float64 is clipped to [-1, 1] in place."""
+    def fly(
+        self, actions: np.ndarray, active: np.ndarray, anew: np.ndarray | None = None
+    ) -> Outcome:
+        """One control period; `x` is a new array then, and the one before stays as it was.
+
+        Args:
+            actions: (count, 4) float64; whether they are clipped in place is left open.
+            active: which rows fly, (count,). anew: which of the others start a new flight, (count,).
+        """
         n = self.count
         outcome = Outcome(
             np.empty((n, self.n_observed), dtype=np.float32),
-            np.zeros(n),
-            np.zeros((n, len(self._weights))),
-            np.zeros(n, dtype=np.bool_),
+            np.empty(n),
+            np.empty((n, len(self._weights))),
+            np.empty(n, dtype=np.bool_),
         )
-
+        before, self.x = self.x, np.empty_like(self.x)
+        if anew is not None:
+            self._draw(anew)
         task = (
             self._weights, self._scales, self._places, self._height_sign, self._course, self._box,
             self._dwell,
         )  # fmt: skip
-        results = (outcome.observations, outcome.rewards, outcome.terms, outcome.over)
+        results = (self.x, outcome.observations, outcome.rewards, outcome.terms, outcome.over)
+        side_by_side = self._side_by_side()
 
         def rows(first: int, last: int) -> None:
-            if self._side_by_side():
+            if side_by_side:
                 self._fly_lanes()(
                     first, last, active, actions, self.trim, self.scale, self.params,
                     self._table[0], self._limits[0], self._gust, *task,
-                    self.x, self.u, self.rows, self.azimuth, self.streams, self.asked, self.bias,
+                    before, self.u, self.rows, self.azimuth, self.streams, self.asked, self.bias,
                     self.targets, self.progress, self.held, *results,
                 )  # fmt: skip
-                return
-            _fly_rows(
-                first, last, active, actions, self.trim, self.scale, self.params, self.kinds,
-                self._table, self._limits, self._gust, self._turbulence, *task,
-                self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked,
-                self.bias, self.past, self.eddies, self.breeze, self.targets, self.progress,
-                self.held, *results,
-            )  # fmt: skip
+            else:
+                _fly_rows(
+                    first, last, active, actions, self.trim, self.scale, self.params, self.kinds,
+                    self._table, self._limits, self._gust, self._turbulence, *task,
+                    before, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked,
+                    self.bias, self.past, self.eddies, self.breeze, self.targets, self.progress,
+                    self.held, *results,
+                )  # fmt: skip
+            if anew is not None:
+                self._start(first, last, anew, False, outcome.observations)
 
         in_threads(rows, n, self._threads)
         return outcome

@@ -12,10 +12,10 @@ from coax_env import parameters as P
 from coax_env.actuators import limit
 from coax_env.dynamics import WORK_SIZE, measure_bare, step_bare
 from coax_env.errors import InputError
-from coax_env.fleet import STAGES, in_threads
+from coax_env.fleet import STAGES, in_threads, rest
 from coax_env.jit import compiled
-from coax_env.lanes import WIDTH, gather, lanes_of, scatter, select, words_of
-from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
+from coax_env.lanes import WIDTH, gather, lanes_of, scatter, scratch, select, words_of
+from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, N_STATES, TIME
 from coax_env.period import BIAS, BIAS_STD, DT, blow, command, read, seen, turned
 from coax_env.vehicle import Vehicle
 
@@ -46,22 +46,22 @@ def _step_of(own):
 
     def step_rows(
         first, last, active, actions, trim, scale, params, limits, gust, weights, scales,
-        x, u, rows, azimuth, streams, asked, targets, rewards, terms, over,
+        x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
     ):  # fmt: skip
         """Fly the active rows first..last-1 for one control period. See fleet.Fleet for the arrays."""
         which = np.empty(WIDTH, np.int64)
         x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
         action_block, asked_block = np.empty((4, WIDTH)), np.empty((4, WIDTH))
         target_block, term_block = np.empty((4, WIDTH)), np.zeros((len(weights), WIDTH))
-        stream_block, work_block = np.empty((2, WIDTH), np.uint64), np.empty((WORK_SIZE, WIDTH))
-        row_block = np.empty((_N_SINGLES, WIDTH))
+        stream_block, row_block = np.empty((2, WIDTH), np.uint64), np.empty((_N_SINGLES, WIDTH))
         x_, u_, action_ = lanes_of(x_block), lanes_of(u_block), lanes_of(action_block)
         asked_, target_, terms_ = (
             lanes_of(asked_block),
             lanes_of(target_block),
             lanes_of(term_block),
         )
-        single_, work, stream_ = lanes_of(row_block), lanes_of(work_block), words_of(stream_block)
+        single_, stream_ = lanes_of(row_block), words_of(stream_block)
+        work, flown_ = scratch(WORK_SIZE), scratch(N_FULL)
         if own:
             p_block = np.empty((_N_PARAMETERS, WIDTH))
             p = lanes_of(p_block)
@@ -89,12 +89,14 @@ def _step_of(own):
                 blow(x_, p, gust, stream_)
                 scatter(stream_block, which, n, streams)
             u_[TIME] = single_[_ROW] * DT
-            step_bare(x_, u_, DT, p, work, x_)
+            step_bare(x_, u_, DT, p, work, flown_)
+            for k in range(N_FULL):
+                x_[k] = flown_[k]
             u_[TIME] = (single_[_ROW] + 1.0) * DT
             single_[_AZIMUTH] = turned(single_[_AZIMUTH], x_[16])
             single_[_REWARD] = hover.reward(x_, action_, target_, weights, scales, terms_)
             single_[_OVER] = select(hover.is_over(x_), 1.0, 0.0)
-            scatter(x_block, which, n, x)
+            scatter(x_block, which, n, flown)
             scatter(u_block, which, n, u)
             scatter(term_block, which, n, terms)
             for j in range(n):
@@ -113,23 +115,20 @@ def _sense_of(own):
 
     def sense_rows(
         first, last, active, params, sensors, places, height_sign,
-        x, u, rows, streams, bias, targets, held, observations,
+        x, rows, streams, bias, targets, held, observations,
     ):  # fmt: skip
         """New readings of the active rows first..last-1. See fleet.Fleet for the arrays."""
         which = np.empty(WIDTH, np.int64)
         count = len(sensors)
-        x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
+        x_block, reading_block = np.empty((N_FULL, WIDTH)), np.empty((N_CHANNELS, WIDTH))
         target_block, held_block = np.empty((4, WIDTH)), np.empty((held.shape[1], WIDTH))
         bias_block, value_block = np.zeros((count, WIDTH)), np.empty((count, WIDTH))
-        reading_block, work_block = np.empty((N_CHANNELS, WIDTH)), np.empty((WORK_SIZE, WIDTH))
         stream_block, row_block = np.empty((2, WIDTH), np.uint64), np.empty((1, WIDTH))
-        x_, u_, target_, held_ = (
-            lanes_of(x_block), lanes_of(u_block), lanes_of(target_block), lanes_of(held_block)
-        )  # fmt: skip
+        x_, target_, held_ = lanes_of(x_block), lanes_of(target_block), lanes_of(held_block)
         bias_, values_, readings_ = (
             lanes_of(bias_block), lanes_of(value_block), lanes_of(reading_block)
         )  # fmt: skip
-        row_, work, stream_ = lanes_of(row_block), lanes_of(work_block), words_of(stream_block)
+        row_, stream_, work = lanes_of(row_block), words_of(stream_block), scratch(WORK_SIZE)
         if own:
             p_block = np.empty((_N_PARAMETERS, WIDTH))
             p = lanes_of(p_block)
@@ -142,7 +141,6 @@ def _sense_of(own):
         n, after = _next_group(first, last, active, which)
         while n > 0:
             gather(x, which, x_block)
-            gather(u, which, u_block)
             gather(held, which, held_block)
             gather(streams, which, stream_block)
             if biased:
@@ -151,7 +149,7 @@ def _sense_of(own):
                 gather(params, which, p_block)
             for j in range(WIDTH):
                 row_block[0, j] = rows[which[j]]
-            measure_bare(x_, u_, p, work, readings_)
+            measure_bare(x_, x_[N_STATES:], p, work, readings_)  # actuators are where they were sent
             seen(x_, readings_, sensors, values_)
             read(values_, row_[0], sensors, bias_, stream_, flags, held_)
             if len(places) > 0:
@@ -176,7 +174,7 @@ def _fly_of(own):
         first, last, active, actions, trim, scale, params, sensors, limits, gust,
         weights, scales, places, height_sign, course, box, dwell,
         x, u, rows, azimuth, streams, asked, bias, targets, progress, held,
-        observations, rewards, terms, over,
+        flown, observations, rewards, terms, over,
     ):  # fmt: skip
         """One control period of the active rows first..last-1. See fleet.Fleet for the arrays."""
         for start in range(first, last, CHUNK):
@@ -184,30 +182,29 @@ def _fly_of(own):
             if own:
                 _step_own(
                     start, end, active, actions, trim, scale, params, limits, gust, weights, scales,
-                    x, u, rows, azimuth, streams, asked, targets, rewards, terms, over,
+                    x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
                 )  # fmt: skip
             else:
                 _step_shared(
                     start, end, active, actions, trim, scale, params, limits, gust, weights, scales,
-                    x, u, rows, azimuth, streams, asked, targets, rewards, terms, over,
+                    x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
                 )  # fmt: skip
             for i in range(start, end):
                 if not active[i]:
-                    for k in range(held.shape[1]):
-                        observations[i, k] = held[i, k]
-                elif dwell > 0 and tasks.arrive(x[i], targets[i], dwell, progress[i], course):
+                    rest(i, x, held, flown, observations, rewards, terms, over)
+                elif dwell > 0 and tasks.arrive(flown[i], targets[i], dwell, progress[i], course):
                     terms[i, hover.N_TERMS] = weights[hover.N_TERMS]
                     rewards[i] += weights[hover.N_TERMS]
                     tasks.aim(streams[i], course, box, progress[i, tasks.REACHED], targets[i])
             if own:
                 _sense_own(
                     start, end, active, params, sensors, places, height_sign,
-                    x, u, rows, streams, bias, targets, held, observations,
+                    flown, rows, streams, bias, targets, held, observations,
                 )  # fmt: skip
             else:
                 _sense_shared(
                     start, end, active, params, sensors, places, height_sign,
-                    x, u, rows, streams, bias, targets, held, observations,
+                    flown, rows, streams, bias, targets, held, observations,
                 )  # fmt: skip
 
     return compiled()(fly)
@@ -221,13 +218,15 @@ fly_own = _fly_of(True)
 def _dynamics_rows(first, last, x, u, p):
     which, active = np.empty(WIDTH, np.int64), np.ones(len(x), np.bool_)
     x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
-    work_block = np.empty((WORK_SIZE, WIDTH))
-    x_, u_, work = lanes_of(x_block), lanes_of(u_block), lanes_of(work_block)
+    x_, u_ = lanes_of(x_block), lanes_of(u_block)
+    work, flown_ = scratch(WORK_SIZE), scratch(N_FULL)
     n, after = _next_group(first, last, active, which)
     while n > 0:
         gather(x, which, x_block)
         gather(u, which, u_block)
-        step_bare(x_, u_, DT, p, work, x_)
+        step_bare(x_, u_, DT, p, work, flown_)
+        for k in range(N_FULL):
+            x_[k] = flown_[k]
         scatter(x_block, which, n, x)
         n, after = _next_group(after, last, active, which)
 
