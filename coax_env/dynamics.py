@@ -240,6 +240,7 @@ def _rates_of(with_effects):
 
 
 _rates_with_effects = late(_rates_of(True))
+_rates_without = late(_rates_of(False))  # compiled once, not again within every caller
 _rates_bare = compiled(forceinline=True)(_rates_of(False))
 
 
@@ -250,7 +251,7 @@ def _rates(x, p, f, dx):
     if flown + p[effects.UNLISTED] != 0.0:
         _rates_with_effects(x, p, f, dx)
     else:
-        _rates_bare(x, p, f, dx)
+        _rates_without(x, p, f, dx)
 
 
 def _step_of(with_effects):

@@ -164,7 +164,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = action_space()
         self.observation_names = tuple(entry.name for entry in entries)
         self.observation_units = tuple(entry.unit for entry in entries)
-        self._terms = tuple(enumerate(self.fleet.task.terms))
+        self._terms = self.fleet.task.terms
         self._screen = _Screen(self.fleet, render_mode)
 
     def reset(
@@ -189,9 +189,8 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """One control period of 0.01 s."""
         outcome = self.fleet.fly(np.array(action, dtype=np.float64).reshape(1, 4), _ALL)
         self._screen.moved()
-        terms = outcome.terms[0].tolist()
         info = self._told()
-        info["reward_terms"] = {name: terms[k] for k, name in self._terms}
+        info["reward_terms"] = dict(zip(self._terms, outcome.terms[0].tolist(), strict=True))
         reward = float(outcome.rewards[0])
         return outcome.observations[0], reward, bool(outcome.over[0]), False, info
 
@@ -226,8 +225,9 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     - ``threads``: at most so many; default one per 256 rows and processor.
 
     Infos are those of `CoaxEnv` with a first axis of num_envs, and masks ``_NAME`` as Gymnasium has
-    them: ``info["state"]`` is (num_envs, 26), ``info["reward_terms"]`` and ``info["vehicle"]``
-    (where rows have started anew) are dicts of (num_envs,). ``render`` gives one picture per row.
+    them: ``info["state"]`` is (num_envs, 26) and read-only, ``info["reward_terms"]`` and
+    ``info["vehicle"]`` (where rows have started anew) are dicts of (num_envs,). ``render`` gives one
+    picture per row.
     """
 
     def __init__(

@@ -7,20 +7,23 @@ results are dropped.
 
 import numpy as np
 
-from coax_env import effects, hover, tasks
+from coax_env import effects, hover
 from coax_env import parameters as P
 from coax_env.actuators import limit
 from coax_env.dynamics import WORK_SIZE, measure_bare, step_bare
 from coax_env.errors import InputError
-from coax_env.fleet import STAGES, in_threads, rest
+from coax_env.fleet import STAGES, in_threads
 from coax_env.jit import compiled
 from coax_env.lanes import WIDTH, gather, lanes_of, scatter, scratch, select, words_of
 from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, N_STATES, TIME
-from coax_env.period import BIAS, BIAS_STD, DT, blow, command, read, seen, turned
+from coax_env.period import BIAS, BIAS_STD, DT, blow, command, read, rest, seen, turned
 from coax_env.vehicle import Vehicle
 
-CHUNK = 64
-"""Rows that are flown, and then sense: the code of either stays at hand for some groups."""
+CHUNK = 512
+"""Rows that are flown, and then sense: as many as the second-level cache can hold."""
+
+PHASES = 10
+"""Rows after which the shipped sensors' rates, 10 to 100 Hz, come round again."""
 
 _N_PARAMETERS = P.N_FIXED + len(effects.STAGES)
 _ROW, _AZIMUTH, _REWARD, _OVER = range(4)
@@ -39,6 +42,25 @@ def _next_group(i, last, active, which):
     for j in range(n, WIDTH):
         which[j] = which[0]
     return n, i
+
+
+@compiled()
+def _by_phase(first, last, active, rows, order):
+    """The active rows first..last-1 into `order`, those together whose sensors are due together; how
+    many they are. What no row of a group has due, none of them draws noise for.
+    """
+    places = np.zeros(PHASES + 1, np.int64)
+    for i in range(first, last):
+        if active[i]:
+            places[rows[i] % PHASES + 1] += 1
+    for phase in range(PHASES):
+        places[phase + 1] += places[phase]
+    for i in range(first, last):
+        if active[i]:
+            phase = rows[i] % PHASES
+            order[places[phase]] = i
+            places[phase] += 1
+    return places[PHASES]
 
 
 def _step_of(own):
@@ -114,21 +136,20 @@ def _sense_of(own):
     """Readings, for parameters of each row's own, or for one vehicle."""
 
     def sense_rows(
-        first, last, active, params, sensors, places, height_sign,
-        x, rows, streams, bias, targets, held, observations,
+        first, last, active, params, sensors, flags, x, rows, streams, bias, held, observations,
     ):  # fmt: skip
         """New readings of the active rows first..last-1. See fleet.Fleet for the arrays."""
-        which = np.empty(WIDTH, np.int64)
+        which, order = np.empty(WIDTH, np.int64), np.empty(last - first, np.int64)
         count = len(sensors)
         x_block, reading_block = np.empty((N_FULL, WIDTH)), np.empty((N_CHANNELS, WIDTH))
-        target_block, held_block = np.empty((4, WIDTH)), np.empty((held.shape[1], WIDTH))
+        held_block, row_block = np.empty((held.shape[1], WIDTH)), np.empty((1, WIDTH))
         bias_block, value_block = np.zeros((count, WIDTH)), np.empty((count, WIDTH))
-        stream_block, row_block = np.empty((2, WIDTH), np.uint64), np.empty((1, WIDTH))
-        x_, target_, held_ = lanes_of(x_block), lanes_of(target_block), lanes_of(held_block)
+        stream_block, work = np.empty((2, WIDTH), np.uint64), scratch(WORK_SIZE)
+        x_, held_, row_ = lanes_of(x_block), lanes_of(held_block), lanes_of(row_block)
         bias_, values_, readings_ = (
             lanes_of(bias_block), lanes_of(value_block), lanes_of(reading_block)
         )  # fmt: skip
-        row_, stream_, work = lanes_of(row_block), words_of(stream_block), scratch(WORK_SIZE)
+        stream_ = words_of(stream_block)
         if own:
             p_block = np.empty((_N_PARAMETERS, WIDTH))
             p = lanes_of(p_block)
@@ -137,9 +158,11 @@ def _sense_of(own):
         biased = False
         for k in range(count):
             biased = biased or sensors[k, BIAS] != 0.0 or sensors[k, BIAS_STD] != 0.0
-        flags = len(held_) - len(places) - count
-        n, after = _next_group(first, last, active, which)
-        while n > 0:
+        active_rows = _by_phase(first, last, active, rows, order)
+        for at in range(0, active_rows, WIDTH):
+            n = min(WIDTH, active_rows - at)
+            for j in range(WIDTH):
+                which[j] = order[at + j if j < n else at]
             gather(x, which, x_block)
             gather(held, which, held_block)
             gather(streams, which, stream_block)
@@ -149,16 +172,13 @@ def _sense_of(own):
                 gather(params, which, p_block)
             for j in range(WIDTH):
                 row_block[0, j] = rows[which[j]]
-            measure_bare(x_, x_[N_STATES:], p, work, readings_)  # actuators are where they were sent
+            # without effects the actuators are where they were sent, and time has no part
+            measure_bare(x_, x_[N_STATES:], p, work, readings_)
             seen(x_, readings_, sensors, values_)
             read(values_, row_[0], sensors, bias_, stream_, flags, held_)
-            if len(places) > 0:
-                gather(targets, which, target_block)
-                tasks.point(held_, places, height_sign, target_, held_[count + flags :])
             scatter(held_block, which, n, held)
             scatter(held_block, which, n, observations)
             scatter(stream_block, which, n, streams)
-            n, after = _next_group(after, last, active, which)
 
     return compiled()(sense_rows)
 
@@ -171,10 +191,9 @@ def _fly_of(own):
     """The batch kernel for parameters of each row's own, or for one vehicle."""
 
     def fly(
-        first, last, active, actions, trim, scale, params, sensors, limits, gust,
-        weights, scales, places, height_sign, course, box, dwell,
-        x, u, rows, azimuth, streams, asked, bias, targets, progress, held,
-        flown, observations, rewards, terms, over,
+        first, last, active, actions, trim, scale, params, sensors, limits, gust, flags,
+        weights, scales, x, u, rows, azimuth, streams, asked, bias, targets, held, flown,
+        observations, rewards, terms, over,
     ):  # fmt: skip
         """One control period of the active rows first..last-1. See fleet.Fleet for the arrays."""
         for start in range(first, last, CHUNK):
@@ -191,20 +210,21 @@ def _fly_of(own):
                 )  # fmt: skip
             for i in range(start, end):
                 if not active[i]:
-                    rest(i, x, held, flown, observations, rewards, terms, over)
-                elif dwell > 0 and tasks.arrive(flown[i], targets[i], dwell, progress[i], course):
-                    terms[i, hover.N_TERMS] = weights[hover.N_TERMS]
-                    rewards[i] += weights[hover.N_TERMS]
-                    tasks.aim(streams[i], course, box, progress[i, tasks.REACHED], targets[i])
+                    rest(x[i], flown[i])
+                    rest(held[i], observations[i])
+                    for k in range(terms.shape[1]):
+                        terms[i, k] = 0.0
+                    rewards[i] = 0.0
+                    over[i] = False
             if own:
                 _sense_own(
-                    start, end, active, params, sensors, places, height_sign,
-                    flown, rows, streams, bias, targets, held, observations,
+                    start, end, active, params, sensors, flags, flown, rows, streams, bias, held,
+                    observations,
                 )  # fmt: skip
             else:
                 _sense_shared(
-                    start, end, active, params, sensors, places, height_sign,
-                    flown, rows, streams, bias, targets, held, observations,
+                    start, end, active, params, sensors, flags, flown, rows, streams, bias, held,
+                    observations,
                 )  # fmt: skip
 
     return compiled()(fly)
