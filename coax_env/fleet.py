@@ -403,14 +403,14 @@ class Fleet:
             self.past, self.eddies, self.breeze, self.targets, self.progress, self.held,
             observations,
         )  # fmt: skip
-        self._point(first, last, which, observations)
+        if self.task.aims:
+            self._point(first, last, which, observations)
 
     def _point(self, first: int, last: int, which: np.ndarray, observations: np.ndarray) -> None:
-        if self.task.aims:
-            _point_rows(
-                first, last, which, self._places, self._height_sign, self.targets, self.held,
-                observations,
-            )  # fmt: skip
+        _point_rows(
+            first, last, which, self._places, self._height_sign, self.targets, self.held,
+            observations,
+        )  # fmt: skip
 
     def fly(
         self, actions: np.ndarray, active: np.ndarray, anew: np.ndarray | None = None
@@ -430,67 +430,60 @@ class Fleet:
         )
         if anew is not None:
             self._draw(anew)
-        fly = self._lanes(actions, active, outcome) or self._one_by_one(actions, active, outcome)
+        side_by_side = self._fit_for_lanes and not self._switched_on
+        before = self.x
+        self.x = np.empty_like(before) if side_by_side else before.copy()
 
         def rows(first: int, last: int) -> None:
-            fly(first, last)
+            if side_by_side:
+                self._fly_lanes(first, last, actions, active, before, outcome)
+            else:
+                self._fly_one_by_one(first, last, actions, active, outcome)
             if self._dwell:
                 _arrive_rows(
                     first, last, active, self._weights, self._course, self._box, self._dwell,
                     self.x, self.streams, self.targets, self.progress, outcome.rewards,
                     outcome.terms,
                 )  # fmt: skip
-            self._point(first, last, active, outcome.observations)
+            if self.task.aims:
+                self._point(first, last, active, outcome.observations)
             if anew is not None:
                 self._start(first, last, anew, False, outcome.observations)
 
         in_threads(rows, n, self._threads)
         return outcome
 
-    def _one_by_one(
-        self, actions: np.ndarray, active: np.ndarray, outcome: Outcome
-    ) -> Callable[[int, int], None]:
-        """What flies the rows first..last-1, one after the other."""
-        self.x = self.x.copy()
-
-        def fly(first: int, last: int) -> None:
-            if self._disturbed:
-                _disturb_rows(
-                    first, last, active, self.params, self._gust, self._turbulence,
-                    self.x, self.streams, self.eddies, self.breeze,
-                )  # fmt: skip
-            _fly_rows(
-                first, last, active, actions, self.trim, self.scale, self.params, self.kinds,
-                self._table, self._limits, len(self.flags), self._weights, self._scales,
-                self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked,
-                self.bias, self.past, self.targets, self.held,
-                outcome.observations, outcome.rewards, outcome.terms, outcome.over,
+    def _fly_one_by_one(
+        self, first: int, last: int, actions: np.ndarray, active: np.ndarray, outcome: Outcome
+    ) -> None:
+        if self._disturbed:
+            _disturb_rows(
+                first, last, active, self.params, self._gust, self._turbulence,
+                self.x, self.streams, self.eddies, self.breeze,
             )  # fmt: skip
+        _fly_rows(
+            first, last, active, actions, self.trim, self.scale, self.params, self.kinds,
+            self._table, self._limits, len(self.flags), self._weights, self._scales,
+            self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked,
+            self.bias, self.past, self.targets, self.held,
+            outcome.observations, outcome.rewards, outcome.terms, outcome.over,
+        )  # fmt: skip
 
-        return fly
-
-    def _lanes(
-        self, actions: np.ndarray, active: np.ndarray, outcome: Outcome
-    ) -> Callable[[int, int], None] | None:
-        """What flies the rows first..last-1 side by side; None where they cannot be."""
-        if self._switched_on or not self._fit_for_lanes:
-            return None
+    def _fly_lanes(
+        self, first: int, last: int, actions: np.ndarray, active: np.ndarray, before: np.ndarray,
+        outcome: Outcome,
+    ) -> None:  # fmt: skip
         from coax_env import fleet_lanes  # compiled where it is flown only
 
-        kernel = fleet_lanes.fly_own if len(self.params) > 1 else fleet_lanes.fly_shared
-        before, self.x = self.x, np.empty_like(self.x)
-
-        def fly(first: int, last: int) -> None:
-            kernel(
-                first, last, active, actions, self.trim, self.scale, self.params,
-                self._table[0], self._limits[0], self._gust, len(self.flags),
-                self._weights, self._scales,
-                before, self.u, self.rows, self.azimuth, self.streams, self.asked, self.bias,
-                self.targets, self.held, self.x,
-                outcome.observations, outcome.rewards, outcome.terms, outcome.over,
-            )  # fmt: skip
-
-        return fly
+        fly = fleet_lanes.fly_own if len(self.params) > 1 else fleet_lanes.fly_shared
+        fly(
+            first, last, active, actions, self.trim, self.scale, self.params,
+            self._table[0], self._limits[0], self._gust, len(self.flags),
+            self._weights, self._scales,
+            before, self.u, self.rows, self.azimuth, self.streams, self.asked, self.bias,
+            self.targets, self.held, self.x,
+            outcome.observations, outcome.rewards, outcome.terms, outcome.over,
+        )  # fmt: skip
 
     @property
     def air(self) -> np.ndarray:
