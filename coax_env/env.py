@@ -188,11 +188,13 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One control period of 0.01 s."""
         outcome = self.fleet.fly(np.array(action, dtype=np.float64).reshape(1, 4), _ALL)
-        self._screen.moved()
+        if self.render_mode is not None:
+            self._screen.moved()
         info = self._told()
-        info["reward_terms"] = dict(zip(self._terms, outcome.terms[0].tolist(), strict=True))
-        reward = float(outcome.rewards[0])
-        return outcome.observations[0], reward, bool(outcome.over[0]), False, info
+        terms = outcome.terms.tolist()[0]
+        info["reward_terms"] = dict(zip(self._terms, terms))  # noqa: B905 - strict is slow
+        reward, over = outcome.rewards.item(), outcome.over.item()
+        return outcome.observations[0], reward, over, False, info
 
     def render(self) -> np.ndarray | None:
         """The picture (540, 960, 3), uint8, in mode ``rgb_array``; ``human`` shows it, every 40 ms."""
