@@ -59,8 +59,7 @@ def listen(search: Search, state: State) -> bool:
     passes = _passes(search.engine, state)
     if not is_white(passes, search.model.channels):
         return False
-    _attach(search.engine, passes)
-    gains = _gains(passes, [r.news for r in search.engine.records])
+    gains = _gains(passes, _attach(search.engine, passes))
     search.loosen(gains)
     trial = replace(state, values={**dict.fromkeys(P.COMMAND_GAINS, 0.0), **state.values})
     trial = search.settle(trial)
@@ -84,9 +83,11 @@ def _passes(engine: Engine, state: State) -> list[RunPass]:
     return engine.filter(state.values, state.noise, start_rows=rows)
 
 
-def _attach(engine: Engine, passes: Sequence[RunPass]) -> None:
-    for i, news in enumerate(_news(passes)):
+def _attach(engine: Engine, passes: Sequence[RunPass]) -> list[np.ndarray]:
+    found = _news(passes)
+    for i, news in enumerate(found):
         engine.records[i] = replace(engine.records[i], news=news)
+    return found
 
 
 def _news(passes: Sequence[RunPass]) -> list[np.ndarray]:
@@ -135,11 +136,11 @@ def surprise(known: np.ndarray, change: np.ndarray) -> np.ndarray:
     return result
 
 
-def _gains(passes: Sequence[RunPass], news: Sequence[np.ndarray | None]) -> list[FreeParameter]:
+def _gains(passes: Sequence[RunPass], news: Sequence[np.ndarray]) -> list[FreeParameter]:
     """The gains with their priors: std of the filter's error over that of the news."""
     variances = [np.einsum("sii->si", run.start_covariances) for run in passes]
     unknown = np.sqrt(np.vstack(variances).mean(axis=0))
-    spread = np.vstack([part for part in news if part is not None])
+    spread = np.vstack(news)
     found = []
     for name, corrected, taken in zip(P.COMMAND_GAINS, _CORRECTED, _TAKEN, strict=True):
         std = float(np.sqrt(np.mean((spread @ taken.T) ** 2)))

@@ -36,11 +36,11 @@ def template(dark: bool = False) -> dict[str, Any]:
     ink, grid = ("#d7dbe0", "#353b43") if dark else ("#2b3036", "#e3e6ea")
     axis = {
         "gridcolor": grid, "zerolinecolor": grid, "linecolor": grid, "automargin": True,
-        "ticks": "", "title": {"standoff": 6, "font": {"size": 12}}, "zerolinewidth": 1.5,
+        "ticks": "", "title": {"standoff": 6, "font": {"size": 14}}, "zerolinewidth": 1.5,
     }  # fmt: skip
     return {
         "layout": {
-            "font": {"family": "system-ui, sans-serif", "size": 12, "color": ink},
+            "font": {"family": "system-ui, sans-serif", "size": 14, "color": ink},
             "paper_bgcolor": "rgba(0,0,0,0)",
             "plot_bgcolor": "rgba(0,0,0,0)",
             "colorway": list(WHEEL),
@@ -61,7 +61,7 @@ def _figure(data: list[dict[str, Any]], height: int, **layout: Any) -> Figure:
     return {"data": data, "layout": {"height": height, "autosize": True, **layout}}
 
 
-def _numbers(values: Any) -> Any:
+def numbers(values: Any) -> Any:
     """Numbers as plotly's typed arrays in single precision: small, and more than a screen shows."""
     array = np.ascontiguousarray(values, "<f4")
     return {"dtype": "f4", "bdata": base64.b64encode(array.tobytes()).decode()}
@@ -70,8 +70,8 @@ def _numbers(values: Any) -> Any:
 def _curve(x: Any, y: Any, name: str, colour: str, row: int = 1, **more: Any) -> dict[str, Any]:
     every = max(1, math.ceil(len(x) / MOST_POINTS))
     trace = {
-        "type": "scatter", "mode": "lines", "x": _numbers(np.asarray(x)[::every]),
-        "y": _numbers(np.asarray(y)[::every]), "name": name, "legendgroup": name,
+        "type": "scatter", "mode": "lines", "x": numbers(np.asarray(x)[::every]),
+        "y": numbers(np.asarray(y)[::every]), "name": name, "legendgroup": name,
         "hovertemplate": "%{y:.3~g}", **_axes(row),
     }  # fmt: skip
     if more.get("mode") == "markers":
@@ -181,13 +181,13 @@ def plan_view(north: np.ndarray, east: np.ndarray, height: np.ndarray) -> Figure
     every = max(1, math.ceil(len(north) / MOST_POINTS))
     north, east, height = (a[::every] for a in (north, east, height))
     track = {
-        "type": "scatter", "mode": "lines+markers", "x": _numbers(east), "y": _numbers(north),
+        "type": "scatter", "mode": "lines+markers", "x": numbers(east), "y": numbers(north),
         "line": {"color": MEASURED, "width": 1},
         "marker": {
-            "size": 4, "color": _numbers(height), "colorscale": "Viridis", "showscale": True,
+            "size": 4, "color": numbers(height), "colorscale": "Viridis", "showscale": True,
             "colorbar": {"title": {"text": "h [m]"}, "thickness": 12},
         },
-        "customdata": _numbers(height),
+        "customdata": numbers(height),
         "hovertemplate": "E %{x:.2f} m, N %{y:.2f} m, h %{customdata:.2f} m<extra></extra>",
     }  # fmt: skip
     return _figure(
@@ -238,7 +238,7 @@ def prediction(
 
 
 def gain_bars(channels: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Prediction error per channel in per cent of *before*: refitted, after with interval, noise.
+    """Prediction error per channel in per cent of the bare model's: refitted, extended, noise.
 
     Args:
         channels: findings.json's ``gain.channels``.
@@ -264,32 +264,35 @@ def gain_bars(channels: Mapping[str, Mapping[str, Any]]) -> Figure:
         low.append(0.0 if middle is None or ends[0] is None else max(middle - ends[0], 0.0))
         high.append(0.0 if middle is None or ends[1] is None else max(ends[1] - middle, 0.0))
     whisker = {
-        "type": "data", "symmetric": False, "array": high, "arrayminus": low, "color": MEASURED,
-        "thickness": 1.6, "width": 4,
+        "type": "data", "symmetric": False, "array": high, "arrayminus": low, "color": AFTER,
+        "thickness": 2, "width": 4,
     }  # fmt: skip
+    dot = {"type": "scatter", "mode": "markers"}
+    upright = {"symbol": "line-ns", "size": 20}
     data = [
-        trace("before", "before", marker={"color": BEFORE, "opacity": 0.3}, **bar),
-        trace("after", "after", marker={"color": AFTER}, width=0.5, error_x=whisker, **bar),
-        trace(
-            "before_refitted", "bare model refitted", type="scatter", mode="markers",
-            marker={"color": REFITTED, "symbol": "diamond", "size": 10},
-        ),
-        trace(
-            "noise", "sensor noise", type="scatter", mode="markers",
-            marker={"symbol": "line-ns", "size": 18, "color": NOISE,
-                    "line": {"color": NOISE, "width": 3}},
-        ),
+        trace("noise", "sensor noise, out of reach", marker={"color": NOISE, "opacity": 0.3}, **bar),
+        {
+            "y": labels, "x": [None if a is None else 100.0 - a for a in after], "base": after,
+            "width": 0.28, "name": "removed", "marker": {"color": AFTER, "opacity": 0.3},
+            "hoverinfo": "skip", "showlegend": False, **bar,
+        },
+        trace("before", "bare", marker={
+            **upright, "color": BEFORE, "line": {"color": BEFORE, "width": 4}}, **dot),
+        trace("before_refitted", "bare, refitted", marker={
+            "color": REFITTED, "symbol": "diamond", "size": 9}, **dot),
+        trace("after", "extended", marker={"color": AFTER, "size": 11}, error_x=whisker, **dot),
     ]  # fmt: skip
-    top = max([100.0, *(x for x in share("before_refitted") + after if x is not None)])
+    reach = [a + h for a, h in zip(after, high, strict=True) if a is not None]
+    top = max([100.0, *reach, *(x for x in share("before_refitted") if x is not None)])
     return _figure(
         data,
-        90 + 34 * max(len(names), 2),
+        110 + 34 * max(len(names), 2),
         barmode="overlay",
         bargap=0.35,
         hovermode="closest",
         xaxis={
-            "title": {"text": "prediction error, % of before"},
-            "range": [0, min(1.08 * top, 400)],
+            "title": {"text": "error, % of the bare model's"},
+            "range": [0, min(1.05 * top, 400)],
         },
         yaxis={"ticklabelstandoff": 6},
     )

@@ -52,14 +52,14 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise InputError(f"{path}: not valid TOML: {error}") from error
 
 
-def write_text(path: str | Path, text: str) -> Path:
-    """Write a text file whole or not at all; missing folders are made."""
+def write_bytes(path: str | Path, content: bytes) -> Path:
+    """Write a file whole or not at all; missing folders are made."""
     path = Path(path)
     make_folder(path.parent)
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
     except OSError as error:
@@ -67,6 +67,11 @@ def write_text(path: str | Path, text: str) -> Path:
     finally:
         Path(temporary).unlink(missing_ok=True)
     return path
+
+
+def write_text(path: str | Path, text: str) -> Path:
+    """Write a text file in UTF-8, as `write_bytes`."""
+    return write_bytes(path, text.encode("utf-8"))
 
 
 def write_json(path: str | Path, content: Any) -> Path:

@@ -97,6 +97,7 @@ class Flight:
 
     @property
     def run_names(self) -> tuple[str, ...]:
+        """Names of the runs, in the card's order."""
         return tuple(run.name for run in self.runs)
 
     @property

@@ -175,7 +175,8 @@ def check_flight(
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     label = str(flight.vehicle if vehicle is None else getattr(vehicle, "name", vehicle))
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
-    channels = tuple(_channel(flight, c) for c in flight.channels)
+    rates = logged_rates(flight)
+    channels = tuple(_channel(flight, c, rates[c]) for c in flight.channels)
     suspicions = [*_suspicions(flight, vehicle), *_sick(channels)]
     say("linearising along the records")
     shown, own, undetermined, directions, doubted = _learnable(flight, vehicle)
@@ -214,7 +215,7 @@ def _run(run: Run) -> RunCheck:
     )  # fmt: skip
 
 
-def _channel(flight: Flight, channel: str) -> ChannelCheck:
+def _channel(flight: Flight, channel: str, rate: float) -> ChannelCheck:
     runs = [run for run in flight.runs if channel in run.measured]
     std = sensor_std(flight, channel)
     gap = frozen = 0.0
@@ -231,7 +232,7 @@ def _channel(flight: Flight, channel: str) -> ChannelCheck:
             gap = max(gap, run.duration)
     y = np.concatenate(everything) if everything else np.empty(0)
     return ChannelCheck(
-        channel, CHANNEL_UNITS[channel], len(runs), logged_rates(flight)[channel], std, gap,
+        channel, CHANNEL_UNITS[channel], len(runs), rate, std, gap,
         frozen if frozen > FROZEN and std > 0.0 else 0.0, _saturated(y),
     )  # fmt: skip
 
@@ -447,15 +448,9 @@ def _usual(search: Search, effect: str) -> np.ndarray:
     return np.array([f.std for f in search.by_effect[effect] if f.name in names])
 
 
-def _beside(search: Search, *active: str) -> list[str]:
-    """Base parameters that stay loose beside these effects."""
-    replaced = {b for e in active for b in effects.CATALOGUE[e].replaces}
-    return [f.name for f in search.base if f.name not in replaced]
-
-
 def _nats(search: Search, quadratic: Quadratic, effect: str) -> float:
     """Evidence expected of an effect, every parameter at its usual size, Occam factor deducted."""
-    own, rest = search.candidate_names(effect), _beside(search, effect)
+    own, rest = search.candidate_names(effect), search.base_names([effect])
     information, _ = quadratic.projected(own, rest)
     worth = 0.5 * float(_usual(search, effect) ** 2 @ np.diag(information))
     return worth - quadratic.occam(own, rest)
@@ -465,7 +460,7 @@ def _stds(search: Search, quadratic: Quadratic, effect: str) -> list[float]:
     """Std expected of an effect's parameters, no prior on them; infinite where nothing is told."""
     own = search.candidate_names(effect)
     usual = _usual(search, effect)
-    information, _ = quadratic.projected(own, _beside(search, effect))
+    information, _ = quadratic.projected(own, search.base_names([effect]))
     shares, vectors = np.linalg.eigh(information * np.outer(usual, usual))
     told = shares > NOTHING
     variance = vectors[:, told] ** 2 @ (1.0 / shares[told])
@@ -478,7 +473,7 @@ def _ties(search: Search, quadratic: Quadratic, shown: Sequence[str]) -> dict[st
     usual = {e: _usual(search, e) for e in shown}
 
     def left(truth: str, other: str) -> float:
-        rest = _beside(search, truth, other) + search.candidate_names(other)
+        rest = search.base_names([truth, other]) + search.candidate_names(other)
         information, _ = quadratic.projected(search.candidate_names(truth), rest)
         return 0.5 * float(usual[truth] ** 2 @ np.diag(information))
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from coax_env.jit import compiled
 from coax_env.lanes import negated, select
-from coax_env.layout import N_FULL
+from coax_env.layout import N_FULL, PLACE, RATE, VELOCITY
 from coax_env.random_streams import uniform
 
 HEIGHT = 1.5  # [m] of the centre of gravity above ground
@@ -140,6 +140,27 @@ def is_over(x):
     return negated(inside)  # a comparison with NaN is false
 
 
+def squared_errors(states: np.ndarray, targets: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Squares of the errors that LIMITS names, but for the effort, of every state; SI.
+
+    Args:
+        states: full or paper states, shape (..., >=16).
+        targets: x y z psi, shape (..., 4); None: hover's.
+
+    Returns:
+        height, position (horizontal), speed, heading, rates: each of shape (...).
+    """
+    goal = np.array([0.0, 0.0, -HEIGHT, 0.0]) if targets is None else targets
+    heading = (states[..., 12] - goal[..., 3] + math.pi) % (2.0 * math.pi) - math.pi
+    return {
+        "height": (states[..., 15] - goal[..., 2]) ** 2,
+        "position": ((states[..., PLACE] - goal[..., 0:2]) ** 2).sum(-1),
+        "speed": (states[..., VELOCITY] ** 2).sum(-1),
+        "heading": heading**2,
+        "rates": (states[..., RATE] ** 2).sum(-1),
+    }
+
+
 def cost(states: np.ndarray, actions: np.ndarray, targets: np.ndarray | None = None) -> np.ndarray:
     """Quadratic cost of every step: COST_WEIGHTS times the squared errors in units of LIMITS.
 
@@ -150,17 +171,6 @@ def cost(states: np.ndarray, actions: np.ndarray, targets: np.ndarray | None = N
     Returns:
         shape (...).
     """
-    goal = np.array([0.0, 0.0, -HEIGHT, 0.0]) if targets is None else targets
-    heading = (states[..., 12] - goal[..., 3] + math.pi) % (2.0 * math.pi) - math.pi
-    squares = np.stack(
-        [
-            (states[..., 15] - goal[..., 2]) ** 2,
-            ((states[..., 13:15] - goal[..., 0:2]) ** 2).sum(-1),
-            (states[..., 0:3] ** 2).sum(-1),
-            heading**2,
-            (states[..., 3:6] ** 2).sum(-1),
-            (np.asarray(actions) ** 2).sum(-1),
-        ],
-        axis=-1,
-    )
+    errors = squared_errors(states, targets) | {"effort": (np.asarray(actions) ** 2).sum(-1)}
+    squares = np.stack([errors[name] for name in LIMITS], axis=-1)
     return squares @ (_COST_WEIGHTS / _LIMITS**2)

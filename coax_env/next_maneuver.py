@@ -27,7 +27,7 @@ from coax_env.errors import InputError
 from coax_env.files import write_text
 from coax_env.flight import Flight, Run, write_flight
 from coax_env.heli_model import HeliModel
-from coax_env.layout import CHANNELS, RPM_PER_RAD_S
+from coax_env.layout import CHANNELS, RPM_PER_RAD_S, VELOCITY
 from coax_env.maneuvers import (
     ASKED,
     DEGREE,
@@ -71,7 +71,7 @@ class Envelope:
         height = -flown["z"]
         tilt = np.maximum(abs(flown["phi"]), abs(flown["theta"])).max()
         turning = abs(flown["r"]).max()
-        speed = np.linalg.norm(flown.state[:, 0:3], axis=1).max()
+        speed = np.linalg.norm(flown.state[:, VELOCITY], axis=1).max()
         away = np.hypot(flown["x"] - flown["x"][0], flown["y"] - flown["y"][0]).max()
         if flown.ended:
             return flown.ended

@@ -34,17 +34,6 @@ BASE = {
 }
 """Name and unit of the numbers every vehicle file must have."""
 
-PAPER_SYMBOLS = {
-    "arm_upper": "d_u", "arm_lower": "d_l",
-    "inertia_xx": "I_xx", "inertia_yy": "I_yy", "inertia_zz": "I_zz",
-    "rotor_inertia_upper": "J_u", "rotor_inertia_lower": "J_l", "flybar_inertia": "J_f",
-    "thrust_coefficient_upper": "C_Tu", "thrust_coefficient_lower": "C_Tl",
-    "torque_coefficient_upper": "C_Qu", "torque_coefficient_lower": "C_Ql",
-    "flap_time_constant": "tau_fl", "flybar_time_constant": "tau_ff",
-    "swash_to_flap": "K_b", "flybar_to_rotor_lon": "K_q", "flybar_to_rotor_lat": "K_p",
-    "flap_coupling_lon": "A_beta", "flap_coupling_lat": "B_alpha",
-}  # fmt: skip
-
 (
     MASS, GRAVITY, AIR_DENSITY, ROTOR_RADIUS,
     FUSELAGE_LENGTH, FUSELAGE_WIDTH, FUSELAGE_DRAG,

@@ -10,7 +10,8 @@ import math
 import numpy as np
 
 from coax_env.dynamics import derivative, hover_trim
-from coax_env.layout import N_COMMANDS, N_STATES
+from coax_env.layout import N_COMMANDS, N_STATES, PLACE
+from coax_env.linear import slopes
 from coax_env.vehicle import Vehicle
 
 TREMOR_MEMORY = 0.2  # [s]
@@ -23,7 +24,6 @@ _TOLERATED = np.array(
 )
 """Deviation of each state that costs as much as one unit of effort."""
 _EFFORT = np.array([0.04, 0.04, 0.08, 0.08])  # rotor speeds as a fraction of trim; rad
-
 
 CORNER = 1.0  # [s] over which the pilot rounds the corners of what he is asked for
 
@@ -68,7 +68,7 @@ class Pilot:
         error[5] -= asked_rate[3]
         error[12] = math.remainder(state[12] - self.trim_state[12] - asked[3], 2.0 * math.pi)
         error[15] = state[15] + asked[0]
-        error[13:15] = 0.0
+        error[PLACE] = 0.0
         error = np.clip(error, -_REACH, _REACH)
         correction = -self.gain @ error
         if self.tremor:
@@ -86,18 +86,10 @@ def _gain(vehicle: Vehicle, state: np.ndarray, command: np.ndarray) -> np.ndarra
     """Linear-quadratic gain (4, 16) about a trim, from differences of the one kernel."""
     from scipy.linalg import solve_continuous_are
 
-    size = 1e-4
-    point = np.concatenate([state, command])
-    columns = []
-    for i in range(N_STATES + N_COMMANDS):
-        step = np.zeros(len(point))
-        step[i] = size
-        ahead, behind = point + step, point - step
-        columns.append(
-            derivative(ahead[:N_STATES], ahead[N_STATES:], vehicle)
-            - derivative(behind[:N_STATES], behind[N_STATES:], vehicle)
-        )
-    jacobian = np.column_stack(columns) / (2.0 * size)
+    jacobian = slopes(
+        lambda point: derivative(point[:N_STATES], point[N_STATES:], vehicle),
+        np.concatenate([state, command]), np.ones(N_STATES + N_COMMANDS),
+    )  # fmt: skip
     A = jacobian[np.ix_(_HELD, _HELD)]
     B = jacobian[_HELD, N_STATES:]
     effort = _EFFORT * [command[0], command[1], 1.0, 1.0]

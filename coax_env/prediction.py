@@ -19,7 +19,7 @@ from coax_env.engine.model import Noise
 from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight
 from coax_env.heli_model import GUST_LEVELS, HeliModel, record_of, sensor_std, starting_noise
-from coax_env.layout import CHANNEL_UNITS, CHANNELS, N_FULL
+from coax_env.layout import CHANNEL_UNITS, CHANNELS, GUSTS, N_FULL
 from coax_env.vehicle import Vehicle, load_vehicle
 
 HEADING = CHANNELS.index("psi")
@@ -84,7 +84,7 @@ def fly_again(
             targets = _targets(present, record.t, last, used)
             for gust, out in ((0.0, predicted), (1.0, decaying)):
                 x = run.states[first].copy()
-                x[20:26] *= gust
+                x[GUSTS] *= gust
                 ok = kalman.fly_open_loop(
                     engine.model.step, engine.model.measure, dt, run.inputs, x, p,
                     engine.model.work_size, first, targets, out[s],
@@ -172,7 +172,7 @@ def _spread(
     moved = np.full(len(CHANNELS), np.nan)
     S = np.zeros((len(CHANNELS), N_FULL))
     x0 = run.states[first].copy()
-    x0[20:26] = 0.0
+    x0[GUSTS] = 0.0
 
     def fly(x: np.ndarray, out: np.ndarray) -> None:
         kalman.fly_open_loop(

@@ -16,7 +16,7 @@ import numpy as np
 from coax_env import parameters as P
 from coax_env.errors import InputError, require
 from coax_env.fleet import DT
-from coax_env.layout import RPM_PER_RAD_S
+from coax_env.layout import ATTITUDE, PLACE, POSITION, RPM_PER_RAD_S, VELOCITY
 from coax_env.scene import (
     LOWER,
     PICTURE,
@@ -131,7 +131,7 @@ class Renderer:
                 self._line(_GRID, camera.seen_line(*ends), 1)
 
     def _paths(self, camera: "Camera", view: View) -> None:
-        x, y, z = view.state[13:16]
+        x, y, z = view.state[POSITION]
         self._blob(_SHADOW, camera, (x, y, 0.0), 0.22)
         self._line(_SHADOW, camera.seen_line((x, y, 0.0), (x, y, z)), 1)
         in_front = camera.depth(view.trace) > camera.near
@@ -156,7 +156,7 @@ class Renderer:
 
     def _helicopter(self, camera: "Camera", view: View) -> None:
         p, x = view.params, view.state
-        turn, centre = body_to_world(x[10:13]), x[13:16]
+        turn, centre = body_to_world(x[ATTITUDE]), x[POSITION]
 
         def place(points: Any) -> list[tuple[float, float]]:
             return camera.seen(centre + np.atleast_2d(points) @ turn.T)
@@ -237,7 +237,7 @@ class Renderer:
         self._polyline(_TRACE, [spot(*point) for point in view.trace[:, :2]], 2)
         if view.target is not None:
             self._heading_mark(_TARGET, spot(*view.target[:2]), view.target[3], 9.0)
-        self._heading_mark(_BODY, spot(*view.state[13:15]), view.state[12], 12.0)
+        self._heading_mark(_BODY, spot(*view.state[PLACE]), view.state[12], 12.0)
         north, east = view.air[:2]
         speed = math.hypot(north, east)
         if speed >= 0.05:
@@ -270,7 +270,7 @@ class Renderer:
 
     def _numbers(self, view: View) -> None:
         x = view.state
-        speed = float(np.linalg.norm(x[0:3]))
+        speed = float(np.linalg.norm(x[VELOCITY]))
         lines = [
             ("t", f"{view.seconds:.2f} s", "height", f"{-x[15]:.2f} m"),
             ("speed", f"{speed:.2f} m/s", "heading", f"{round(math.degrees(_wrapped(x[12])))}°"),
@@ -292,7 +292,7 @@ class Renderer:
             self._write(two, 848, y, 26, _INK)
         words = f"task: {view.task}"
         if view.target is not None:
-            gap = x[13:16] - view.target[:3]
+            gap = x[POSITION] - view.target[:3]
             words += f"   to the target {float(np.linalg.norm(gap)):.2f} m"
         self._write(words, 644, 516, 18, _TARGET)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from coax_env import parameters as P
 from coax_env.fleet import DT, Fleet
+from coax_env.layout import POSITION
 from coax_env.tasks import TASKS
 
 PICTURE = (960, 540)  # [px] width and height of a picture
@@ -47,7 +48,7 @@ class Traces:
         rows = self._fleet.rows
         self._kept[rows == 0] = 0
         due = np.flatnonzero(rows % _TRACE_EVERY == 0)
-        self._points[due, self._kept[due] % _TRACE_LENGTH] = self._fleet.x[due, 13:16]
+        self._points[due, self._kept[due] % _TRACE_LENGTH] = self._fleet.x[due, POSITION]
         self._kept[due] += 1
 
     def view(self, row: int) -> View:
@@ -62,7 +63,7 @@ class Traces:
             azimuth=float(fleet.azimuth[row]),
             seconds=float(fleet.rows[row] * DT),
             task=next(name for name, task in TASKS.items() if task is fleet.task),
-            trace=np.vstack([np.nan_to_num(self._points[row, order]), state[13:16]]),
+            trace=np.vstack([np.nan_to_num(self._points[row, order]), state[POSITION]]),
             target=fleet.targets[row].copy(),
         )
 
@@ -75,7 +76,7 @@ class Camera:
     near = 0.2  # [m]
 
     def __init__(self, view: View) -> None:
-        self.place = view.state[13:16]
+        self.place = view.state[POSITION]
         away = np.array([-0.80, 0.52, -0.20])
         self.eye = self.place + self.distance * away / np.linalg.norm(away)
         self.forward = (self.place - self.eye) / self.distance

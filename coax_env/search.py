@@ -246,11 +246,14 @@ class Search:
 
     # --- which parameters are loose -----------------------------------------------------------------
 
-    def free_names(self, active: Collection[str]) -> list[str]:
-        """Base parameters that no active effect replaces, and the active effects' own."""
+    def base_names(self, active: Collection[str]) -> list[str]:
+        """Base parameters that no active effect replaces."""
         replaced = {b for e in active for b in effects.CATALOGUE[e].replaces}
-        names = [f.name for f in self.base if f.name not in replaced]
-        return names + [f.name for e in active for f in self.by_effect[e]]
+        return [f.name for f in self.base if f.name not in replaced]
+
+    def free_names(self, active: Collection[str]) -> list[str]:
+        """Those, and the active effects' own."""
+        return self.base_names(active) + [f.name for e in active for f in self.by_effect[e]]
 
     def candidate_names(self, effect: str) -> list[str]:
         """An effect's parameters that act as soon as it does (no shapes)."""

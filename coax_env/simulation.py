@@ -17,6 +17,7 @@ from coax_env.errors import InputError
 from coax_env.flight import SHORTEST_RUN, Flight, Run
 from coax_env.layout import (
     CHANNELS,
+    GUSTS,
     N_CHANNELS,
     N_FULL,
     N_STATES,
@@ -111,7 +112,7 @@ def fly(
 
     x = dynamics.full_state(start, trim, vehicle)
     if gusting:
-        x[20:26] = level * rng.standard_normal(6)
+        x[GUSTS] = level * rng.standard_normal(6)
     delay, within, last = _SwashDelay(values, trim, dt), limits(vehicle), trim.copy()
     work = np.zeros(dynamics.WORK_SIZE)
     states, commands = np.empty((len(t), N_FULL)), np.empty((len(t), 4))
@@ -140,7 +141,7 @@ def fly(
             begin += seconds
         azimuth += dt * x[16]
         if gusting:
-            x[20:26] += level * math.sqrt(1.0 - keep * keep) * rng.standard_normal(6)
+            x[GUSTS] += level * math.sqrt(1.0 - keep * keep) * rng.standard_normal(6)
     if rows and t[rows - 1] < SHORTEST_RUN:
         raise InputError(f"maneuver {plan.name!r} ends after {t[rows - 1]:.2f} s: {ended}")
     note = f"ended at {t[rows - 1]:.2f} s: {ended}" if ended else ""

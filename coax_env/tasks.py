@@ -5,7 +5,7 @@ it moves on from one target to the next. All tasks start, end and are rewarded b
 target in force; ``hover`` has its target fixed over the start. A target is (north, east, height,
 heading) [m, rad] for the user, and x y z psi of the state in the kernel.
 
-Success is contract.md's, about the target: see `succeeded`.
+Success is contract.md's, about the target: see `judge`, and `succeeded` for one recorded flight.
 """
 
 import math
@@ -18,6 +18,7 @@ import numpy as np
 from coax_env import hover
 from coax_env.errors import InputError
 from coax_env.jit import compiled
+from coax_env.layout import PLACE
 from coax_env.random_streams import uniform
 from coax_env.sensors import Sensor
 
@@ -27,8 +28,15 @@ RADIUS = 0.3  # [m] from a waypoint, of the whole distance,
 HEADING_TOLERANCE = 15.0 * _DEGREE  # and from its heading:
 DWELL = 0.5  # [s] so long within both, and the waypoint is reached
 
-SETTLED = 3.0  # [s] from here on success is judged
-SUCCESS = {"height": 0.10, "speed": 0.25, "heading": 10.0 * _DEGREE, "drift": 2.0}
+SETTLED = 3.0  # [s] from here on success is judged:
+FIRST_JUDGED = round(SETTLED / hover.CONTROL_PERIOD)
+"""The state after so many control periods is the first that counts."""
+SUCCESS = {
+    "height": hover.LIMITS["height"],
+    "speed": hover.LIMITS["speed"],
+    "heading": hover.LIMITS["heading"],
+    "drift": hover.LIMITS["position"],
+}
 """Contract.md: rms of the errors of height [m], speed [m/s] and heading [rad]; farthest drift [m]."""
 
 
@@ -213,6 +221,31 @@ def point(held, places, height_sign, target, out):
         out[i] = min(max(out[i], -_BOUNDS[i]), _BOUNDS[i])
 
 
+def judge(
+    name: str,
+    flown: np.ndarray,
+    errors: Mapping[str, np.ndarray],
+    reached: np.ndarray | int = 0,
+    wanted: int = 1,
+) -> np.ndarray:
+    """Which flights were successes, (count,) bool.
+
+    ``hover`` and ``position``: flown to the end, and from SETTLED on every error under SUCCESS's.
+    ``waypoints``: flown to the end, and `wanted` of them reached.
+
+    Args:
+        flown: whether each was flown to the end, (count,).
+        errors: with the keys of SUCCESS, each (count,): rms of the errors of height, speed and
+            heading from SETTLED on, and the farthest drift: from the place at that time in
+            ``hover``, whose sensors need not show the position, else from the target.
+        reached: waypoints reached, (count,). wanted: how many it should have been.
+    """
+    if task(name).moves_on:
+        return np.asarray(flown & (reached >= wanted))
+    within = [errors[key] < limit for key, limit in SUCCESS.items()]
+    return np.logical_and.reduce([flown, *within])
+
+
 def succeeded(
     name: str,
     states: np.ndarray,
@@ -221,35 +254,22 @@ def succeeded(
     reached: int = 0,
     wanted: int = 1,
 ) -> bool:
-    """Whether one flight was a success, from true states.
-
-    ``hover`` and ``position``: flown to the end, and after the first 3 s height rms < 0.10 m, speed
-    rms < 0.25 m/s, heading rms < 10 deg, and never 2 m away: from the place at 3 s in ``hover``,
-    whose sensors need not show the position, else from the target. ``waypoints``: flown to the end,
-    and `wanted` of them reached.
+    """Whether one flight was a success by `judge`, from true states.
 
     Args:
-        states: (n, >=16), one row per step flown. targets: x y z psi in force, (n, 4).
+        states: (n, >=16), one row after each step flown. targets: x y z psi in force, (n, 4).
         steps: how many the flight should have had.
         reached: waypoints reached, ``info["reached"]``. wanted: how many it should have been.
     """
-    if len(states) < steps or not np.isfinite(states).all():
-        return False
-    if task(name).moves_on:
-        return reached >= wanted
-    late = slice(round(SETTLED / hover.CONTROL_PERIOD), None)
-    x, goal = states[late], targets[late]
-    if not len(x):
-        return False
-    place = x[0, 13:15] if name == "hover" else goal[:, 0:2]
-    turn = (x[:, 12] - goal[:, 3] + math.pi) % (2.0 * math.pi) - math.pi
-    found = {
-        "height": float(np.sqrt(np.mean((x[:, 15] - goal[:, 2]) ** 2))),
-        "speed": float(np.sqrt(np.mean((x[:, 0:3] ** 2).sum(axis=1)))),
-        "heading": float(np.sqrt(np.mean(turn**2))),
-        "drift": float(np.linalg.norm(x[:, 13:15] - place, axis=1).max()),
-    }
-    return all(found[key] < limit for key, limit in SUCCESS.items())
+    flown = np.array([len(states) >= steps and bool(np.isfinite(states).all())])
+    x, goal = states[FIRST_JUDGED - 1 :], targets[FIRST_JUDGED - 1 :]
+    errors = dict.fromkeys(SUCCESS, np.array([np.inf]))
+    if len(x):
+        place = x[0, PLACE] if name == "hover" else goal[:, 0:2]
+        squares = hover.squared_errors(x, goal)
+        errors = {k: np.sqrt([squares[k].mean()]) for k in ("height", "speed", "heading")}
+        errors["drift"] = np.linalg.norm(x[:, PLACE] - place, axis=1).max(keepdims=True)
+    return bool(judge(name, flown, errors, reached, wanted)[0])
 
 
 def dwell_rows(name: str) -> int:

@@ -29,7 +29,7 @@ from coax_env.engine.whiteness import whiteness
 from coax_env.generic_terms import AXES, SMALLEST, TERMS, Term, term_value
 from coax_env.heli_model import FARTHEST
 from coax_env.jit import compiled
-from coax_env.layout import CHANNELS, GUST_FORCE, N_CHANNELS
+from coax_env.layout import CHANNELS, GUSTS, N_CHANNELS
 from coax_env.search import EVIDENCE, Quadratic, Search, State
 
 SPOKEN_FOR = {
@@ -91,7 +91,7 @@ class Along:
             table = np.empty((int(late.sum()), len(TERMS)))
             _evaluate(run.states[late], run.inputs[late], p, table)
             values.append(table)
-            gusts.append(run.states[late, GUST_FORCE.start : GUST_FORCE.start + len(AXES)])
+            gusts.append(run.states[late, GUSTS])
         return cls(np.concatenate(values), np.concatenate(gusts))
 
     def columns(self, terms: Sequence[Term]) -> np.ndarray:

@@ -79,6 +79,8 @@ def compare(
     vehicles: int = 50,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
+    jobs: int = 1,
+    backend: str = "loky",
 ) -> dict[str, Any]:
     """Fly every controller in every condition.
 
@@ -88,7 +90,7 @@ def compare(
     Args:
         ppo: the trained policy; default the shipped one.
         episodes: flights per condition; on drawn vehicles a fifth of that for each.
-        vehicles: how many are drawn.
+        vehicles: how many are drawn. jobs, backend: how many of them at once, and where.
 
     Returns:
         compare.json: condition -> controller -> score.json, None where it cannot fly that.
@@ -106,8 +108,9 @@ def compare(
                 row[name] = None
             elif condition.spread:
                 row[name] = evaluate_spread(
-                    controller, condition.vehicle, vehicles, max(episodes // 5, 1), seconds, seed
-                )
+                    controller, condition.vehicle, vehicles, max(episodes // 5, 1), seconds, seed,
+                    jobs=jobs, backend=backend,
+                )  # fmt: skip
             else:
                 row[name] = evaluate(
                     controller, condition.vehicle, episodes, seconds, seed, **condition.arguments

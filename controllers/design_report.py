@@ -7,6 +7,7 @@ from gymnasium.vector import AutoresetMode
 
 from coax_env import figures, hover
 from coax_env.env import CoaxVectorEnv
+from coax_env.layout import ATTITUDE, N_STATES, STATES
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from coax_env.vehicle import Vehicle
 from controllers.loading import Controller
@@ -99,8 +100,6 @@ def step_response(
     controller: Controller, vehicle: Vehicle, seconds: float = 8.0
 ) -> tuple[np.ndarray, list[tuple[str, dict[str, np.ndarray]]]]:
     """True states of one flight from START on noisy sensors: time (n,) and panels of curves."""
-    from coax_env.layout import N_STATES, STATES
-
     names = [name for name, _ in STATES]
     start = np.zeros(N_STATES)
     for name, value in START.items():
@@ -118,7 +117,7 @@ def step_response(
         actions.append(action[0])
     x, a = np.array(states), np.array(actions)
     t = np.arange(len(x)) * hover.CONTROL_PERIOD
-    degrees = np.degrees(x[:, 10:13])
+    degrees = np.degrees(x[:, ATTITUDE])
     return t, [
         ("height [m]", {"height": -x[:, 15]}),
         (

@@ -11,6 +11,7 @@ so there is one gain per row of that cycle, and one for the first reading of a f
 """
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -26,7 +27,8 @@ from coax_env.layout import CHANNELS, FULL_STATES, N_COMMANDS
 from coax_env.linear import sampled
 from coax_env.sensors import BASE_RATE, Sensor, is_new, slow_instruments, suite
 from coax_env.vehicle import Vehicle
-from controllers.target import TargetView
+from controllers.feedback import Feedback
+from controllers.target import TargetView, turned
 
 DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; not the fly-bar's, from which it must be told
 FORCE_SHARE = 0.05  # std of the disturbing force, of the weight
@@ -270,10 +272,10 @@ class Tracker:
         seen, asked, there = self._view.seen(observations)
         moved = np.where((self._rows > 0)[:, None], asked - self._asked, 0.0)[which]
         heading = asked[which, 3] + seen[which, self._view.names.index("psi")]
-        cosine, sine = np.cos(heading), np.sin(heading)
+        forward, right = turned(moved[:, :2], -heading).T
         changes = {
-            "x": cosine * moved[:, 0] + sine * moved[:, 1],
-            "y": cosine * moved[:, 1] - sine * moved[:, 0],
+            "x": forward,
+            "y": right,
             "z": moved[:, 2],
             "psi": (moved[:, 3] + math.pi) % (2.0 * math.pi) - math.pi,
         }
@@ -290,6 +292,43 @@ class Tracker:
         self.integrals += DT * self._readings[:, self._integrated] * self._there[:, None]
         np.clip(self.integrals, -self._most, self._most, out=self.integrals)
         self._rows += 1
+
+
+class Estimating(Feedback):
+    """A controller that sees through the filter: what a Tracker knows is all that it is given."""
+
+    estimator: EstimatorDesign
+    tracker: Tracker
+    known: np.ndarray  # (count, n + i), the last estimate and integrals, kept to be looked at
+
+    @property
+    def sensors(self) -> str:  # type: ignore[override]
+        """The suite it must be given."""
+        return self.estimator.sensors
+
+    @property
+    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Trim and scale of its actions, for ``nominal=`` of the env."""
+        return self.estimator.action_trim, self.estimator.action_scale
+
+    def begin(self) -> None:
+        """New flights of `count` helicopters."""
+        self.tracker = Tracker(self.estimator, self.count)
+
+    def answer(self, observations: np.ndarray) -> np.ndarray:
+        """Actions (count, 4), not yet clipped, to observations (count, n_obs)."""
+        self.known = self.tracker.see(observations)
+        return self.answer_knowing(self.known)
+
+    @abstractmethod
+    def answer_knowing(self, known: np.ndarray) -> np.ndarray:
+        """Actions (count, 4), not yet clipped, to estimates and integrals (count, n + i)."""
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Observation (n_obs,) or (count, n_obs) to action (4,) or (count, 4), float32."""
+        actions = super().act(observation)
+        self.tracker.acted(np.atleast_2d(actions))
+        return actions
 
 
 @compiled()

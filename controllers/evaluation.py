@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,9 @@ from gymnasium.vector import AutoresetMode
 from coax_env import hover, tasks
 from coax_env.env import CoaxVectorEnv
 from coax_env.errors import InputError
+from coax_env.layout import PLACE
 from coax_env.vehicle import Vehicle, load_vehicle
+from coax_env.workers import each
 from controllers.loading import Controller
 
 
@@ -26,7 +29,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Fly ``episodes`` flights at once, seeds seed, seed + 1, ..., and judge them.
 
-    Success is `tasks.succeeded`'s, from true states: hovering, flown to the end, and after the
+    Success is `tasks.judge`'s, from true states: hovering, flown to the end, and after the
     first 3 s height rms < 0.10 m, speed rms < 0.25 m/s, heading rms < 10 deg, drift < 2 m, the
     largest horizontal distance from the place at 3 s (in ``position`` from the target); of
     ``waypoints`` those given must be reached, or the first of those drawn. The rms figures are
@@ -59,7 +62,7 @@ def evaluate(
         actions = np.nan_to_num(controller.act(observations))
         targets = info.get("target", tally.targets)
         observations, rewards, terminated, _, info = env.step(actions)
-        late = (step + 1) * hover.CONTROL_PERIOD >= tasks.SETTLED
+        late = step + 1 >= tasks.FIRST_JUDGED
         tally.add(info, targets, np.clip(actions, -1.0, 1.0), rewards, late)
         tally.alive &= ~terminated
         if progress:
@@ -88,9 +91,16 @@ def evaluate_spread(
     seconds: float = 20.0,
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
+    jobs: int = 1,
+    backend: str = "loky",
     **env_arguments: Any,
 ) -> dict[str, Any]:
     """`evaluate` on vehicles drawn from a vehicle's spread, the same seeds on each.
+
+    Args:
+        progress: called with the number of vehicles flown.
+        jobs, backend: vehicles at once, and where, as in `coax_env.workers.each`; the figures are
+            the same.
 
     Returns:
         score.json of the vehicle with the lowest success rate (the highest cost among equals), with
@@ -100,19 +110,30 @@ def evaluate_spread(
         raise InputError(f"need at least one drawn vehicle, found {vehicles}")
     vehicle = load_vehicle(vehicle)
     rng = np.random.default_rng(seed)
-    scores, drawn = [], []
-    for _ in range(vehicles):
-        one = vehicle.draw(rng)
-        scores.append(evaluate(controller, one, episodes, seconds, seed, **env_arguments))
-        drawn.append(one.values())
+    drawn = [vehicle.draw(rng) for _ in range(vehicles)]
+    judge = partial(_one_drawn, controller, (episodes, seconds, seed), env_arguments)
+    found = {}
+    for (number, _), score in each(judge, list(enumerate(drawn)), jobs, backend):
+        found[number] = score
         if progress:
             progress(1)
+    scores = [found[number] for number in range(vehicles)]
     worst = min(scores, key=lambda score: (score["success_rate"], -score["mean_cost"]))
     table = [
-        {name: score[name] for name in FIGURES} | {"values": values}
-        for score, values in zip(scores, drawn, strict=True)
+        {name: score[name] for name in FIGURES} | {"values": one.values()}
+        for score, one in zip(scores, drawn, strict=True)
     ]
     return worst | {"vehicles": table}
+
+
+def _one_drawn(
+    controller: Controller,
+    flights: tuple[int, float, int],
+    env_arguments: dict[str, Any],
+    numbered: tuple[int, Vehicle],
+) -> dict[str, Any]:
+    """The score on one of the drawn vehicles, which come with their numbers."""
+    return evaluate(controller, numbered[1], *flights, **env_arguments)
 
 
 FIGURES = (
@@ -132,7 +153,7 @@ class _Tally:
         self.wanted = max(1, len(tasks.course(task, course)))
         self.cost, self.reward, self.effort = np.zeros(count), np.zeros(count), np.zeros(count)
         self.flown, self.judged = np.zeros(count), np.zeros(count)
-        self.height, self.speed, self.heading = np.zeros(count), np.zeros(count), np.zeros(count)
+        self.squares = {name: np.zeros(count) for name in ("height", "speed", "heading")}
         self.drift, self.reached = np.zeros(count), np.zeros(count)
         self.place: np.ndarray | None = None
 
@@ -156,52 +177,44 @@ class _Tally:
         if not late:
             return
         if self.place is None:
-            self.place = states[:, 13:15].copy()
+            self.place = states[:, PLACE].copy()
         place = self.place if self.task == "hover" else targets[:, 0:2]
-        heading = (states[:, 12] - targets[:, 3] + math.pi) % (2.0 * math.pi) - math.pi
-        self.height += np.where(finite, (states[:, 15] - targets[:, 2]) ** 2, 0.0)
-        self.speed += np.where(finite, (states[:, 0:3] ** 2).sum(axis=1), 0.0)
-        self.heading += np.where(finite, heading**2, 0.0)
+        errors = hover.squared_errors(states, targets)
+        for name, total in self.squares.items():
+            total += np.where(finite, errors[name], 0.0)
         self.judged += finite
-        away = np.linalg.norm(states[:, 13:15] - place, axis=1)
+        away = np.linalg.norm(states[:, PLACE] - place, axis=1)
         self.drift = np.maximum(self.drift, np.where(finite, away, 0.0))
 
     def score(self, steps: int) -> dict[str, Any]:
         """The figures, of flights that should have had so many steps."""
         judged = np.maximum(self.judged, 1.0)
-        height = np.sqrt(self.height / judged)
-        speed = np.sqrt(self.speed / judged)
-        heading = np.sqrt(self.heading / judged)
-        limit = tasks.SUCCESS
-        but_drift = (
-            self.alive
-            & (height < limit["height"])
-            & (speed < limit["speed"])
-            & (heading < limit["heading"])
-        )
-        success = but_drift & (self.drift < limit["drift"])
-        moves_on = tasks.task(self.task).moves_on
-        if moves_on:
-            success = self.alive & (self.reached >= self.wanted)
+        errors = {name: np.sqrt(total / judged) for name, total in self.squares.items()}
+        errors["drift"] = self.drift
+        success = tasks.judge(self.task, self.alive, errors, self.reached, self.wanted)
+        at_rest = errors | {"drift": np.zeros(self.count)}
+        but_drift = tasks.judge("hover", self.alive, at_rest)
 
-        def pooled(squares: np.ndarray) -> float | None:
+        def pooled(name: str) -> float | None:
             total = self.judged.sum()
-            return math.sqrt(squares.sum() / total) if total else None
+            return math.sqrt(self.squares[name].sum() / total) if total else None
 
-        heading_rms = pooled(self.heading)
+        heading_rms = pooled("heading")
         seen = self.judged > 0
         figures = {
             "success_rate": float(success.mean()),
             "mean_cost": float(self.cost.mean() / steps),
             "mean_return": float(self.reward.mean()),
-            "height_rms_m": pooled(self.height),
-            "velocity_rms_mps": pooled(self.speed),
+            "height_rms_m": pooled("height"),
+            "velocity_rms_mps": pooled("speed"),
             "heading_rms_deg": None if heading_rms is None else math.degrees(heading_rms),
             "drift_m": float(self.drift[seen].mean()) if seen.any() else None,
             "effort": float(math.sqrt(self.effort.sum() / max(self.flown.sum(), 1.0))),
             "success_but_drift_rate": float(but_drift.mean()),
             "survival_rate": float(self.alive.mean()),
-            "worst_height_rms_m": float(height[seen].max()) if seen.any() else None,
+            "worst_height_rms_m": float(errors["height"][seen].max()) if seen.any() else None,
             "worst_cost": float(self.cost.max() / steps),
         }
-        return figures | ({"mean_reached": float(self.reached.mean())} if moves_on else {})
+        if tasks.task(self.task).moves_on:
+            figures["mean_reached"] = float(self.reached.mean())
+        return figures

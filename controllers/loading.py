@@ -10,10 +10,7 @@ import numpy as np
 from coax_env.errors import InputError
 from coax_env.fleet import Nominal
 from coax_env.vehicle import Vehicle
-
-FORMAT = "coax-controller"
-VERSION = 1
-"""Of controller.json, whatever the kind."""
+from controllers.feedback import FORMAT, VERSION
 
 KINDS = {
     "lqr": "linear feedback of the exact state (--sensors state); on noisy sensors: lqg",

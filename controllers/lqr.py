@@ -8,30 +8,28 @@ velocity stands for it: the machine then holds still, and its place drifts.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from coax_env import hover
-from coax_env.files import write_json
 from coax_env.fleet import DT, Nominal
 from coax_env.vehicle import Vehicle, load_vehicle
 from controllers.estimator import (
     INTEGRAL_TIME,
+    Estimating,
     EstimatorDesign,
-    Tracker,
     design_estimator,
     integrated_readings,
 )
-from controllers.loading import FORMAT, VERSION
+from controllers.feedback import Designed
 
 INPUT_NAMES = ("rotor_upper", "rotor_lower", "swash_lon", "swash_lat")
 
 
 @dataclass
-class LQG:
+class LQG(Estimating, Designed):
     """A designed controller: plain matrices. `act` flies one helicopter or a batch of them.
 
     action = clip(feedforward - gain @ [estimate; integrals], -1, 1), all deviations from the design
@@ -42,44 +40,16 @@ class LQG:
     estimator: EstimatorDesign
     gain: np.ndarray  # (4, n + i), per state [SI], of the action
     cost_to_go: np.ndarray  # (n + i, n + i): x'Px is the cost of all further steps
-    tracker: Tracker | None = field(default=None, init=False, repr=False, compare=False)
-    known: np.ndarray | None = field(default=None, init=False, repr=False, compare=False)
 
     kind = "lqg"
 
-    @property
-    def sensors(self) -> str:
-        """The suite it must be given."""
-        return self.estimator.sensors
+    def answer_knowing(self, known: np.ndarray) -> np.ndarray:
+        """Actions (count, 4), not yet clipped, to estimates and integrals (count, n + i)."""
+        return -self.tracker.offset / self.estimator.action_scale - known @ self.gain.T
 
-    @property
-    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Trim and scale of its actions, for ``nominal=`` of the env."""
-        return self.estimator.action_trim, self.estimator.action_scale
-
-    def reset(self, count: int = 1) -> None:
-        """Forget the last flight; `count` helicopters are flown next."""
-        self.tracker = Tracker(self.estimator, count)
-
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Observation (n_obs,) or (count, n_obs) to action (4,) or (count, 4), float32."""
-        batch = np.atleast_2d(observation)
-        if self.tracker is None or self.tracker.count != len(batch):
-            self.tracker = Tracker(self.estimator, len(batch))
-        self.known = self.tracker.see(batch)  # estimate and integrals, kept to be looked at
-        feedforward = -self.tracker.offset / self.estimator.action_scale
-        actions = feedforward - self.known @ self.gain.T
-        actions = np.clip(actions, -1.0, 1.0).astype(np.float32)
-        self.tracker.acted(actions)
-        return actions if np.ndim(observation) == 2 else actions[0]
-
-    def to_dict(self) -> dict[str, Any]:
-        """For a JSON file, weights included."""
+    def content(self) -> dict[str, Any]:
+        """What a file of this kind has of its own."""
         return {
-            "format": FORMAT,
-            "version": VERSION,
-            "kind": self.kind,
-            "vehicle": self.vehicle,
             "control_period_s": DT,
             "cost": {"weights": hover.COST_WEIGHTS, "limits": hover.LIMITS},
             "integral_time_s": INTEGRAL_TIME,
@@ -87,10 +57,6 @@ class LQG:
             "gain": self.gain.tolist(),
             "cost_to_go": self.cost_to_go.tolist(),
         }
-
-    def save(self, path: str | Path) -> Path:
-        """Write controller.json."""
-        return write_json(path, self.to_dict())
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> "LQG":

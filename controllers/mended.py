@@ -15,6 +15,7 @@ from coax_env.diagnosis import Diagnosis, diagnose
 from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
+from coax_env.report.worth import FlownControllers
 from coax_env.simulation import simulate
 from coax_env.vehicle import Vehicle, load_vehicle
 from controllers import lqr, ppo
@@ -105,6 +106,33 @@ def compare_models(
         "cost_ratio": gains,
     }
     return content, result, controllers
+
+
+def before_and_after(
+    bare: Vehicle, extended: Vehicle, machine: Vehicle, episodes: int = 20, seed: int = 0
+) -> dict[str, tuple[lqr.LQG, dict[str, Any]]]:
+    """An LQG of the bare and one of the extended model, flown on one machine from the same seeds.
+
+    Returns:
+        controller and score.json by MODELS.
+    """
+    result = {}
+    for name, model in zip(MODELS, (bare, extended), strict=True):
+        controller = lqr.design(model, bare)
+        result[name] = controller, evaluate(controller, machine, episodes, seed=seed)
+    return result
+
+
+def flown_controllers(
+    flown: Mapping[str, tuple[lqr.LQG, dict[str, Any]]], machine: str
+) -> FlownControllers:
+    """What a diagnosis' report shows of `before_and_after`; `machine` in words."""
+    scores = (score for _, score in flown.values())
+    return FlownControllers(
+        dict(zip(("bare", "extended"), scores, strict=True)),
+        machine,
+        "An LQG (python-control) designed on each model, with the same cost and estimator.",
+    )
 
 
 def rows(content: Mapping[str, Any]) -> list[list[str]]:

@@ -10,20 +10,18 @@ order lag. The place is held only where it is measured (suite ``mocap``).
 """
 
 import math
-from dataclasses import dataclass, field, fields
-from pathlib import Path
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from coax_env import hover
 from coax_env.errors import InputError
-from coax_env.files import write_json
 from coax_env.fleet import DT, Nominal, action_map
 from coax_env.sensors import suite
 from coax_env.vehicle import Vehicle, load_vehicle
-from controllers.loading import FORMAT, VERSION
-from controllers.target import TargetView
+from controllers.feedback import Designed, Feedback
+from controllers.target import TargetView, turned
 
 _NEEDED = ("p", "q", "r", "phi", "theta", "psi", "h", "vn", "ve", "vd")
 _PLACE = ("pn", "pe")
@@ -50,11 +48,11 @@ class Gains:
 
 
 @dataclass
-class PID:
+class PID(Feedback, Designed):
     """The cascade for one helicopter or many; ``act`` as every controller."""
 
     vehicle: str
-    suite: str
+    sensors: str
     action_trim: np.ndarray  # (4,)
     action_scale: np.ndarray  # (4,)
     gains: Gains = field(default_factory=Gains)
@@ -62,53 +60,27 @@ class PID:
     kind = "pid"
 
     def __post_init__(self) -> None:
-        names = [sensor.name for sensor in suite(self.suite)]
+        names = [sensor.name for sensor in suite(self.sensors)]
         missing = [name for name in _NEEDED if name not in names]
         if missing:
-            raise InputError(f"pid needs {', '.join(missing)}, which sensors {self.suite!r} lack")
-        self._view = TargetView(self.suite)
+            raise InputError(f"pid needs {', '.join(missing)}, which sensors {self.sensors!r} lack")
+        self._view = TargetView(self.sensors)
         self._at = {name: names.index(name) for name in (*_NEEDED, *_PLACE) if name in names}
-        self.reset()
 
-    @property
-    def sensors(self) -> str:
-        """The suite it must be given."""
-        return self.suite
+    def begin(self) -> None:
+        """New flights of `count` helicopters."""
+        self._smooth = np.zeros((self.count, 3))  # forward, right, down [m/s]
+        self._sums = np.zeros((self.count, 4))  # forward, right [m], height [m s], heading [rad s]
 
-    @property
-    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Trim and scale of its actions, for ``nominal=`` of the env."""
-        return self.action_trim, self.action_scale
-
-    def reset(self, count: int = 1) -> None:
-        """Forget the last flight; `count` helicopters are flown next."""
-        self._smooth: np.ndarray | None = None  # forward, right, down [m/s], (count, 3)
-        self._sums = np.zeros((count, 4))  # forward, right [m], height [m s], heading [rad s]
-
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Observation (n_obs,) or (count, n_obs) to action (4,) or (count, 4), float32."""
-        batch = np.atleast_2d(observation).astype(float)
-        if len(self._sums) != len(batch):
-            self.reset(len(batch))
-        there = np.ones(len(batch), dtype=bool)
-        if self._view.aims(batch):
-            batch, _, there = self._view.seen(batch)
-        actions = np.clip(self._actions(batch, there), -1.0, 1.0).astype(np.float32)
-        return actions if np.ndim(observation) == 2 else actions[0]
-
-    def _actions(self, batch: np.ndarray, there: np.ndarray) -> np.ndarray:
+    def answer(self, observations: np.ndarray) -> np.ndarray:
+        """Actions (count, 4), not yet clipped, to observations (count, n_obs)."""
+        batch, there = self._view.as_hover(observations)
         g, y = self.gains, {name: batch[:, at] for name, at in self._at.items()}
-        measured = np.column_stack([*_turned(y["vn"], y["ve"], y["psi"]), y["vd"]])
-        if self._smooth is None:
-            self._smooth = np.zeros_like(measured)
+        speed = turned(np.column_stack([y["vn"], y["ve"]]), -y["psi"])
+        measured = np.column_stack([speed, y["vd"]])
         self._smooth += (measured - self._smooth) * (1.0 - math.exp(-DT / g.smoothing))
         forward, right, down = self._smooth.T
-        ask_forward = ask_right = np.zeros(len(batch))
-        if "pn" in y:
-            ask = -g.place * np.column_stack([y["pn"], y["pe"]])
-            length = np.maximum(np.linalg.norm(ask, axis=1), 1e-9)
-            ask *= np.minimum(1.0, g.fastest / length)[:, None]
-            ask_forward, ask_right = _turned(ask[:, 0], ask[:, 1], y["psi"])
+        ask_forward, ask_right = self._speed_asked(y).T
         height = hover.HEIGHT - y["h"]
         heading = -((y["psi"] + math.pi) % (2.0 * math.pi) - math.pi)
         ahead, aside = ask_forward - forward, ask_right - right
@@ -129,22 +101,23 @@ class PID:
             ]
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """For a JSON file."""
+    def _speed_asked(self, y: dict[str, np.ndarray]) -> np.ndarray:
+        """Forward and right [m/s] (count, 2), towards a place that is measured."""
+        if "pn" not in y:
+            return np.zeros((self.count, 2))
+        ask = -self.gains.place * np.column_stack([y["pn"], y["pe"]])
+        length = np.maximum(np.linalg.norm(ask, axis=1), 1e-9)
+        ask *= np.minimum(1.0, self.gains.fastest / length)[:, None]
+        return turned(ask, -y["psi"])
+
+    def content(self) -> dict[str, Any]:
+        """What a file of this kind has of its own."""
         return {
-            "format": FORMAT,
-            "version": VERSION,
-            "kind": self.kind,
-            "vehicle": self.vehicle,
-            "sensors": self.suite,
+            "sensors": self.sensors,
             "action_trim": self.action_trim.tolist(),
             "action_scale": self.action_scale.tolist(),
-            "gains": {f.name: getattr(self.gains, f.name) for f in fields(Gains)},
+            "gains": asdict(self.gains),
         }
-
-    def save(self, path: str | Path) -> Path:
-        """Write controller.json."""
-        return write_json(path, self.to_dict())
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> "PID":
@@ -160,11 +133,3 @@ def design(vehicle: str | Vehicle, nominal: Nominal = None, sensors: str = "onbo
     """The cascade about a vehicle's nominal trim; nothing else of the vehicle is used."""
     vehicle = load_vehicle(vehicle)
     return PID(vehicle.name, sensors, *action_map(vehicle, nominal))
-
-
-def _turned(
-    north: np.ndarray, east: np.ndarray, heading: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Horizontal vectors as forward and right of a heading [rad]."""
-    cosine, sine = np.cos(heading), np.sin(heading)
-    return cosine * north + sine * east, cosine * east - sine * north

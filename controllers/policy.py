@@ -14,18 +14,18 @@ integrals of controllers/estimator.py, scaled.
 
 import io
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coax_env.errors import InputError
-from controllers.estimator import EstimatorDesign, Tracker, integrated_readings
+from coax_env.files import write_bytes
+from controllers.estimator import Estimating, EstimatorDesign, integrated_readings
 
 FORMAT = "coax-policy"
 VERSION = 2
@@ -69,55 +69,25 @@ class Network:
 
 
 @dataclass
-class Policy:
+class Policy(Estimating):
     """A trained policy with its estimator: a controller like any other."""
 
     network: Network
     estimator: EstimatorDesign
     scales: np.ndarray  # (n + i,), of what is known
-    content: dict[str, Any]
-    eyes: "Eyes | None" = field(default=None, init=False, repr=False, compare=False)
+    content: dict[str, Any]  # of policy.json
 
     kind = "ppo"
 
-    @property
-    def sensors(self) -> str:
-        """The suite it must be given."""
-        return self.estimator.sensors
-
-    @property
-    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Trim and scale of its actions, for ``nominal=`` of the env."""
-        return self.estimator.action_trim, self.estimator.action_scale
-
-    def reset(self, count: int = 1) -> None:
-        """Forget the last flight; `count` helicopters are flown next."""
-        self.eyes = Eyes(self.estimator, count, self.scales)
-
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Observation (n_obs,) or (count, n_obs) to action (4,) or (count, 4), float32."""
-        batch = np.atleast_2d(observation)
-        if self.eyes is None or self.eyes.count != len(batch):
-            self.reset(len(batch))
-        assert self.eyes is not None
-        actions = np.clip(self.network(self.eyes.features(self.eyes.see(batch))), -1.0, 1.0).astype(
-            np.float32
-        )
-        self.eyes.acted(actions)
-        return actions if np.ndim(observation) == 2 else actions[0]
+    def answer_knowing(self, known: np.ndarray) -> np.ndarray:
+        """Actions (count, 4), not yet clipped, to estimates and integrals (count, n + i)."""
+        return self.network(features(known, self.scales))
 
 
-class Eyes(Tracker):
-    """The filter, and what it knows as the policy's features, for one helicopter or many."""
-
-    def __init__(self, design: EstimatorDesign, count: int, scales: np.ndarray) -> None:
-        super().__init__(design, count)
-        self._per_scale = 1.0 / scales
-
-    def features(self, known: np.ndarray) -> np.ndarray:
-        """What `see` has returned as features (count, n), float32, within [-10, 10]."""
-        features = (known * self._per_scale).astype(np.float32)
-        return np.clip(features, -_FEATURE_LIMIT, _FEATURE_LIMIT, out=features)
+def features(known: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Estimates and integrals (count, n + i) in units of their scales, float32, within [-10, 10]."""
+    found = (known * (1.0 / scales)).astype(np.float32)
+    return np.clip(found, -_FEATURE_LIMIT, _FEATURE_LIMIT, out=found)
 
 
 def feature_scales(design: EstimatorDesign) -> np.ndarray:
@@ -151,7 +121,6 @@ def save_policy(
         content: further entries of the description.
         training: a zip file of Stable-Baselines3, whose members join the plain ones.
     """
-    path = Path(path)
     arrays: dict[str, Any] = {}
     for k, (weight, bias) in enumerate(network.layers):
         arrays[f"weight_{k}"], arrays[f"bias_{k}"] = weight, bias
@@ -167,15 +136,7 @@ def save_policy(
     with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(_dated(DESCRIPTION), json.dumps(content, allow_nan=False))
         archive.writestr(_dated(WEIGHTS), weights.getvalue())
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(buffer.getvalue())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
+    return write_bytes(path, buffer.getvalue())
 
 
 def _dated(name: str) -> zipfile.ZipInfo:

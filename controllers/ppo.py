@@ -4,8 +4,10 @@ The policy that comes out is controllers/policy.py's. Torch is imported only to 
 """
 
 import io
+import tempfile
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +16,15 @@ from gymnasium.spaces import Box
 
 from coax_env import hover
 from coax_env.errors import InputError, require
-from coax_env.files import make_folder
+from coax_env.files import make_folder, write_bytes
 from coax_env.fleet import DT, Nominal
 from coax_env.vehicle import Vehicle, load_vehicle
-from controllers.estimator import EstimatorDesign, design_estimator
+from coax_env.workers import each
+from controllers.estimator import EstimatorDesign, Tracker, design_estimator
 from controllers.policy import (
-    Eyes,
     Network,
     feature_scales,
+    features,
     load_policy,
     n_features,
     save_policy,
@@ -80,7 +83,7 @@ def hover_vec_env(
         """See hover_vec_env."""
 
         def __init__(self) -> None:
-            self.eyes = Eyes(design, n_envs, feature_scales(design))
+            self.tracker, self.scales = Tracker(design, n_envs), feature_scales(design)
             super().__init__(
                 n_envs, round(episode_s / DT), reward_scale,
                 Box(-10.0, 10.0, (n_features(design),), np.float32),
@@ -89,17 +92,17 @@ def hover_vec_env(
             )  # fmt: skip
 
         def begin(self, which: np.ndarray) -> None:
-            self.eyes.reset(which)
+            self.tracker.reset(which)
 
         def view(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
-            return self.eyes.features(self.eyes.see(observations, which))
+            return features(self.tracker.see(observations, which), self.scales)
 
         def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
             actions, total = self._actions, np.zeros(n_envs)
             over = np.zeros(n_envs, dtype=bool)
             infos: list[dict[str, Any]] = [{} for _ in range(n_envs)]
             for _ in range(hold):
-                self.eyes.acted(actions)
+                self.tracker.acted(actions)
                 observations, rewards, terminated, truncated, info = self.env.step(actions)
                 done = terminated | truncated
                 ended = info["final_info"]["state"] if done.any() else info["state"]
@@ -109,17 +112,17 @@ def hover_vec_env(
                 self._return += np.where(over, 0.0, rewards)
                 self._length += ~over
                 if not done.any():
-                    known = self.eyes.see(observations)
+                    known = self.tracker.see(observations)
                     continue
                 last = self.view(info["final_obs"])
                 self.begin(done)
-                known = self.eyes.see(observations, done)
+                known = self.tracker.see(observations, done)
                 self.tell_the_end(infos, done & ~over, truncated & ~terminated, last)
                 over |= done
                 actions = np.where(over[:, None], 0.0, actions)  # until the next decision
             self._return[over], self._length[over] = 0.0, 0
             rewards = (reward_scale * total).astype(np.float32)
-            return self.eyes.features(known), rewards, over, infos
+            return features(known, self.scales), rewards, over, infos
 
     return HoverVecEnv()
 
@@ -218,6 +221,42 @@ def train(
         save()
         env.close()
     return path
+
+
+def train_seeds(
+    vehicle: str | Vehicle,
+    out: str | Path,
+    seeds: Sequence[int],
+    jobs: int = 1,
+    backend: str = "loky",
+    **training: Any,
+) -> Iterator[tuple[int, Path]]:
+    """`train` once for each seed, several at a time; a seed gives the policy it would give alone.
+
+    Every policy is trained in a temporary folder and comes back as bytes, so that the machines of a
+    cluster need no disk in common; one that is interrupted is lost.
+
+    Args:
+        jobs, backend: as in `coax_env.workers.each`.
+        training: further arguments of `train`, but for ``progress``.
+
+    Returns:
+        each seed with its OUT/seed_N/policy.zip, as they are done.
+    """
+    training["vehicle"] = load_vehicle(vehicle)
+    if isinstance(training.get("nominal"), str | Path):
+        training["nominal"] = load_vehicle(training["nominal"])
+    for name in ("resume", "tensorboard"):  # a worker may stand in another folder
+        if training.get(name):
+            training[name] = Path(training[name]).resolve()
+    for seed, content in each(partial(_trained, training), list(seeds), jobs, backend):
+        yield seed, write_bytes(Path(out) / f"seed_{seed}" / "policy.zip", content)
+
+
+def _trained(training: Mapping[str, Any], seed: int) -> bytes:
+    """The policy.zip of a seed."""
+    with tempfile.TemporaryDirectory(prefix="coax-ppo-") as folder:
+        return train(out=folder, seed=seed, **training).read_bytes()
 
 
 def _new_model(env: Any, settings: dict[str, Any], seed: int, tensorboard: Any) -> Any:

@@ -11,20 +11,18 @@ The first two say what the noise of real sensors costs the third.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coax_env import hover
-from coax_env.files import write_json
 from coax_env.fleet import DT, Nominal
 from coax_env.layout import ACTUATOR_STATES, STATES
 from coax_env.vehicle import Vehicle, load_vehicle
 from controllers.estimator import design_estimator, integrated_readings
-from controllers.loading import FORMAT, VERSION
+from controllers.feedback import Designed, Feedback
 from controllers.lqr import regulator_problem
-from controllers.target import TargetView
+from controllers.target import TargetView, turned
 
 NAMES = tuple(name for name, _ in (*STATES, *ACTUATOR_STATES))
 _X, _Y, _PSI = (NAMES.index(name) for name in ("x", "y", "psi"))
@@ -32,7 +30,7 @@ _WINDUP = 20.0  # integrals stop at so many of the limits they are weighed by
 
 
 @dataclass
-class StateFeedback:
+class StateFeedback(Feedback, Designed):
     """action = clip(feedforward - gain @ [state; integrals], -1, 1), deviations from trim."""
 
     vehicle: str
@@ -47,56 +45,32 @@ class StateFeedback:
 
     sensors = "state"
 
-    def __post_init__(self) -> None:
+    def begin(self) -> None:
+        """New flights of `count` helicopters."""
         self._view = TargetView(self.sensors)
-        self._integrals = np.zeros((1, len(self.integrated)))
+        self.integrals = np.zeros((self.count, len(self.integrated)))
 
-    @property
-    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Trim and scale of its actions, for ``nominal=`` of the env."""
-        return self.action_trim, self.action_scale
-
-    def reset(self, count: int = 1) -> None:
-        """Forget the last flight; `count` helicopters are flown next."""
-        self._integrals = np.zeros((count, len(self.integrated)))
-
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Observation (n_obs,) or (count, n_obs) to action (4,) or (count, 4), float32."""
-        batch = np.atleast_2d(observation).astype(float)
-        if len(self._integrals) != len(batch):
-            self.reset(len(batch))
-        there = np.ones(len(batch), dtype=bool)
-        if self._view.aims(batch):
-            batch, _, there = self._view.seen(batch)
+    def answer(self, observations: np.ndarray) -> np.ndarray:
+        """Actions (count, 4), not yet clipped, to observations (count, n_obs)."""
+        batch, there = self._view.as_hover(observations)
         state = batch - self.state_trim
-        heading, north, east = state[:, _PSI], state[:, _X].copy(), state[:, _Y].copy()
-        state[:, _X] = np.cos(heading) * north + np.sin(heading) * east
-        state[:, _Y] = np.cos(heading) * east - np.sin(heading) * north
-        known = np.hstack([state, self._integrals])
-        actions = np.clip(self.feedforward - known @ self.gain.T, -1.0, 1.0).astype(np.float32)
+        state[:, [_X, _Y]] = turned(state[:, [_X, _Y]], -state[:, _PSI])
+        known = np.hstack([state, self.integrals])
         places = [NAMES.index(name) for name in self.integrated]
         most = _WINDUP * np.array(list(self.integrated.values()))
-        self._integrals += DT * there[:, None] * state[:, places]
-        np.clip(self._integrals, -most, most, out=self._integrals)
-        return actions if np.ndim(observation) == 2 else actions[0]
+        self.integrals += DT * there[:, None] * state[:, places]
+        np.clip(self.integrals, -most, most, out=self.integrals)
+        return self.feedforward - known @ self.gain.T
 
-    def to_dict(self) -> dict[str, Any]:
-        """For a JSON file, weights included."""
+    def content(self) -> dict[str, Any]:
+        """What a file of this kind has of its own."""
         return {
-            "format": FORMAT,
-            "version": VERSION,
-            "kind": self.kind,
-            "vehicle": self.vehicle,
             "control_period_s": DT,
             "cost": {"weights": hover.COST_WEIGHTS, "limits": hover.LIMITS},
             "states": NAMES,
             "integrated": self.integrated,
             **{name: getattr(self, name).tolist() for name in _ARRAYS},
         }
-
-    def save(self, path: str | Path) -> Path:
-        """Write controller.json."""
-        return write_json(path, self.to_dict())
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> "StateFeedback":

@@ -34,6 +34,18 @@ class TargetView:
         """Whether observations (count, n) have a target in them."""
         return observations.shape[1] == self.width + tasks.N_AIM
 
+    def as_hover(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Observations (count, n), with or without a target, as those of a hover.
+
+        Returns:
+            observations (count, width), float; whether what is asked for is the target itself, or
+            nothing but to hover, (count,) bool.
+        """
+        if self.aims(observations):
+            seen, _, there = self.seen(observations)
+            return seen, there
+        return observations.astype(float), np.ones(len(observations), dtype=bool)
+
     def seen(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Observations (count, width + 4) as those of a hover at the target, or on the way to it.
 
@@ -52,19 +64,22 @@ class TargetView:
         x, y, z, psi = self._places
         heading = seen[:, psi].copy()
         asked = np.empty((len(seen), 4))
-        asked[:, :2] = seen[:, [x, y]] + _turned(way[:, :2], heading)
+        asked[:, :2] = seen[:, [x, y]] + turned(way[:, :2], heading)
         asked[:, 2] = -self._up * seen[:, z] - way[:, 2]
         asked[:, 3] = heading + way[:, 3]
         seen[:, psi] = -way[:, 3]
-        seen[:, [x, y]] = -_turned(way[:, :2], seen[:, psi])
+        seen[:, [x, y]] = -turned(way[:, :2], seen[:, psi])
         seen[:, z] = self._up * (hover.HEIGHT - way[:, 2])
         if self._speed:
-            seen[:, self._speed] = _turned(seen[:, self._speed], -asked[:, 3])
+            seen[:, self._speed] = turned(seen[:, self._speed], -asked[:, 3])
         return seen, asked, (way == whole).all(axis=1)
 
 
-def _turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Horizontal vectors (count, 2) turned clockwise, seen from above, by angles [rad] (count,)."""
+def turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Horizontal vectors (count, 2) turned clockwise, seen from above, by angles [rad] (count,).
+
+    By a heading: forward and right become north and east; by minus a heading, the other way round.
+    """
     cosine, sine = np.cos(angle), np.sin(angle)
     forward, right = vectors[:, 0], vectors[:, 1]
     return np.column_stack([cosine * forward - sine * right, sine * forward + cosine * right])

@@ -13,6 +13,7 @@ from typing import NoReturn
 from tqdm import tqdm
 
 from coax_env.errors import InputError
+from coax_env.workers import BACKENDS
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -37,6 +38,24 @@ def parser(name: str, description: str, *, seed: bool = False) -> Parser:
     if seed:
         result.add_argument("--seed", type=int, default=0, help="of chance (default: 0)")
     return result
+
+
+def add_workers(parser: Parser, what: str, default: int) -> None:
+    """``--jobs`` and ``--backend``, for `coax_env.workers.each`; `what` is worked on at once."""
+    usual = "all cores" if default < 0 else f"{default}; -1: all cores"
+    parser.add_argument(
+        "--jobs", type=_jobs, default=default, help=f"{what} at once (default: {usual})"
+    )
+    parser.add_argument(
+        "--backend", choices=BACKENDS, default="loky",
+        help="joblib's own processes, or a Ray cluster (RAY_ADDRESS; else a local one)",
+    )  # fmt: skip
+
+
+def _jobs(text: str) -> int:
+    if not re.fullmatch(r"[+-]?\d+", text) or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"must be a whole number and not 0, found {text!r}")
+    return int(text)
 
 
 def as_called(text: str) -> str:

@@ -17,9 +17,9 @@ from coax_env import plain_words
 from coax_env.diagnosis import Diagnosis, diagnose
 from coax_env.files import write_json
 from coax_env.flight import read_flight
+from coax_env.report import FlownControllers
 from coax_env.vehicle import Vehicle, load_vehicle
-from controllers import lqr
-from controllers.evaluation import evaluate
+from controllers import mended
 
 PACKAGE = Path(coax_env.__file__).resolve().parent
 BUNDLED = PACKAGE / "flights" / "windy"
@@ -33,7 +33,7 @@ def main() -> None:
     start = monotonic()
 
     print("1. A measured flight: 12 runs of a Lama 400D, synthetic, from an independent simulator.")
-    result = run("demo", BUNDLED, None, options.out)
+    result = look("demo", BUNDLED, None)
     truth = json.loads((BUNDLED / "truth.json").read_text())
     print(f"   hidden in it, for comparison: {', '.join(truth['hidden'])}\n")
 
@@ -41,26 +41,32 @@ def main() -> None:
         "2. A hover controller designed on the bare and on the mended model (LQG, python-control),"
     )
     print("   both flown in CoaxHeli-v0 on the machine as it truly is, 20 episodes of 20 s:")
-    fly(result, true_vehicle(truth), options.out)
+    flown = fly(result, true_vehicle(truth), options.out)
+    save(result, options.out, flown)
 
     if REAL.is_dir() and not options.no_real:
         print(
             "\n3. Real flights of a Skybotix CoaX (M. Faessler, GRASP Lab, 2011): fitted on hover and"
         )
         print("   vertical_sine, predicted on circles, which the fit has not seen.")
-        run("real", REAL, ["circles"], options.out / "real")
+        save(look("real", REAL, ["circles"]), options.out / "real")
     print(f"\n{monotonic() - start:.0f} s in all. Open {options.out / 'report.html'} in a browser.")
 
 
-def run(name: str, flight: Path, hold_out: list[str] | None, out: Path) -> Diagnosis:
-    """Diagnose a flight, write its report, print what was found."""
+def look(name: str, flight: Path, hold_out: list[str] | None) -> Diagnosis:
+    """Diagnose a flight and print what was found."""
     with command_line.progress(name) as say:
         result = diagnose(read_flight(flight), hold_out=hold_out, progress=say)
-    diagnose_script.save(result, out, f"scripts/diagnose.py {flight} --out {out}")
     print_errors(result)
     print(indented(diagnose_script.summary(result)))
-    print(f"   report: {out / 'report.html'}")
     return result
+
+
+def save(result: Diagnosis, out: Path, flown: FlownControllers | None = None) -> None:
+    """Write a diagnosis and its report."""
+    command = f"scripts/diagnose.py {result.flight.path} --out {out}"
+    diagnose_script.save(result, out, command, flown)
+    print(f"   report: {out / 'report.html'}")
 
 
 def print_errors(result: Diagnosis) -> None:
@@ -94,14 +100,13 @@ def true_vehicle(truth: dict) -> Vehicle:
     )
 
 
-def fly(result: Diagnosis, machine: Vehicle, out: Path) -> None:
+def fly(result: Diagnosis, machine: Vehicle, out: Path) -> FlownControllers:
     """LQG designed on each model, flown on the true machine."""
     bare = load_vehicle("lama400d")
+    flown = mended.before_and_after(bare, result.vehicle_after, machine)
     rows = [["", "success", "cost", "height rms", "speed rms", "heading rms", "drift"]]
-    for name, model in (("bare", bare), ("mended", result.vehicle_after)):
-        controller = lqr.design(model, nominal=bare)
+    for name, (controller, score) in flown.items():
         controller.save(out / f"controller_{name}.json")
-        score = evaluate(controller, machine, episodes=20, seconds=20.0, seed=0)
         write_json(out / f"score_{name}.json", score)
         rows.append(
             [
@@ -115,6 +120,7 @@ def fly(result: Diagnosis, machine: Vehicle, out: Path) -> None:
             ]
         )
     command_line.print_columns(rows)
+    return mended.flown_controllers(flown, "the machine as it truly is")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from coax_env.files import staged_folder, write_json, write_text
 
 if TYPE_CHECKING:
     from coax_env.diagnosis import Diagnosis
+    from coax_env.report import FlownControllers
 
 
 def main() -> None:
@@ -33,6 +35,10 @@ def main() -> None:
         "--ceiling", action="store_true",
         help="also fit a black box: how much of the reachable gain the named causes explain",
     )  # fmt: skip
+    parser.add_argument(
+        "--fly", action="store_true",
+        help="also design a hover controller on the model before and after, and fly both",
+    )  # fmt: skip
     options = parser.parse_args()
     for file in options.effect:
         load_effect(file)
@@ -50,19 +56,32 @@ def main() -> None:
             progress=say,
             ceiling=options.ceiling,
         )
-    save(result, options.out, "scripts/diagnose.py " + shlex.join(sys.argv[1:]))
+        flown = fly(result, say) if options.fly else None
+    save(result, options.out, "scripts/diagnose.py " + shlex.join(sys.argv[1:]), flown)
     print(summary(result))
     print(f"findings {options.out / 'findings.json'}, extended vehicle "
           f"{options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")  # fmt: skip
 
 
-def save(result: "Diagnosis", out: Path, command: str) -> None:
+def fly(result: "Diagnosis", say: Callable[[str], None]) -> "FlownControllers":
+    """An LQG of each model, flown on the extended one: the machine itself is not at hand."""
+    from controllers import mended
+
+    say("flying a controller of each model")
+    before, after = result.vehicle_before, result.vehicle_after
+    flown = mended.before_and_after(before, after, after)
+    return mended.flown_controllers(flown, "the extended model, the best guess at the machine")
+
+
+def save(
+    result: "Diagnosis", out: Path, command: str, flown: "FlownControllers | None" = None
+) -> None:
     """findings.json, vehicle.toml and report.html, all or none; then the next flight's card."""
     from coax_env import report
     from coax_env.next_maneuver import write_flight_card
     from coax_env.vehicle import vehicle_toml
 
-    page = report.diagnosis_page(result, command)
+    page = report.diagnosis_page(result, command, flown)
     with staged_folder(out) as folder:
         write_json(folder / "findings.json", result.findings)
         write_text(folder / "vehicle.toml", vehicle_toml(result.vehicle_after))

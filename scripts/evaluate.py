@@ -38,6 +38,7 @@ def main() -> None:
         help="fly vehicles drawn from the file's spread; the score is of the worst",
     )  # fmt: skip
     parser.add_argument("--vehicles", type=int, default=50, help="how many (default: 50)")
+    command_line.add_workers(parser, "drawn vehicles", 1)
     parser.add_argument(
         "--compare", action="store_true",
         help="LQG, PPO, PID and LQI in hover, gusts, wind, on drawn vehicles, and to targets; "
@@ -67,7 +68,7 @@ def fly(options: argparse.Namespace, vehicle: Vehicle, controller: Controller) -
         with tqdm(total=options.vehicles, unit="vehicle", leave=False, disable=None) as bar:
             return evaluate_spread(
                 controller, vehicle, options.vehicles, options.episodes, options.seconds,
-                options.seed, bar.update, **env,
+                options.seed, bar.update, options.jobs, options.backend, **env,
             )  # fmt: skip
     steps = round(options.seconds / CONTROL_PERIOD)
     with tqdm(total=steps, unit="step", leave=False, disable=None) as bar:
@@ -82,8 +83,9 @@ def compare(options: argparse.Namespace, vehicle: Vehicle) -> None:
     policy = None if options.controller in KINDS else load_controller(options.controller)
     with command_line.progress("compare") as say:
         content = comparison.compare(
-            vehicle, policy, options.episodes, options.seconds, options.vehicles, options.seed, say
-        )
+            vehicle, policy, options.episodes, options.seconds, options.vehicles, options.seed, say,
+            options.jobs, options.backend,
+        )  # fmt: skip
     make_folder(options.out)
     path = write_json(options.out / "compare.json", content)
     text = comparison.comparison_page(content, "scripts/evaluate.py " + shlex.join(sys.argv[1:]))

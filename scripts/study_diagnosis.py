@@ -1,9 +1,9 @@
 """How often is the diagnosis right? Flights whose truth is known, flown, diagnosed and counted."""
 
-import os
 import shlex
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +14,18 @@ from study.one_flight import fly_and_diagnose
 from study.plan import PlannedFlight
 from tqdm import tqdm
 
-from coax_env import calibration
-from coax_env.errors import InputError, require
+from coax_env import calibration, workers
+from coax_env.errors import InputError
 from coax_env.files import make_folder, write_json, write_text
 from coax_env.report.page import Section, figure, page
 
 QUICK = {"clean": 8, "effects": 16}
-PORTION = 4  # flights per worker between two savings on Ray
 
 
 def main() -> None:
     options = parse()
     runs = None if options.full else plan.RICH
-    flights = plan.plan(options.clean, options.effects, options.seed, runs)
+    flights = plan.plan(options.clean, options.effects, options.seed, runs, options.many)
     if options.calibrate:
         flights = [f for f in flights if f.kind in ("still", "gusty")]
     make_folder(options.out)
@@ -52,6 +51,10 @@ def parse() -> Any:
     parser.set_defaults(out=Path("runs/study"))
     parser.add_argument("--clean", type=int, default=200, help="flights without effects")
     parser.add_argument("--effects", type=int, default=400, help="flights with effects")
+    parser.add_argument(
+        "--many", type=int, default=0,
+        help=f"gusty flights with {plan.MANY} effects each, for the intervals",
+    )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="24 flights in all")
     parser.add_argument(
         "--full",
@@ -67,20 +70,15 @@ def parse() -> Any:
         help="with --calibrate: what was measured becomes the package's calibration.json",
     )  # fmt: skip
     parser.add_argument("--no-baselines", action="store_true", help="the package alone")
-    parser.add_argument("--jobs", type=int, default=-1, help="flights at once (default: all cores)")
-    parser.add_argument(
-        "--backend", choices=("loky", "ray"), default="loky",
-        help="joblib's own processes, or a Ray cluster (RAY_ADDRESS; else a local one)",
-    )  # fmt: skip
+    command_line.add_workers(parser, "flights", -1)
     options = parser.parse_args()
     if options.quick:
         options.clean, options.effects = QUICK["clean"], QUICK["effects"]
-    if options.clean < 0 or options.effects < 0 or options.clean + options.effects == 0:
+    counts = (options.clean, options.effects, options.many)
+    if min(counts) < 0 or sum(counts) == 0:
         raise InputError("a study needs at least one flight")
     if options.adopt and not options.calibrate:
         raise InputError("--adopt goes with --calibrate")
-    if options.jobs == 0:
-        raise InputError("--jobs must not be 0")
     return options
 
 
@@ -88,48 +86,13 @@ def each(
     flights: list[PlannedFlight], options: Any
 ) -> Iterator[tuple[PlannedFlight, dict[str, Any]]]:
     """Results as they come, of flights worked on in parallel; one job works in this process."""
-    alone = options.no_baselines
-    if options.jobs == 1 and options.backend == "loky":
-        for flight in flights:
-            yield flight, fly_and_diagnose(flight, alone)
-        return
-    require("joblib", "study")
-    from joblib import Parallel, delayed, parallel_config
-
-    ray = options.backend == "ray"
-    jobs = start_ray(options.jobs) if ray else options.jobs
-    work = [delayed(labelled)(flight, alone) for flight in flights]
-    with parallel_config(backend=options.backend, n_jobs=jobs):
-        if not ray:
-            yield from Parallel(return_as="generator_unordered", batch_size=1)(work)
-            return
-        portion = PORTION * jobs  # Ray's backend hands a whole call's results over together
-        for first in range(0, len(work), portion):
-            yield from Parallel(batch_size=1)(work[first : first + portion])
+    work = partial(row_of, options.no_baselines)
+    return workers.each(work, flights, options.jobs, options.backend)
 
 
-def labelled(flight: PlannedFlight, alone: bool) -> tuple[PlannedFlight, dict[str, Any]]:
-    """A flight with its result: they come back in no order."""
-    return flight, fly_and_diagnose(flight, alone)
-
-
-def start_ray(jobs: int) -> int:
-    """Join the cluster of RAY_ADDRESS, or start one here; the number of its workers.
-
-    Every machine of a cluster needs this checkout at the same place.
-    """
-    require("ray", "study")
-    import ray
-    from ray.util.joblib import register_ray
-
-    local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": jobs if jobs > 0 else None}
-    modules = {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    ray.init(
-        include_dashboard=False, logging_level="ERROR", ignore_reinit_error=True,
-        runtime_env={"env_vars": modules}, **local,
-    )  # fmt: skip
-    register_ray()
-    return jobs if jobs > 0 else int(ray.cluster_resources()["CPU"])
+def row_of(alone: bool, flight: PlannedFlight) -> dict[str, Any]:
+    """The result of a flight; `alone`: without the baselines."""
+    return fly_and_diagnose(flight, alone)
 
 
 def adopt(out: Path) -> None:

@@ -1,6 +1,7 @@
 """Do the identification's 95 % intervals hold the truth? Simulated flights in gusts, counted."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,26 +10,24 @@ from study import judge
 from study.coverage import METHODS, fly_and_identify
 from tqdm import tqdm
 
-from coax_env.errors import InputError, require
+from coax_env.errors import InputError
 from coax_env.files import make_folder, write_json, write_text
+from coax_env.workers import each
 
 
 def main() -> None:
     parser = command_line.parser("study_identification", __doc__, seed=True)
     parser.add_argument("--flights", type=int, default=200, help="default: %(default)s")
-    parser.add_argument("--jobs", type=int, default=-1, help="flights at once (default: all cores)")
     parser.add_argument("--peer", action="store_true", help="AeroID on the same doublets, too")
+    command_line.add_workers(parser, "flights", -1)
     options = parser.parse_args()
     if options.flights < 1:
         raise InputError("a study needs at least one flight")
     make_folder(options.out)
     numbers = [1000 * options.seed + k for k in range(options.flights)]
     waiting = [n for n in numbers if not path_of(options.out, n).exists()]
-    require("joblib", "study")
-    from joblib import Parallel, delayed
-
-    work = (delayed(labelled)(n, options.peer) for n in waiting)
-    results = Parallel(n_jobs=options.jobs, return_as="generator_unordered", batch_size=1)(work)
+    work = partial(fly_and_identify, peer=options.peer)
+    results = each(work, waiting, options.jobs, options.backend)
     done = len(numbers) - len(waiting)
     try:
         for number, row in tqdm(results, "study", len(numbers), initial=done, unit="flight"):
@@ -44,11 +43,6 @@ def path_of(folder: Path, number: int) -> Path:
     """File of a flight's result."""
     (folder / "flights").mkdir(exist_ok=True)
     return folder / "flights" / f"{number:06d}.json"
-
-
-def labelled(number: int, peer: bool) -> tuple[int, dict[str, list[dict[str, Any]]]]:
-    """A flight's number with its result: they come back in no order."""
-    return number, fly_and_identify(number, peer)
 
 
 def table(rows: list[dict[str, list[dict[str, Any]]]]) -> str:

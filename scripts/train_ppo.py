@@ -1,19 +1,26 @@
 """Train a hover policy with PPO on the Kalman filter's estimate. Ctrl-C keeps what is learnt."""
 
+import argparse
 import json
 import os
 import shlex
 import sys
+from pathlib import Path
 from typing import Any
 
 import command_line
 from tqdm import tqdm
 
-from coax_env.files import write_json
+from coax_env.errors import InputError
+from coax_env.files import write_bytes, write_json
 from coax_env.sensors import SUITES
-from coax_env.vehicle import load_vehicle
+from coax_env.vehicle import Vehicle, load_vehicle
 from controllers import load_controller, ppo
 from controllers.evaluation import evaluate
+
+FLIGHTS = 100
+CHOSEN_ON, JUDGED_ON = 10_000, 20_000
+"""First seeds of the flights on which the best policy is chosen, and on which it is then judged."""
 
 
 def main() -> None:
@@ -35,11 +42,39 @@ def main() -> None:
         help=f"hyperparameters, as JSON (default: {json.dumps(ppo.SETTINGS)})",
     )  # fmt: skip
     parser.add_argument("--tensorboard", metavar="DIR", help="write TensorBoard's logs there")
+    parser.add_argument(
+        "--seeds", type=int, default=1, metavar="N",
+        help="policies from seed, seed + 1, ...: DIR/seed_K each, the best in DIR (default: 1)",
+    )  # fmt: skip
+    command_line.add_workers(parser, "seeds", 1)
     options = parser.parse_args()
+    if options.seeds < 1:
+        raise InputError(f"need at least one seed, found {options.seeds}")
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
 
     vehicle = load_vehicle(options.vehicle)
-    with tqdm(total=round(options.steps), unit="step", unit_scale=True, disable=None) as bar:
+    training: dict[str, Any] = {
+        "steps": round(options.steps), "nominal": options.nominal, "sensors": options.sensors,
+        "resume": options.resume, "tensorboard": options.tensorboard,
+        "command_line": shlex.join(["scripts/train_ppo.py", *sys.argv[1:]]),
+        "settings": dict(setting(text) for text in options.set),
+    }  # fmt: skip
+    if options.randomize:
+        training["randomize"] = options.randomize
+    if options.seeds == 1:
+        path = train_one(vehicle, options, training)
+        score = judged(path, vehicle, CHOSEN_ON + options.seed)
+    else:
+        path = train_several(vehicle, options, training)
+        score = judged(path, vehicle, JUDGED_ON + options.seed)
+    write_json(options.out / "score.json", score)
+    print(in_words(score))
+    print(f"policy {path}, score {options.out / 'score.json'}")
+
+
+def train_one(vehicle: Vehicle, options: argparse.Namespace, training: dict[str, Any]) -> Path:
+    """DIR/policy.zip, there from the first checkpoint on."""
+    with tqdm(total=training["steps"], unit="step", unit_scale=True, disable=None) as bar:
 
         def progress(steps: int, mean: dict[str, float]) -> None:
             bar.set_postfix(
@@ -47,20 +82,38 @@ def main() -> None:
             )
             bar.update(steps - bar.n)
 
-        more: dict[str, Any] = {"randomize": options.randomize} if options.randomize else {}
-        path = ppo.train(
-            vehicle, options.out, round(options.steps), options.seed, options.nominal,
-            options.sensors, options.resume, progress, options.tensorboard,
-            command_line=shlex.join(["scripts/train_ppo.py", *sys.argv[1:]]),
-            settings=dict(setting(text) for text in options.set), **more,
-        )  # fmt: skip
-    score = evaluate(load_controller(path), vehicle, episodes=100, seed=10_000 + options.seed)
-    write_json(options.out / "score.json", score)
-    print(
-        f"100 flights of 20 s: {100 * score['survival_rate']:.0f} % stay up, "
+        return ppo.train(vehicle, options.out, seed=options.seed, progress=progress, **training)
+
+
+def train_several(vehicle: Vehicle, options: argparse.Namespace, training: dict[str, Any]) -> Path:
+    """DIR/seed_K/policy.zip and score.json of every seed, and a copy of the best in DIR."""
+    seeds = range(options.seed, options.seed + options.seeds)
+    found: dict[int, tuple[Path, dict[str, Any]]] = {}
+    trained = ppo.train_seeds(
+        vehicle, options.out, seeds, options.jobs, options.backend, **training
+    )
+    for seed, path in tqdm(trained, total=len(seeds), unit="policy", disable=None):
+        found[seed] = path, judged(path, vehicle, CHOSEN_ON + options.seed)
+        write_json(path.with_name("score.json"), found[seed][1])
+    for seed in seeds:
+        print(f"seed {seed}: {in_words(found[seed][1])}")
+    best = min(seeds, key=lambda s: (-found[s][1]["success_rate"], found[s][1]["mean_cost"]))
+    print(f"the best, seed {best}, on flights that it was not chosen on:")
+    return write_bytes(options.out / "policy.zip", found[best][0].read_bytes())
+
+
+def judged(path: Path, vehicle: Vehicle, seed: int) -> dict[str, Any]:
+    """The score of a policy."""
+    return evaluate(load_controller(path), vehicle, episodes=FLIGHTS, seed=seed)
+
+
+def in_words(score: dict[str, Any]) -> str:
+    """A score in one line."""
+    return (
+        f"{score['episodes']} flights of {score['seconds']:.0f} s: "
+        f"{100 * score['survival_rate']:.0f} % stay up, "
         f"{100 * score['success_rate']:.0f} % succeed, mean cost {score['mean_cost']:.3g}"
     )
-    print(f"policy {path}, score {options.out / 'score.json'}")
 
 
 def setting(text: str) -> tuple[str, Any]:

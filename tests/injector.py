@@ -466,7 +466,6 @@ def _steps(t: np.ndarray, at: float, unit: float, pattern: Iterable[tuple[float,
     return signal
 
 
-DOUBLET = ((1, -1.0), (1, 1.0))
 T3211 = ((3, 1.0), (2, -1.0), (1, 1.0), (1, -1.0))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import coax_env
-from coax_env import hover
+from coax_env import hover, tasks
 from coax_env.dynamics import WORK_SIZE, kernel_input, step
 from coax_env.errors import InputError
 from coax_env.fleet import DT
@@ -244,6 +244,28 @@ def test_a_crash_is_counted_and_costs():
     json.dumps(score, allow_nan=False)
 
 
+def test_a_score_counts_the_flights_that_succeed_one_by_one():
+    """In wind, on a rotor with drag, some do: each recorded flight judged alone gives the share."""
+    vehicle = LAMA.with_effect("rotor_drag", coefficient=3.5e-4)
+    controller, count, steps, wind = pid.design(LAMA), 12, 500, (2.0, -1.0)
+    score = evaluate(controller, vehicle, count, steps * DT, seed=3, wind=wind)
+    env = gymnasium.make_vec(
+        "CoaxHeli-v0", num_envs=count, vectorization_mode="vector_entry_point", vehicle=vehicle,
+        wind=wind, autoreset_mode="Disabled", max_episode_steps=None,
+    )  # fmt: skip
+    observations, _ = env.reset(seed=3)
+    controller.reset(count)
+    states = []
+    for _ in range(steps):
+        observations, *_, info = env.step(controller.act(observations))
+        states.append(info["state"])
+    goal = np.tile([0.0, 0.0, -hover.HEIGHT, 0.0], (steps, 1))
+    flights = np.swapaxes(states, 0, 1)
+    found = [tasks.succeeded("hover", flight, goal, steps) for flight in flights]
+    assert 0 < sum(found) < count
+    assert score["success_rate"] == pytest.approx(np.mean(found))
+
+
 # --- files ----------------------------------------------------------------------------------------
 
 
@@ -326,7 +348,7 @@ def test_state_feedback_costs_what_its_riccati_solution_says(integral):
         action = design.act(x[:20])
         simulated += known @ Q @ known + action @ R @ action
         step(x, kernel_input(command + design.action_scale * action), DT, LAMA.vector, work, x)
-        known = np.concatenate([x[:20] - trim[:20], design._integrals[0]])
+        known = np.concatenate([x[:20] - trim[:20], design.integrals[0]])
     assert simulated == pytest.approx(predicted, rel=2e-3)
 
 

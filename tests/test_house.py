@@ -12,17 +12,17 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("coax_env", "controllers")
 
-GROUND = "errors files layout log_units"
+GROUND = "errors files layout log_units workers"
 MODEL = "parameters flow effects dynamics generic_terms jit late random_streams"
 RECORDS = "flight foreign_columns outliers autopilot_logs"
 MACHINE = "vehicle maneuvers multisine sensors"
 ENVIRONMENT = "env fleet hover"
 FITTING = (
     "heli_model prediction gain search diagnosis next_maneuver unlisted vibration identification "
-    "flight_plan flight_check two_step closed_loop calibration"
+    "flight_plan flight_check two_step closed_loop calibration trajectories"
 )
 SHOWN = "figures report"
-WORDS = "plain_words"
+WORDS = "plain_words consequences"
 
 # what may not be reached from what, over any number of imports, those inside functions too
 ARROWS: tuple[tuple[str, str, str], ...] = (

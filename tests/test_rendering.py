@@ -1,4 +1,4 @@
-"""Pictures of CoaxHeli-v0, without a screen; and the batch as Stable-Baselines3 wants it."""
+"""Pictures of CoaxHeli-v0, without a screen."""
 
 import importlib.util
 import warnings

@@ -1,20 +1,37 @@
 """Reports: self-contained, small enough to send, and saying what the findings say."""
 
+import asyncio
 import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
+import browser
+import diagnose as diagnose_script
 import numpy as np
 import pytest
 
-from coax_env import effects, figures, identify, load_vehicle, plain_words, report, simulate
+from coax_env import (
+    consequences,
+    derivative,
+    effects,
+    figures,
+    hover_trim,
+    identify,
+    load_vehicle,
+    plain_words,
+    report,
+    simulate,
+)
 from coax_env import simulation as sim
 from coax_env.diagnosis import Diagnosis
 from coax_env.engine.whiteness import Whiteness
 from coax_env.identification import RunEstimate
+from coax_env.layout import STATES
 from coax_env.prediction import ChannelReplay, RunReplay
+from coax_env.report.flight_view import flight_view
 from coax_env.report.page import figure, inline, table
+from coax_env.trajectories import RESTART, trajectories
 from coax_env.vehicle import Parameter
 
 LAMA = load_vehicle("lama400d")
@@ -24,7 +41,7 @@ CHANNELS = ("h", "phi", "az")
 class Outline(HTMLParser):
     """Text, headings and external addresses of a page; fails on tags that do not nest."""
 
-    VOID = ("meta", "br", "link", "img")
+    VOID = ("meta", "br", "link", "img", "input")
 
     def __init__(self, text):
         super().__init__()
@@ -97,7 +114,7 @@ def diagnosis(**changes):
         "held_out": ["low_hover"], "horizon_s": 1.0,
         "channels": {"h": entry(0.21, 0.06, "m"), "phi": entry(0.02, 0.02, "rad")},
         "error_removed_percent": 71.4, "ci95": [66.0, 75.0], "refitted_base_percent": -0.2,
-        "noise_floor_percent": 98.0,
+        "noise_floor_percent": 98.0, "black_box_percent": 45.6,
     }  # fmt: skip
     findings = {
         "verdict": "explained",
@@ -134,20 +151,48 @@ def diagnosis(**changes):
     )
 
 
-def test_diagnosis_page_says_what_was_found():
-    page = report.diagnosis_page(diagnosis(), "scripts/diagnose.py <flight>")
+def score(cost):
+    return {
+        "success_rate": 0.95, "mean_cost": cost, "height_rms_m": 0.02, "velocity_rms_mps": 0.1,
+        "heading_rms_deg": 3.0 * cost, "drift_m": 0.4, "episodes": 20, "seconds": 20.0,
+    }  # fmt: skip
+
+
+FLOWN = report.FlownControllers(
+    {"bare": score(1.75), "extended": score(0.5)}, "the machine itself", "An LQG of each."
+)
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory):
+    """What scripts/diagnose.py writes for the diagnosis above, its controllers flown."""
+    out = tmp_path_factory.mktemp("report") / "out"
+    diagnose_script.save(diagnosis(), out, "scripts/diagnose.py <flight>", FLOWN)
+    return out
+
+
+def test_diagnosis_page_says_what_was_found(made):
+    page = (made / "report.html").read_text(encoding="utf-8")
     text = Outline(page).text
     for words in (
         "Ground effect and axial damping explain what the simulation got wrong",
-        "removes 71 % (66 to 75 %, 95 % interval)",
-        "would remove 0 %",
-        "+6.2 % thrust at 0.25 m",
-        "gain 0.500 ± 0.020",
+        "71 % of the error of a 1 s prediction is gone on runs that the fit has not seen",
+        "66 to 75 %, 95 % interval",
+        "0 %by refitting alone",
+        "46 %by a black boxof 270 generic terms",
+        "Two runs of a lama400d",
+        "the bare model misses height by 0.21 m (4.2 times the sensor's noise)",
+        "+6.2 % (5.1 to 7.4) thrust at 0.25 m",
+        "16 sigma, 123 nats",
         "These flights cannot tell it from airframe drag",
         "Cannot be mistaken for another effect",
-        "Fly next: climb descend",
+        "Axial damping cannot be told from airframe drag",
+        "Fly next: climb descend. It parts axial damping and airframe drag: W.",
         "false cause through in 1 % of them",
+        "Nothing beyond noise and gusts is left",
         "outliers in h removed: 12",
+        "Flown on the machine itself, 20 flights of 20 s each",
+        "95 % with the bare model's and 95 % with the extended model's",
         "scripts/diagnose.py <flight>",
         "axial damping -> rotor drag",
     ):
@@ -155,13 +200,224 @@ def test_diagnosis_page_says_what_was_found():
     assert "fit <b>" not in page
 
 
-def test_pages_are_self_contained_and_small():
-    page = report.diagnosis_page(diagnosis())
+def test_pages_are_self_contained_and_small(made):
+    page = (made / "report.html").read_text(encoding="utf-8")
     assert not Outline(page).external
     assert page.count("Plotly.newPlot(plot") == 1
-    assert len(page.encode()) < 6e6
-    for content in re.findall(r'<script type="application/json">(.*?)</script>', page):
-        assert set(json.loads(content)) == {"data", "layout"}
+    assert len(page.encode()) < 5e6
+    contents = re.findall(r'<script type="application/json">(.*?)</script>', page)
+    assert all({"data", "layout"} == set(c) or "runs" in c for c in map(json.loads, contents))
+
+
+# --- as a browser shows it ------------------------------------------------------------------------
+
+LIBRARY = """
+const rest = time => new Promise(done => setTimeout(done, time));
+const part = name => document.querySelector(`.flight [data-part="${name}"]`);
+const tell = (one, kind) => one.dispatchEvent(new Event(kind));
+const shown = one => one.checkVisibility();
+const picture = () => document.querySelector('.scene').toDataURL();
+async function scroll() { // lazy figures are drawn as they come near
+  await library;
+  const root = document.documentElement;
+  for (let y = 0; y < root.scrollHeight; y += 700) { scrollTo(0, y); await rest(60); }
+  scrollTo(0, 0);
+}
+function colours(canvas) {
+  const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d');
+  copy.drawImage(canvas, 0, 0);
+  const {data} = copy.getImageData(0, 0, canvas.width, canvas.height);
+  return new Set(new Uint32Array(data.buffer)).size;
+}
+function state() {
+  const words = [...document.querySelectorAll('body *')].filter(one => shown(one) &&
+    [...one.childNodes].some(n => n.nodeType === 3 && n.textContent.trim()));
+  return {
+    wide: document.documentElement.scrollWidth, screen: document.documentElement.clientWidth,
+    smallest: Math.min(...words.map(one => parseFloat(getComputedStyle(one).fontSize))),
+    plots: [...document.querySelectorAll('.plot')].filter(shown).map(plot => ({
+      marks: plot.querySelectorAll('.trace path, .points path, .point, .shapelayer path').length,
+      right: Math.max(0, ...[...plot.querySelectorAll('.main-svg')].map(
+        svg => svg.getBoundingClientRect().right)),
+      ink: plot.layout ? plot.layout.template.layout.font.color : 'not drawn'})),
+    canvases: [...document.querySelectorAll('canvas')].filter(shown).map(colours),
+    ground: getComputedStyle(document.body).backgroundColor,
+    folded: [...document.querySelectorAll('details.numbers')].filter(one => !one.open).length,
+    buttons: [...document.querySelectorAll('button')].filter(shown).length,
+  };
+}
+"""
+
+EVERY_CHOICE = """(async () => {
+  const found = [];
+  document.querySelectorAll('details').forEach(one => { one.open = true; });
+  for (const chooser of document.querySelectorAll('.chooser')) {
+    const [first, second] = chooser.querySelectorAll('select');
+    for (const a of first.options) for (const b of second.options) {
+      first.value = a.value; second.value = b.value; tell(first, 'change');
+      await rest(50);
+      const choice = chooser.querySelector('.choice:not([hidden])');
+      if (choice) found.push([choice.dataset.key, choice.querySelectorAll('.trace').length]);
+    }
+  }
+  return found;
+})()"""
+
+PLAY = """(async () => {
+  const slider = part('time'), play = part('play'), run = part('run'), seen = {runs: []};
+  slider.value = slider.min; tell(slider, 'input');
+  const [first, start] = [picture(), part('clock').textContent];
+  part('speed').value = '4';
+  play.click(); await rest(800);
+  seen.while = play.textContent;
+  play.click();
+  seen.clock = [start, part('clock').textContent];
+  seen.moved = picture() !== first && Number(slider.value) > Number(slider.min);
+  const paused = picture(); await rest(200);
+  seen.stays = picture() === paused;
+  slider.value = slider.max; tell(slider, 'input');
+  seen.end = part('clock').textContent;
+  for (const option of run.options) {
+    run.value = option.value; tell(run, 'change');
+    seen.runs.push([option.value, part('words').textContent, picture()]);
+  }
+  const all = picture();
+  document.querySelector('[data-model="0"]').click();
+  seen.hidden = picture() !== all;
+  return seen;
+})()"""
+
+
+async def look(page):
+    """Everything about the report that the tests below ask."""
+    found = {"touched": []}
+    await page.ask(f"{LIBRARY}; scroll()")
+    found["desk"] = await page.ask("state()")
+    found["numbers"] = await page.ask(
+        "[...document.querySelectorAll('data')].map(d => [d.dataset.of, d.value, d.textContent])"
+    )
+    found["played"] = await page.ask(PLAY)
+    found["choices"] = await page.ask(EVERY_CHOICE)
+    await page.ask("document.querySelectorAll('details').forEach(one => { one.open = false; })")
+    for name, dark in (("phone", False), ("dark", True)):
+        await page.show(browser.PHONE, dark)
+        await page.ask("scroll().then(() => rest(500))")
+        found[name] = await page.ask("state()")
+    await page.ask("document.querySelector('.scene').scrollIntoView({block: 'center'})")
+    box = await page.ask(
+        "(r => [r.x, r.y])(document.querySelector('.scene').getBoundingClientRect())"
+    )
+    for x in (150, 190, 230):
+        kind = "touchStart" if x == 150 else "touchMove"
+        point = {"x": box[0] + x, "y": box[1] + 100}
+        await page.send("Input.dispatchTouchEvent", type=kind, touchPoints=[point])
+        await asyncio.sleep(0.1)
+        found["touched"].append(await page.ask("picture()"))
+    await page.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    await page.show((700, 900), dark=True, paper=True)
+    await page.ask("tell(window, 'beforeprint'); rest(800)")
+    found["paper"] = await page.ask("state()")
+    await page.ask("tell(window, 'afterprint')")
+    await page.show(browser.DESK)
+    found["after"] = await page.ask("rest(300).then(state)")
+    found["pdf"] = await page.print()
+    found["faults"] = page.faults
+    return found
+
+
+@pytest.fixture(scope="session")
+def seen(made):
+    return browser.visit(made / "report.html", look)
+
+
+@browser.needed
+def test_the_console_is_silent(seen):
+    assert seen["faults"] == []
+
+
+@browser.needed
+def test_every_figure_is_drawn(seen):
+    for screen in ("desk", "phone", "dark", "paper"):
+        state = seen[screen]
+        assert len(state["plots"]) >= 3 and all(p["marks"] for p in state["plots"]), screen
+        assert len(state["canvases"]) == 2 and all(c > 5 for c in state["canvases"]), screen
+    assert len(seen["choices"]) > 6 and all(traces for _, traces in seen["choices"])
+
+
+@browser.needed
+def test_every_number_shown_is_that_of_findings_json(seen, made):
+    findings = json.loads((made / "findings.json").read_text())
+    shown = set()
+    for place, exact, text in seen["numbers"]:
+        value = findings
+        for step in place.split("/"):
+            value = value[int(step) if isinstance(value, list) else step]
+        assert float(exact) == value, place
+        digits, _, power = re.search(r"-?[\d.]+(e-?\d+)?", text.replace("−", "-"))[0].partition("e")
+        unit = 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))
+        assert abs(float(digits) * 10.0 ** int(power or 0) - value) <= 0.5001 * unit, (place, text)
+        shown.add(place)
+    for k, cause in enumerate(findings["causes"]):
+        assert f"causes/{k}/evidence" in shown
+        for name in cause["parameters"]:
+            assert {f"causes/{k}/parameters/{name}/{x}" for x in ("value", "std")} <= shown
+    for channel in findings["gain"]["channels"]:
+        keys = ("before", "before_refitted", "after", "noise", "ci95/0", "ci95/1")
+        assert {f"gain/channels/{channel}/{key}" for key in keys} <= shown
+    whole = ("error_removed_percent", "refitted_base_percent", "noise_floor_percent",
+             "black_box_percent", "ci95/0", "ci95/1")  # fmt: skip
+    assert {f"gain/{key}" for key in whole} <= shown
+
+
+@browser.needed
+def test_the_page_fits_a_phone(seen):
+    for screen in ("phone", "dark"):
+        assert seen[screen]["screen"] == browser.PHONE[0]
+        assert seen[screen]["wide"] <= browser.PHONE[0]
+        assert all(p["right"] <= browser.PHONE[0] for p in seen[screen]["plots"])
+    assert all(seen[screen]["smallest"] >= 13.9 for screen in ("desk", "phone", "dark"))
+
+
+@browser.needed
+def test_the_reader_chooses_light_or_dark(seen):
+    grounds, inks = [], []
+    for screen in ("phone", "dark", "paper"):
+        grounds.append(sum(map(int, re.findall(r"\d+", seen[screen]["ground"])[:3])))
+        inks.append({p["ink"] for p in seen[screen]["plots"]})
+    assert grounds[0] > 700 and grounds[1] < 150 and grounds[2] > 700  # paper is white
+    assert inks[0] == inks[2] == {figures.template(False)["layout"]["font"]["color"]}
+    assert inks[1] == {figures.template(True)["layout"]["font"]["color"]}
+
+
+@browser.needed
+def test_the_page_prints(seen):
+    """Figures fit the sheet, the tables are open, nothing is left to click; all as before after."""
+    paper = seen["paper"]
+    assert paper["wide"] <= 700 and all(p["right"] <= 700 for p in paper["plots"])
+    assert paper["folded"] == 0 and paper["buttons"] == 0
+    assert seen["after"]["folded"] == 2 and seen["after"]["buttons"] == seen["desk"]["buttons"]
+    assert seen["pdf"].startswith(b"%PDF") and len(seen["pdf"]) > 50_000
+
+
+@browser.needed
+def test_the_flight_is_replayed(seen):
+    played = seen["played"]
+    assert played["moved"] and played["while"] == "Pause" and played["stays"] and played["hidden"]
+    start, now, end = (float(w.split()[0]) for w in (*played["clock"], played["end"]))
+    assert start == 0.0 and 1.0 < now < 8.0 < end
+    names, words, pictures = zip(*played["runs"], strict=True)
+    assert {n.split(" ")[0] for n in names} == {"hover", "low_hover"}
+    assert "low_hover (held out of the fit)" in names and len(set(pictures)) == 2
+    for text in words:
+        assert re.fullmatch(r"bare [\d.]+ m off, extended [\d.]+ m off", text)
+
+
+@browser.needed
+def test_a_finger_turns_the_flight(seen):
+    assert len(set(seen["touched"])) == 3
+
+
+# --- what a page says -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -178,7 +434,7 @@ def test_pages_are_self_contained_and_small():
             },
             "Unexplained structure is left in pitch rate",
         ),
-        ({"verdict": "partly explained"}, "explain a part; something else is left"),
+        ({"verdict": "partly explained"}, "explain a part of what the simulation got wrong"),
         ({"gain": None}, "how well this predicts is not known"),
         ({"next_maneuver": None, "false_alarm_rate": None}, "has not been calibrated"),
         ({"causes": [finding("cg_offset", x=0.05, y=0.0)]}, "outside the usual range"),
@@ -244,7 +500,7 @@ def two_steps():
 def test_two_step_page(two_steps):
     page = report.two_step_page(two_steps)
     outline = Outline(page)
-    assert not outline.external and len(page.encode()) < 6e6
+    assert not outline.external and len(page.encode()) < 5e6
     text = " ".join(outline.text.split())
     assert "The paper's two steps on 1 run of lama400d" in text
     assert "1 number found" in text and "Table VIII examined" in text
@@ -257,16 +513,166 @@ def test_two_step_page(two_steps):
         assert set(json.loads(content)) == {"data", "layout"}
 
 
-# --- words and figures ----------------------------------------------------------------------------
+# --- what causes mean -----------------------------------------------------------------------------
+
+
+def usual(name, side=1.0):
+    """A cause of usual size with stds of a tenth of it."""
+    values = {p.name: p.off + side * p.usual for p in effects.CATALOGUE[name].parameters}
+    return finding(name, **values)
 
 
 @pytest.mark.parametrize("name", list(effects.CATALOGUE))
 def test_every_effect_reads_well(name):
+    """A number with its unit and interval, what it does, how sure that is: in one sentence."""
     parameters = effects.CATALOGUE[name].parameters
-    values = {p.name: p.off + p.usual for p in parameters}
-    words = plain_words.consequence(name, values, LAMA)
-    assert "nan" not in words and "_" not in words and len(words) < 90
-    assert not plain_words.outside_usual(name, {p.name: p.off for p in parameters})
+    for side in (1.0, -1.0):
+        if side < 0.0 and any(p.lower > p.off - p.usual for p in parameters):
+            continue
+        words = consequences.sentence(usual(name, side), LAMA, LAMA)
+        assert words.startswith(plain_words.title(name) + ": ")
+        assert words.endswith("; 16 sigma; cannot be mistaken on these flights.")
+        assert "nan" not in words and "_" not in words and "inf" not in words
+        number = r"[+−]?\d[\d.]*( ?(%|°|°/s|°/s²|ms|s|g|mm|m/s|m/s²))? \([−\d.]+ to [−\d.]+\)"
+        assert re.search(number, words), words
+        assert len(words.split("; ")[0].split(" ")) > 8, words
+    assert not consequences.outside_usual(name, {p.name: p.off for p in parameters})
+
+
+def stated(name, **values):
+    """The numbers of an effect, in the catalogue's order."""
+    size = len(values)
+    told = consequences.consequences(name, values, np.zeros((size, size)), LAMA)
+    return [s.value for s in told]
+
+
+AT_HOVER = [
+    ("torque_balance", {"scale": 0.05}, {}, "r", lambda told: -np.radians(told[1])),
+    ("ground_effect", {"gain": 0.3}, {"z": -0.25}, "w", lambda told: -9.804 * told[0] / 100),
+    ("ground_effect", {"gain": 0.3}, {"z": -0.5}, "w", lambda told: -9.804 * told[1] / 100),
+    ("axial_damping", {"coefficient": 0.1}, {"w": -1.0}, "w", lambda told: -9.804 * told[0] / 100),
+    ("rotor_drag", {"coefficient": 4e-4}, {"u": 1.0}, "u", lambda told: -told[0]),
+    ("airframe_drag", {"area_x": 0.02}, {"u": 3.0}, "u", lambda told: -told[0]),
+    ("airframe_drag", {"area_y": 0.01}, {"v": 3.0}, "v", lambda told: -told[1]),
+    ("yaw_damping", {"coefficient": 4e-3}, {"r": np.pi / 2}, "r", lambda told: -np.radians(told[0])),
+    ("rate_damping", {"coefficient": 4e-3}, {"p": np.pi / 2}, "p", lambda told: -np.radians(told[0])),
+    ("rate_damping", {"coefficient": 4e-3}, {"q": np.pi / 2}, "q", lambda told: -np.radians(told[1])),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "values", "moved", "rate", "expected"), AT_HOVER)
+def test_what_is_said_of_an_effect_is_what_the_model_does(name, values, moved, rate, expected):
+    """The change that an effect makes to the state's rates, from the bare model's hover."""
+    names = [state for state, _ in STATES]
+    state, command = hover_trim(LAMA)
+    for key, value in moved.items():
+        state[names.index(key)] = value
+    with_it = derivative(state, command, LAMA.with_effect(name, **values))
+    change = (with_it - derivative(state, command, LAMA))[names.index(rate)]
+    assert change == pytest.approx(expected(stated(name, **values)), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "place"),
+    [("added_mass", {"mass": 0.05}, 1), ("thrust_scale", {"scale": -0.07}, 1)],
+)
+def test_the_rotor_speed_to_hover_is_the_trim_s(name, values, place):
+    bare, changed = (hover_trim(v)[1][:2].mean() for v in (LAMA, LAMA.with_effect(name, **values)))
+    assert 100.0 * (changed / bare - 1.0) == pytest.approx(stated(name, **values)[place], rel=0.02)
+
+
+def test_intervals_hold_what_the_covariance_says():
+    """Against draws: 95 % of what the parameters' spread makes of a consequence."""
+    values = {"gain": 0.5, "decay": 2.0}
+    covariance = np.array([[0.02**2, 0.7 * 0.02 * 0.1], [0.7 * 0.02 * 0.1, 0.1**2]])
+    told = consequences.consequences("ground_effect", values, covariance, LAMA)[0]
+    draws = np.random.default_rng(0).multivariate_normal(list(values.values()), covariance, 20_000)
+    rises = 100.0 * draws[:, 0] * np.exp(-draws[:, 1] * 0.25 / 0.25)
+    low, high = np.percentile(rises, [2.5, 97.5])
+    assert (told.value - told.half, told.value + told.half) == pytest.approx((low, high), rel=0.03)
+
+
+def test_a_cause_s_interval_knows_its_correlation():
+    """Two numbers that move together leave their difference well known."""
+    cause = finding("ground_effect", gain=0.5, decay=2.0)
+    tied = replace(
+        LAMA, correlated=("ground_effect.gain", "ground_effect.decay"),
+        correlation=np.array([[1.0, 0.9], [0.9, 1.0]]),
+    )  # fmt: skip
+    alone, together = (consequences.covariance_of(cause, v) for v in (LAMA, tied))
+    np.testing.assert_allclose(np.diag(alone), np.diag(together))
+    assert alone[0, 1] == 0.0
+    assert together[0, 1] == pytest.approx(0.9 * np.sqrt(alone[0, 0] * alone[1, 1]))
+
+
+def test_what_an_interval_cannot_tell_from_zero_is_not_said():
+    words = consequences.told(finding("gyro_bias", x=1e-5, y=-0.012, z=0.0), LAMA, LAMA)
+    cause = finding("gyro_bias", x=1e-5, y=-0.012, z=0.0)
+    cause["parameters"]["gyro_bias.x"]["std"] = 3e-4
+    assert "roll" in words
+    words = consequences.told(cause, LAMA, LAMA)
+    assert words == "the pitch gyro reads 0.69°/s (0.63 to 0.74) too low"
+
+
+# --- the flight replayed --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """A machine with a drag that its bare model lacks, and its paths."""
+    machine = LAMA.with_effect("rotor_drag", coefficient=8e-4)
+    flight = simulate(machine, ["hover", "forward_run"], seed=2)
+    return flight, machine, trajectories(flight, machine, {"bare": LAMA, "true": machine})
+
+
+def test_simulations_start_on_the_measured_path(pushed):
+    flight, _, paths = pushed
+    assert [p.run for p in paths] == list(flight.run_names)
+    for one in paths:
+        starts = one.t[one.begins]
+        assert np.diff(starts) == pytest.approx(RESTART, abs=0.06)
+        for simulated in one.simulated.values():
+            np.testing.assert_array_equal(simulated[one.begins], one.measured[one.begins])
+
+
+def test_the_true_model_stays_and_the_bare_one_leaves(pushed):
+    _, _, paths = pushed
+    ends = np.flatnonzero(paths[1].begins)[1:] - 1
+    bare, true = (paths[1].astray(m)[ends].mean() for m in ("bare", "true"))
+    assert bare > 3.0 * true and true < 0.3
+    assert paths[1].parted().max() > 0.3 and np.isfinite(paths[1].parted()).all()
+
+
+def test_the_measured_path_is_the_flight_s(pushed):
+    """Where velocity was measured: the path's own slope is that velocity."""
+    flight, _, paths = pushed
+    one, run = paths[1], flight.runs[1]
+    slope = np.gradient(one.measured[:, 0], one.t)
+    there = np.isfinite(run.measured["vn"])
+    measured = np.interp(one.t, run.t[there], run.measured["vn"][there])
+    assert np.sqrt(np.mean((slope - measured) ** 2)) < 0.25  # the sensor's 0.2 m/s
+    heights = np.interp(one.t, run.t, -run.t * 0 + np.nanmedian(run.measured["h"]))
+    assert np.abs(one.measured[:, 2] - heights).max() < 1.0
+
+
+def test_a_long_flight_has_fewer_frames(pushed, monkeypatch):
+    flight, machine, paths = pushed
+    monkeypatch.setattr("coax_env.trajectories.MOST_FRAMES", 200)
+    thin = trajectories(flight, machine, {"bare": LAMA})
+    assert sum(len(p.t) for p in thin) <= 200 < sum(len(p.t) for p in paths)
+
+
+def test_a_simulation_that_runs_away_is_left_out(pushed):
+    flight, machine, _ = pushed
+    wild = LAMA.with_values({"inertia_xx": 1e-9, "inertia_yy": 1e-9})
+    with np.errstate(all="ignore"):
+        paths = trajectories(flight, machine, {"wild": wild})
+    assert np.isnan(paths[0].simulated["wild"]).any()
+    view = flight_view(paths, {"wild": "#000000"}, 0.25, (), "")
+    assert "NaN" not in view
+
+
+# --- words and figures ----------------------------------------------------------------------------
 
 
 def test_numbers_as_people_write_them():
@@ -281,7 +687,7 @@ def test_numbers_as_people_write_them():
 
 def test_text_is_escaped():
     assert inline("<b> **x** `y`") == "&lt;b&gt; <strong>x</strong> <code>y</code>"
-    assert "<script>" not in table(["<script>"], [["<script>", "1"]])
+    assert "<script>" not in table(["<script>"] * 2, [["<script>", "1"]])
     closing = figures.heat_map(["</script>"], ["a"], np.eye(1), [["1"]], "x")
     assert figure(closing).count("</script>") == 1
 

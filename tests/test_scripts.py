@@ -272,7 +272,7 @@ def test_a_planned_flight_is_a_flight_folder(tmp_path):
 @pytest.mark.slow
 def test_diagnose_writes_what_the_contract_says(tmp_path):
     flight = injector.fly(tmp_path / "flight", {"gyro_bias": {}}, runs=["lon_3211", "lat_3211"])
-    done = script("diagnose.py", flight, "--hold-out", "lat_3211", cwd=tmp_path)
+    done = script("diagnose.py", flight, "--hold-out", "lat_3211", "--fly", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     out = tmp_path / "runs" / "diagnose"
     assert {p.name for p in out.iterdir()} == {"findings.json", "vehicle.toml", "report.html"}
@@ -283,6 +283,7 @@ def test_diagnose_writes_what_the_contract_says(tmp_path):
     assert "gyro_bias" in load_vehicle(out / "vehicle.toml").effects
     page = (out / "report.html").read_text()
     assert "gyro bias" in page.lower() and 'src="http' not in page
+    assert "Controllers before and after" in page
 
 
 @pytest.mark.slow

@@ -63,6 +63,17 @@ def test_a_full_study_has_every_effect_with_both_sensor_sets() -> None:
         assert not any(judge.tied(a, b) for a in names for b in names if a != b)
 
 
+def test_flights_for_the_intervals_shake_and_hide_what_both_sides_write_alike() -> None:
+    flights = plan.plan(2, 2, many=30)
+    many = [f for f in flights if f.kind == "many"]
+    assert len(many) == 30 and len(flights) == 34
+    assert [f for f in flights if f.kind != "many"] == plan.plan(2, 2)
+    other_form = {name.partition(".")[0] for name in injector.OTHER_FORM}
+    for flight in many:
+        assert flight.gusts and len(flight.effects) == plan.MANY
+        assert not other_form & set(flight.effects)
+
+
 def test_any_part_of_the_plan_is_a_fair_sample() -> None:
     flights = plan.plan(200, 400)
     early = [f.kind for f in flights[:60]]

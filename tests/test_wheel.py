@@ -1,15 +1,21 @@
 """The wheel: what is in it, and that it flies where there is no checkout."""
 
+import json
 import os
+import re
 import subprocess
 import sys
+import sysconfig
+import venv
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import coax_env
 
+Done = subprocess.CompletedProcess
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", "coax_env", "controllers", "scripts")
 
@@ -34,6 +40,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
         capture_output=True, text=True, check=False, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
+    assert "would be ignored" not in done.stdout + done.stderr, "data that setuptools may leave out"
     return next(folder.glob("*.whl"))
 
 
@@ -54,26 +61,38 @@ def test_the_wheel_has_every_file_of_the_packages(wheel):
     assert wheel.name.startswith(f"coax-{coax_env.__version__}-")
 
 
-@pytest.mark.slow
-def test_the_verbs_work_from_the_wheel(wheel, tmp_path):
-    """`coax`, the quick start and the shipped data, with the wheel in the place of the checkout."""
-    target = tmp_path / "installed"
+@pytest.fixture(scope="module")
+def coax(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Done]:
+    """`coax WORDS`, or a Python text, in an environment that has the wheel and not the checkout.
+
+    The packages that coax needs are lent by this environment, so that nothing is downloaded.
+    """
+    place = tmp_path_factory.mktemp("clean")
+    venv.create(place, with_pip=False, symlinks=True)
+    site = next(place.glob("lib/python*/site-packages"))
+    (site / "lent.pth").write_text(sysconfig.get_path("purelib"))  # its own .pth files do not count
+    python = place / "bin" / "python"
     subprocess.run(
-        [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index",
-         "--target", str(target), str(wheel)],
+        [sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-deps",
+         "--no-index", "--ignore-installed", str(wheel)],
         check=True, timeout=120, capture_output=True,
     )  # fmt: skip
-    env = {**os.environ, "PYTHONPATH": str(target)}
+    folder = tmp_path_factory.mktemp("work")
+    env = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
-    def coax(*words: str, code: int = 0) -> subprocess.CompletedProcess:
-        call = "import sys; from coax_commands.coax import main; sys.exit(main())"
+    def call(*words: str, code: int = 0, text: str = "") -> Done:
+        command = [python, "-c", text] if text else [place / "bin" / "coax", *words]
         done = subprocess.run(
-            [sys.executable, "-c", call, *words],
-            cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300, check=False,
-        )  # fmt: skip
+            command, cwd=folder, env=env, capture_output=True, text=True, timeout=900, check=False
+        )
         assert done.returncode == code, done.stderr[-1500:]
         return done
 
+    return call
+
+
+@pytest.mark.slow
+def test_the_verbs_work_from_the_wheel(coax):
     said = coax("--help").stdout
     for verb in (
         "simulate",
@@ -89,19 +108,33 @@ def test_the_verbs_work_from_the_wheel(wheel, tmp_path):
     refused = coax("check-flight", "nowhere", code=2)
     assert refused.stderr.startswith("error: no flight folder")
     assert len(coax("fly", code=2).stderr.splitlines()) == 1
-    coax("simulate", "--maneuver", "lon_3211,heave_3211", "--out", "sim")
-    assert "next: coax diagnose" in coax("check_flight", "sim/flight").stdout
-    coax("identify", "sim/flight", "--method", "paper", "--out", "steps")  # reads published.toml
-    quick = (
-        "import coax_env, gymnasium; from pathlib import Path; from coax_env.flight import *;"
-        "here = Path(coax_env.__file__).parent;"
-        "assert 'installed' in here.parts, here;"
-        "assert len(read_flight(here / 'flights' / 'windy').runs) == 12;"
-        "env = gymnasium.make('CoaxHeli-v0', vehicle='lama400d'); env.reset(seed=1);"
-        "env.step(env.action_space.sample())"
+    coax("simulate", "--maneuver", "lon_3211,heave_3211", "--out", "my")
+    assert "next: coax diagnose" in coax("check_flight", "my/flight").stdout
+    coax("identify", "my/flight", "--method", "paper", "--out", "steps")  # reads published.toml
+
+
+@pytest.mark.slow
+def test_vehicles_flight_and_policy_come_with_the_wheel(coax):
+    found = coax(
+        text="import json, coax_env; from pathlib import Path\n"
+        "from coax_env.vehicle import shipped_vehicles\n"
+        "from controllers.loading import make_controller\n"
+        "here = Path(coax_env.__file__).parent\n"
+        "flight = coax_env.read_flight(here / 'flights' / 'windy')\n"
+        "print(json.dumps([str(here), len(flight.runs), list(shipped_vehicles()),"
+        " make_controller('ppo').kind]))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", quick], cwd=tmp_path, env=env, capture_output=True, text=True,
-        timeout=200, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-1500:]
+    here, runs, vehicles, kind = json.loads(found.stdout)
+    assert not Path(here).is_relative_to(ROOT) and "site-packages" in here
+    assert (runs, kind) == (12, "ppo") and {"lama400d", "skybotix_coax"} <= set(vehicles)
+
+
+@pytest.mark.slow
+def test_the_readmes_lines_run_from_the_wheel(coax):
+    """From a log to a better hover, as README has it, on a flight of a machine without effects."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    lines = re.search(r"```python\n(.*?)```", readme, re.DOTALL)
+    coax("simulate", "--maneuver", "lon_3211,lat_3211,heave_3211,yaw_3211", "--out", "quick")
+    verdict, score = coax(text=lines[1].replace("my_flight", "quick/flight")).stdout.splitlines()
+    assert verdict == "consistent []"
+    assert "'success_rate': 1.0" in score

@@ -467,7 +467,7 @@ def test_holding_the_target_is_worth_the_most_and_counts_as_success():
         off = still.copy()
         off[:, place] += error
         assert not tasks.succeeded("position", off, aims, steps)
-        early = np.vstack([off[:300], still[300:]])  # the first three seconds do not count
+        early = np.vstack([off[:299], still[299:]])  # before three seconds nothing counts
         assert tasks.succeeded("position", early, aims, steps)
 
 

@@ -6,8 +6,9 @@ identification, effects' parameters free is diagnosis.
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -97,6 +98,20 @@ class Estimate:
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
+class _Room:
+    """Large arrays, filled anew by every pass: fresh memory would cost as much time as a pass."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, np.ndarray] = {}
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
+        """An array of this shape with whatever is in it."""
+        size = math.prod(shape)
+        if name not in self._kept or self._kept[name].size < size:
+            self._kept[name] = np.empty(size, dtype)
+        return self._kept[name][:size].reshape(shape)
+
+
 class Engine:
     """A model, the records it is held against, and the two passes over them.
 
@@ -109,6 +124,7 @@ class Engine:
         self.threads = threads or int(os.environ.get("COAX_THREADS", "2"))
         self.starts = [model.start(r) for r in self.records]
         self.intervals = [np.append(np.diff(r.t), 0.0) for r in self.records]
+        self._rooms: list[_Room] = []  # that no thread works in
 
     def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
         """Work done on every run (or those in `which`), the longest first so that no thread waits."""
@@ -119,6 +135,17 @@ class Engine:
                 for i in sorted(indices, key=lambda i: -self.records[i].t.size)
             }
             return [begun[i].result() for i in indices]
+
+    @contextmanager
+    def _room(self) -> Iterator[_Room]:
+        try:
+            room = self._rooms.pop()
+        except IndexError:
+            room = _Room()
+        try:
+            yield room
+        finally:
+            self._rooms.append(room)
 
     def filter(
         self,
@@ -138,7 +165,8 @@ class Engine:
 
         def one(i: int) -> RunPass:
             starts = None if start_rows is None else start_rows[i]
-            return self._filter_run(i, p, q, R, noise, keep, start_rows=starts)[0]
+            room = _Room() if keep else None
+            return self._filter_run(i, p, q, R, noise, room, start_rows=starts)[0]
 
         return self._each(one, which)
 
@@ -152,11 +180,14 @@ class Engine:
         q: np.ndarray,
         R: np.ndarray,
         noise: Noise,
-        keep: bool,
-        jacobians: bool = False,
+        keep: _Room | None,
+        along: _Room | None = None,
         start_rows: np.ndarray | None = None,
     ) -> tuple[RunPass, Along]:
-        """The filter pass of a run, and what it went along (empty unless asked for)."""
+        """The filter pass of a run, and what it went along.
+
+        keep: room for gains and whitening, along: room for the rest; empty without one.
+        """
         record = self.records[i]
         n, m = record.z.shape
         nx = q.size
@@ -165,12 +196,13 @@ class Engine:
         P0 = P0 + np.diag(self.model.start_noise(noise))
         e = np.full((n, m), np.nan)
         states = np.zeros((n, nx))
-        rows = n if keep else 0
-        K = np.zeros((rows, m, nx), np.float32)
-        W = np.zeros((rows, m, m), np.float32)
-        H = np.zeros((n if jacobians else 0, m, nx), np.float32)
-        F = np.zeros((n if jacobians else 0, nx, nx), np.float32)
-        predicted = np.zeros((n if jacobians else 0, nx))
+        rows, room = (0, _Room()) if keep is None else (n, keep)
+        K = room.array("K", (rows, m, nx), np.float32)
+        W = room.array("W", (rows, m, m), np.float32)
+        rows, room = (0, _Room()) if along is None else (n, along)
+        H = room.array("H", (rows, m, nx), np.float32)
+        F = room.array("F", (rows, nx, nx), np.float32)
+        predicted = room.array("predicted", (rows, nx))
         starts = np.empty(0, np.int64) if start_rows is None else start_rows
         slots = np.full(n, -1, np.int64)
         slots[starts] = np.arange(starts.size)
@@ -179,8 +211,10 @@ class Engine:
             self.model.step, self.model.measure, self.model.drift, self.model.exact,
             self.intervals[i], u, record.z, self.model.wraps, x0, P0, R, q, p,
             self.model.state_scale, self.model.work_size, GATE, REFRESH,
-            keep, states, e, K, W, slots, P, H, F, predicted,
+            keep is not None, states, e, K, W, slots, P, H, F, predicted,
         )  # fmt: skip
+        if not np.isfinite(log_likelihood):
+            K[:], W[:] = 0.0, 0.0
         run = RunPass(record, u, log_likelihood, e, states, deweighted, K, W, starts, P)
         return run, Along(H, F, predicted)
 
@@ -211,31 +245,40 @@ class Engine:
         ]
 
         def one(i: int) -> tuple[Any, ...]:
-            run, along = self._filter_run(i, p, q, R, noise, keep=True, jacobians=True)
-            e = np.nan_to_num(run.innovations)
-            J = np.zeros((*e.shape, len(free)))
-            near = np.flatnonzero(~far)
-            if np.isfinite(run.log_likelihood):
-                J[:, :, near] = self._signatures(
-                    i, run, along, p, [moved[k] for k in near], steps[near], reading_only[near]
+            with self._room() as room:
+                run, along = self._filter_run(i, p, q, R, noise, _Room(), room)
+                there = np.isfinite(run.innovations)
+                e = run.innovations[there]
+                J = room.array("J", (e.size, len(free)))
+                near = np.flatnonzero(~far)
+                if np.isfinite(run.log_likelihood):
+                    self._signatures(
+                        i, run, along, p, [moved[k] for k in near], steps[near],
+                        reading_only[near], near, J,
+                    )  # fmt: skip
+                else:
+                    J[:] = 0.0
+                probed = np.zeros(there.shape)
+                for k in np.flatnonzero(far):
+                    J[:, k] = 0.0
+                    if self._frozen(i, run, moved[k], probed):
+                        change = probed[there] - e
+                        if np.abs(change).max() < HUGE:
+                            J[:, k] = change / steps[k]
+                information = J.T @ J
+                wild = ~np.isfinite(np.diag(information))
+                if wild.any():
+                    J[:, wild] = 0.0
+                    information[wild] = information[:, wild] = 0.0
+                row, channel = np.nonzero(there)
+                t = run.record.t
+                edges = np.searchsorted(t, np.arange(t[0] + STRETCH, t[-1], STRETCH))
+                parts = np.split(np.arange(e.size), np.searchsorted(row, edges))
+                stretches = np.array([e[part] @ J[part] for part in parts])
+                by_channel = np.array(
+                    [np.square(J[channel == c]).sum(0) for c in range(there.shape[1])]
                 )
-            there = np.zeros(e.shape)
-            for k in np.flatnonzero(far):
-                if self._frozen(i, run, moved[k], there) and np.abs(there - e).max() < HUGE:
-                    J[:, :, k] = (there - e) / steps[k]
-            flat = J.reshape(-1, len(free))
-            information = flat.T @ flat
-            wild = ~np.isfinite(np.diag(information))
-            if wild.any():
-                flat[:, wild] = 0.0
-                information[wild] = information[:, wild] = 0.0
-            slopes = np.einsum("nmk,nm->nk", J, e)
-            t = run.record.t
-            edges = np.searchsorted(t, np.arange(t[0], t[-1], STRETCH))
-            return (
-                run, information, slopes.sum(0), np.einsum("nmk,nmk->km", J, J),
-                np.add.reduceat(slopes, edges),
-            )  # fmt: skip
+            return run, information, stretches.sum(0), by_channel.T, stretches
 
         passes, *parts, stretches = zip(*self._each(one), strict=True)
         information, slope, by_channel = (np.array(part) for part in parts)
@@ -252,11 +295,12 @@ class Engine:
         moved: Sequence[np.ndarray],
         steps: np.ndarray,
         reading_only: np.ndarray,
-    ) -> np.ndarray:
-        """Derivatives of a run's whitened innovations in the parameters moved, (n, m, k)."""
-        J = np.zeros((*run.innovations.shape, len(moved)))
+        columns: np.ndarray,
+        J: np.ndarray,
+    ) -> None:
+        """Derivatives of a run's whitened innovations in the parameters moved, into columns of J."""
         if not moved:
-            return J
+            return
         sets, which = [run.inputs], np.zeros(len(moved), np.int64)
         for k, vector in enumerate(moved):
             inputs = self.model.inputs(run.record, vector)
@@ -266,9 +310,9 @@ class Engine:
         kalman.signature_pass(
             self.model.drift, self.model.measure, self.intervals[i], np.array(sets), which,
             along.predicted, run.states, run.innovations, p, np.array(moved), steps, reading_only,
-            self.model.exact, self.model.work_size, run.gains, run.whitening, along.H, along.F, J,
+            self.model.exact, self.model.work_size, run.gains, run.whitening, along.H, along.F, columns,
+            J,
         )  # fmt: skip
-        return J
 
     def descend(
         self,
@@ -376,15 +420,16 @@ class Engine:
         R = self._reading_variances(noise)
 
         def one(i: int) -> tuple[float, np.ndarray, np.ndarray]:
-            run, along = self._filter_run(i, p, q, R, noise, keep=True, jacobians=True)
-            t = run.record.t
+            t = self.records[i].t
             stretch = ((t - t[0]) / STRETCH).astype(np.int64)
             by_noise, by_start = np.zeros((stretch[-1] + 1, q.size)), np.zeros(q.size)
-            if np.isfinite(run.log_likelihood):
-                kalman.score_pass(
-                    self.intervals[i], run.innovations, run.gains, run.whitening, along.H, along.F,
-                    stretch, by_noise, by_start,
-                )  # fmt: skip
+            with self._room() as room:
+                run, along = self._filter_run(i, p, q, R, noise, room, room)
+                if np.isfinite(run.log_likelihood):
+                    kalman.score_pass(
+                        self.intervals[i], run.innovations, run.gains, run.whitening, along.H,
+                        along.F, stretch, by_noise, by_start,
+                    )  # fmt: skip
             return run.log_likelihood, by_noise, by_start
 
         log_likelihood, by_noise, by_start = zip(*self._each(one), strict=True)

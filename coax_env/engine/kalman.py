@@ -21,12 +21,16 @@ from coax_env.jit import compiled
 
 _A = float64[::1]
 _M = float64[:, ::1]
+_I = int64[:, ::1]
+_N = int64[::1]
 STEP = types.FunctionType(types.void(_A, _A, float64, _A, _A, _A))
 MEASURE = types.FunctionType(types.void(_A, _A, _A, _A, _A))
 REORDER = {"fastmath": {"reassoc", "contract"}}
 """Sums may be taken in the order that is fastest."""
 MOST_DECAY = 0.5
 """Share of a state that may decay in a row for the series of the exponential to be used."""
+BLOCK = 16
+"""Rows of matrices are as long as a multiple of this, zeros at the end: no loop has a scalar rest."""
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -36,18 +40,35 @@ def wrap_angle(angle):
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-@compiled(types.void(_M, _M, _M), **REORDER)
-def _product(A, B, out):
-    """A B, row by row so that the compiler can use vectors; most of A is zero."""
-    n = A.shape[0]
-    for i in range(n):
-        for j in range(n):
+@compiled(int64(int64))
+def _whole_blocks(count):
+    """The least multiple of BLOCK that is not less."""
+    return (count + BLOCK - 1) // BLOCK * BLOCK
+
+
+@compiled(types.void(_M, _I, _N))
+def _non_zeros(A, places, counts):
+    """Columns of what is not zero in each row of A, into `places`, and how many."""
+    for i in range(counts.size):
+        count = 0
+        for a in range(places.shape[1]):
+            places[i, count] = a
+            count += A[i, a] != 0.0
+        counts[i] = count
+
+
+@compiled(types.void(_M, _I, _N, _M, _M), **REORDER)
+def _product(A, places, counts, B, out):
+    """A B, row by row so that the compiler can use vectors, with what is not zero in A alone."""
+    width = out.shape[1]
+    for i in range(counts.size):
+        for j in range(width):
             out[i, j] = 0.0
-        for a in range(n):
+        for c in range(counts[i]):
+            a = places[i, c]
             weight = A[i, a]
-            if weight != 0.0:
-                for j in range(n):
-                    out[i, j] += weight * B[a, j]
+            for j in range(width):
+                out[i, j] += weight * B[a, j]
 
 
 @compiled(types.void(STEP, _A, _A, float64, _A, _A, _A, _A, _A, _A, _M), **REORDER)
@@ -64,8 +85,10 @@ def _differences(flow, x, u, dt, p, work, scale, base, x_probe, x_moved, out):
 
 
 @compiled(**REORDER)
-def _transition(drift, step, exact, x, u, dt, p, work, scale, x_next, x_probe, x_moved, A, AA, F):
-    """Jacobian F of a step at x: the exponential of that of the drift, to third order.
+def _transition(
+    drift, step, exact, x, u, dt, p, work, scale, x_next, x_probe, x_moved, A, AA, places, counts, F,
+):  # fmt: skip
+    """Jacobian F of a step at x: the exponential of that of the drift, to third order; its non-zeros.
 
     A step too long for that has its own Jacobian taken, by differences of `step` (x_next at x).
     """
@@ -79,22 +102,26 @@ def _transition(drift, step, exact, x, u, dt, p, work, scale, x_next, x_probe, x
             largest = max(largest, abs(A[i, i]))
     if largest > MOST_DECAY:
         _differences(step, x, u, dt, p, work, scale, x_next, x_probe, x_moved, F)
+        _non_zeros(F, places, counts)
         return
     # F = I + A (I + A/2 (I + A/3)), a row at a time; exact rows are I + A
-    _product(A, A, AA)
+    _non_zeros(A, places, counts)
+    _product(A, places, counts, A, AA)
+    width = F.shape[1]
     for i in range(nx):
         if exact[i]:
-            for j in range(nx):
+            for j in range(width):
                 F[i, j] = A[i, j]
         else:
-            for j in range(nx):
+            for j in range(width):
                 F[i, j] = A[i, j] + 0.5 * AA[i, j]
-            for a in range(nx):
+            for c in range(counts[i]):
+                a = places[i, c]
                 weight = A[i, a] / 6.0
-                if weight != 0.0:
-                    for j in range(nx):
-                        F[i, j] += weight * AA[a, j]
+                for j in range(width):
+                    F[i, j] += weight * AA[a, j]
         F[i, i] += 1.0
+    _non_zeros(F, places, counts)
 
 
 @compiled(
@@ -133,8 +160,10 @@ def filter_pass(
     """
     n, m = z.shape
     nx = x0.size
+    width = _whole_blocks(nx)
     x = x0.copy()
-    P = P0.copy()
+    P = np.zeros((nx, width))
+    P[:, :nx] = P0
     work = np.zeros(work_size)
     x_next = np.zeros(nx)
     x_probe = np.zeros(nx)
@@ -142,17 +171,21 @@ def filter_pass(
     h = np.zeros(m)
     h_probe = np.zeros(m)
     H = np.zeros((m, nx))
-    F = np.eye(nx)
-    A = np.zeros((nx, nx))
-    AA = np.zeros((nx, nx))
+    H_places = np.zeros((m, nx), dtype=np.int64)
+    H_counts = np.zeros(m, dtype=np.int64)
+    F = np.zeros((nx, width))
+    F_places = np.zeros((nx, nx), dtype=np.int64)
+    F_counts = np.zeros(nx, dtype=np.int64)
+    A = np.zeros((nx, width))
+    AA = np.zeros((nx, width))
     dt_of_F = -1.0  # step at which F was computed, and the one it is scaled to
     dt_now = -1.0
-    HP = np.zeros((m, nx))
+    HP = np.zeros((m, width))
     S = np.zeros((m, m))
     W = np.zeros((m, m))
-    FP = np.zeros((nx, nx))
-    PF = np.zeros((nx, nx))
-    gain = np.zeros(nx)
+    FP = np.zeros((nx, width))
+    PF = np.zeros((nx, width))
+    gain = np.zeros(width)
     tell = H_all.shape[0] == n
     who = np.zeros(m, dtype=np.int64)
     nu = np.zeros(m)
@@ -170,6 +203,7 @@ def filter_pass(
                 measure(x_probe, u[k], p, work, h_probe)
                 for i in range(m):
                     H[i, j] = (h_probe[i] - h[i]) / scale[j]
+            _non_zeros(H, H_places, H_counts)
         if tell:
             for i in range(m):
                 for j in range(nx):
@@ -185,18 +219,18 @@ def filter_pass(
                     innovation = wrap_angle(innovation)
                 if not math.isfinite(innovation):
                     return -np.inf, deweighted
-                # H P of this channel, by the non-zeros of H
-                for b in range(nx):
+                # H P of this channel
+                for b in range(width):
                     HP[count, b] = 0.0
-                for a in range(nx):
-                    if H[i, a] != 0.0:
-                        weight = H[i, a]
-                        for b in range(nx):
-                            HP[count, b] += weight * P[a, b]
+                for c in range(H_counts[i]):
+                    a = H_places[i, c]
+                    weight = H[i, a]
+                    for b in range(width):
+                        HP[count, b] += weight * P[a, b]
                 variance = R[i]
-                for a in range(nx):
-                    if H[i, a] != 0.0:
-                        variance += HP[count, a] * H[i, a]
+                for c in range(H_counts[i]):
+                    a = H_places[i, c]
+                    variance += HP[count, a] * H[i, a]
                 if innovation * innovation > gate * gate * variance:
                     inflated = innovation * innovation / (gate * gate)
                     log_likelihood -= 0.5 * (gate * gate - 1.0) * math.log(inflated / variance)
@@ -209,9 +243,9 @@ def filter_pass(
         for a in range(count):
             for b in range(a):
                 total = 0.0
-                for j in range(nx):
-                    if H[who[b], j] != 0.0:
-                        total += HP[a, j] * H[who[b], j]
+                for c in range(H_counts[who[b]]):
+                    j = H_places[who[b], c]
+                    total += HP[a, j] * H[who[b], j]
                 S[a, b] = total
         # Cholesky in place, then its inverse W
         for a in range(count):
@@ -235,11 +269,12 @@ def filter_pass(
             W[a, a] = 1.0 / S[a, a]
         # G = W H P, then P -= G'G, x += G' e
         for a in range(count - 1, -1, -1):
-            for j in range(nx):
+            for j in range(width):
                 HP[a, j] *= W[a, a]
             for b in range(a):
-                for j in range(nx):
-                    HP[a, j] += W[a, b] * HP[b, j]
+                weight = W[a, b]
+                for j in range(width):
+                    HP[a, j] += weight * HP[b, j]
         for a in range(count):
             total = 0.0
             for b in range(a + 1):
@@ -251,17 +286,22 @@ def filter_pass(
         for a in range(count):
             for i in range(nx):
                 weight = HP[a, i]
-                if weight != 0.0:
-                    for j in range(nx):
-                        P[i, j] -= weight * HP[a, j]
+                for j in range(width):
+                    P[i, j] -= weight * HP[a, j]
         if keep:
+            for i in range(m):
+                for j in range(m):
+                    W_all[k, i, j] = 0.0
+                if math.isnan(z[k, i]):
+                    for j in range(nx):
+                        K_all[k, i, j] = 0.0
             for b in range(count):
-                for j in range(nx):
+                for j in range(width):
                     gain[j] = 0.0
                 for a in range(b, count):
                     weight = W[a, b]
                     W_all[k, who[b], who[a]] = weight
-                    for j in range(nx):
+                    for j in range(width):
                         gain[j] += HP[a, j] * weight
                 for j in range(nx):
                     K_all[k, who[b], j] = gain[j]
@@ -280,7 +320,7 @@ def filter_pass(
         if fresh or abs(dt[k] - dt_of_F) > 0.5 * dt_of_F:
             dt_of_F = dt_now = dt[k]
             _transition(drift, step, exact, x, u[k], dt[k], p, work, scale, x_next, x_probe, x_moved,
-                        A, AA, F)  # fmt: skip
+                        A, AA, F_places, F_counts, F)  # fmt: skip
         elif dt[k] != dt_now:
             # same Jacobian, other step: rows of slow states follow the step to first order
             ratio = dt[k] / dt_now
@@ -291,7 +331,7 @@ def filter_pass(
                         own = 1.0 if i == j else 0.0
                         F[i, j] = own + ratio * (F[i, j] - own)
         # P = F (F P)'
-        _product(F, P, FP)
+        _product(F, F_places, F_counts, P, FP)
         for i in range(nx):
             for j in range(nx):
                 PF[j, i] = FP[i, j]
@@ -299,7 +339,7 @@ def filter_pass(
             for i in range(nx):
                 for j in range(nx):
                     F_all[k, i, j] = F[i, j]
-        _product(F, PF, P)
+        _product(F, F_places, F_counts, PF, P)
         for i in range(nx):
             for j in range(i):
                 P[j, i] = P[i, j]
@@ -330,15 +370,22 @@ def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
     """
     n, m = e.shape
     nx = by_start.size
+    width = _whole_blocks(nx)
     r = np.zeros(nx)
-    N = np.zeros((nx, nx))
-    B = np.zeros((nx, nx))
-    moved = np.zeros(nx)
-    K = np.zeros((m, nx))
-    NK = np.zeros((m, nx))
-    Kr = np.zeros(m)
+    N = np.zeros((nx, width))
+    B = np.zeros((nx, width))
+    moved = np.zeros(width)
     FT = np.zeros((nx, nx))
-    NF = np.zeros((nx, nx))
+    F_places = np.zeros((nx, nx), dtype=np.int64)
+    F_counts = np.zeros(nx, dtype=np.int64)
+    NF = np.zeros((nx, width))
+    who = np.zeros(m, dtype=np.int64)
+    H = np.zeros((m, nx))
+    H_places = np.zeros((m, nx), dtype=np.int64)
+    H_counts = np.zeros(m, dtype=np.int64)
+    K = np.zeros((m, width))
+    NK = np.zeros((m, width))
+    Kr = np.zeros(m)
     by_noise[:, :] = 0.0
     for k in range(n - 1, -1, -1):
         if k < n - 1:
@@ -346,69 +393,68 @@ def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
                 by_noise[stretch[k], i] += 0.5 * dt[k] * (r[i] * r[i] - N[i, i])
                 for j in range(nx):
                     FT[j, i] = F_all[k, i, j]
+            _non_zeros(FT, F_places, F_counts)
             # r = F' r, N = F' (F' N)'
             for i in range(nx):
                 moved[i] = 0.0
-                for j in range(nx):
-                    moved[i] += FT[i, j] * r[j]
-            _product(FT, N, B)
+                for c in range(F_counts[i]):
+                    moved[i] += FT[i, F_places[i, c]] * r[F_places[i, c]]
+            _product(FT, F_places, F_counts, N, B)
             for i in range(nx):
                 r[i] = moved[i]
                 for j in range(nx):
                     NF[j, i] = B[i, j]
-            _product(FT, NF, N)
-        # with A = I - sum of K_b H_b': r = A' r, N = A' N A
+            _product(FT, F_places, F_counts, NF, N)
+        count = 0
         for b in range(m):
             if W_all[k, b, b] != 0.0:
-                Kr[b] = 0.0
+                who[count] = b
                 for j in range(nx):
-                    K[b, j] = K_all[k, b, j]
-                    NK[b, j] = 0.0
-                    Kr[b] += K[b, j] * r[j]
-                for i in range(nx):
-                    weight = K[b, i]
-                    for j in range(nx):
-                        NK[b, j] += weight * N[i, j]
-        for b in range(m):
-            if W_all[k, b, b] != 0.0:
-                for j in range(nx):
-                    weight = float64(H_all[k, b, j])
-                    if weight != 0.0:
-                        r[j] -= weight * Kr[b]
-                        for i in range(nx):
-                            N[i, j] -= weight * NK[b, i]
-        for b in range(m):
-            if W_all[k, b, b] != 0.0:
-                for j in range(nx):
-                    NK[b, j] = 0.0
-                for i in range(nx):
-                    weight = K[b, i]
-                    for j in range(nx):
-                        NK[b, j] += weight * N[i, j]
-        for b in range(m):
-            if W_all[k, b, b] != 0.0:
-                for i in range(nx):
-                    weight = float64(H_all[k, b, i])
-                    if weight != 0.0:
-                        for j in range(nx):
-                            N[i, j] -= weight * NK[b, j]
+                    H[count, j] = H_all[k, b, j]
+                    K[count, j] = K_all[k, b, j]
+                count += 1
+        _non_zeros(H[:count], H_places, H_counts[:count])
+        # with A = I - sum of K_b H_b': r = A' r, N = A' N A, which is N less the symmetric part of
+        # twice the sum of H_b w_b', w_b = N K_b - half the sum of H_a (K_a' N K_b)
+        for b in range(count):
+            Kr[b] = 0.0
+            for j in range(width):
+                NK[b, j] = 0.0
+            for i in range(nx):
+                weight = K[b, i]
+                Kr[b] += weight * r[i]
+                for j in range(width):
+                    NK[b, j] += weight * N[i, j]
+        for b in range(count):
+            for j in range(width):
+                moved[j] = NK[b, j]
+            for a in range(count):
+                total = 0.0
+                for j in range(width):
+                    total += K[a, j] * NK[b, j]
+                for c in range(H_counts[a]):
+                    moved[H_places[a, c]] -= 0.5 * total * H[a, H_places[a, c]]
+            for c in range(H_counts[b]):
+                j = H_places[b, c]
+                r[j] -= H[b, j] * Kr[b]
+                weight = 2.0 * H[b, j]
+                for i in range(width):
+                    N[j, i] -= weight * moved[i]
         # the readings' own part: g_a = sum of (L^-1)_ab H_b
-        for a in range(m):
-            if W_all[k, a, a] != 0.0:
-                for j in range(nx):
-                    moved[j] = 0.0
-                for b in range(a + 1):
-                    weight = float64(W_all[k, b, a])
-                    if weight != 0.0:
-                        for j in range(nx):
-                            moved[j] += weight * H_all[k, b, j]
-                for i in range(nx):
-                    weight = moved[i]
-                    if weight != 0.0:
-                        r[i] += weight * e[k, a]
-                        for j in range(nx):
-                            N[i, j] += weight * moved[j]
-        for i in range(nx):  # rounding must not grow
+        for a in range(count):
+            for j in range(width):
+                moved[j] = 0.0
+            for b in range(a + 1):
+                weight = float64(W_all[k, who[b], who[a]])
+                for c in range(H_counts[b]):
+                    moved[H_places[b, c]] += weight * H[b, H_places[b, c]]
+            for i in range(nx):
+                weight = moved[i]
+                if weight != 0.0:
+                    r[i] += weight * e[k, who[a]]
+                    for j in range(width):
+                        N[i, j] += weight * moved[j]
+        for i in range(nx):
             for j in range(i):
                 mean = 0.5 * (N[i, j] + N[j, i])
                 N[i, j] = mean
@@ -462,13 +508,13 @@ def mean_pass(step, measure, dt, u, z, wraps, x0, p, work_size, K_all, W_all, e)
         STEP, MEASURE, _A, float64[:, :, ::1], int64[::1], _M, _M, _M, _A, _M, _A, boolean[::1],
         boolean[::1], int64,
         float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1],
-        float64[:, :, ::1],
+        int64[::1], _M,
     ),
     **REORDER,
 )  # fmt: skip
 def signature_pass(
     drift, measure, dt, u_sets, u_of, predicted, states, e, p, moved, steps, reading_only, exact,
-    work_size, K_all, W_all, H_all, F_all, J,
+    work_size, K_all, W_all, H_all, F_all, columns, J,
 ):  # fmt: skip
     """Derivatives of the whitened innovations in many parameters at once, gains frozen.
 
@@ -485,9 +531,12 @@ def signature_pass(
         predicted, states, e: of the filter pass. p: parameters; moved: (k, np) those with one moved,
             steps: (k,) by how much. reading_only: (k,) those that add nothing to the state.
         K_all, W_all, H_all, F_all: of the filter pass.
-        J: (n, m, k) derivatives, out; 0 where a reading is missing.
+        columns: (k,) where in J a parameter stands. J: derivatives, out, one row for each reading that
+            there is, in the order of e.
     """
-    n, m, k_all = J.shape
+    n, m = e.shape
+    k_all = steps.size
+    there = 0
     nx = exact.size
     work = np.zeros(work_size)
     per_step = 1.0 / steps
@@ -495,11 +544,13 @@ def signature_pass(
     x_here = np.zeros(nx)
     h_base = np.zeros(m)
     h_here = np.zeros(m)
-    b = np.zeros((nx, k_all))
-    dh = np.zeros((m, k_all))
-    s = np.zeros((nx, k_all))
-    half = np.zeros((nx, k_all))
-    before = np.zeros((nx, k_all))
+    width = _whole_blocks(k_all)
+    b = np.zeros((nx, width))
+    dh = np.zeros((m, width))
+    de = np.zeros((m, width))
+    s = np.zeros((nx, width))
+    half = np.zeros((nx, width))
+    before = np.zeros((nx, width))
     for row in range(n):
         measure(predicted[row], u_sets[0, row], p, work, h_base)
         drift(states[row], u_sets[0, row], dt[row], p, work, x_base)
@@ -512,41 +563,46 @@ def signature_pass(
                 for i in range(nx):
                     b[i, k] = (x_here[i] - x_base[i]) * per_step[k]
         for i in range(m):
-            for k in range(k_all):
-                J[row, i, k] = 0.0
+            for k in range(width):
+                de[i, k] = 0.0
             if not math.isnan(e[row, i]):
                 for j in range(nx):
                     weight = float64(H_all[row, i, j])
                     if weight != 0.0:
-                        for k in range(k_all):
+                        for k in range(width):
                             dh[i, k] += weight * s[j, k]
         for i in range(m):
             if not math.isnan(e[row, i]):
                 for a in range(i, m):
                     weight = float64(W_all[row, i, a])
                     if weight != 0.0:
-                        for k in range(k_all):
-                            J[row, a, k] -= weight * dh[i, k]
+                        for k in range(width):
+                            de[a, k] -= weight * dh[i, k]
                 for j in range(nx):
                     weight = float64(K_all[row, i, j])
                     if weight != 0.0:
-                        for k in range(k_all):
+                        for k in range(width):
                             s[j, k] -= weight * dh[i, k]
+        for i in range(m):
+            if not math.isnan(e[row, i]):
+                for k in range(k_all):
+                    J[there, columns[k]] = de[i, k]
+                there += 1
         if row == n - 1:
             break
         for j in range(nx):
-            for k in range(k_all):
+            for k in range(width):
                 half[j, k] = s[j, k] + 0.5 * b[j, k]
                 before[j, k] = s[j, k]
         for i in range(nx):
             source = before if exact[i] else half
             own = 1.0 if exact[i] else 0.5
-            for k in range(k_all):
+            for k in range(width):
                 s[i, k] = own * b[i, k]
             for j in range(nx):
                 weight = float64(F_all[row, i, j])
                 if weight != 0.0:
-                    for k in range(k_all):
+                    for k in range(width):
                         s[i, k] += weight * source[j, k]
 
 

@@ -6,9 +6,11 @@ from coax_env.report.page import Section, page
 from coax_env.report.replay import replay_page
 from coax_env.report.simulation import DOUBLET_HEADER, doublet_rows, simulation_page
 from coax_env.report.two_step import two_step_page
+from coax_env.report.worth import FlownControllers
 
 __all__ = [
     "DOUBLET_HEADER",
+    "FlownControllers",
     "Section",
     "diagnosis_page",
     "doublet_rows",

@@ -1,4 +1,7 @@
-"""The report of a diagnosis: what the simulation got wrong, why, and what mending it is worth."""
+"""The report of a diagnosis: what was flown, what the simulation got wrong, why, what mending is worth.
+
+One page for someone who was not there: two minutes to read, the details folded away at its end.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,28 +11,26 @@ import numpy as np
 
 from coax_env import effects, figures
 from coax_env.engine.whiteness import SHARE
-from coax_env.generic_terms import AXES, TERMS
 from coax_env.plain_words import (
     and_list,
     capital,
     channel_name,
-    consequence,
+    count_word,
     number,
-    outside_usual,
     plain,
     seconds,
-    title,
     unit_name,
     whole_percent,
     with_std,
 )
 from coax_env.prediction import RunReplay, rms
+from coax_env.report.causes import cause_blocks, look_alike_blocks
+from coax_env.report.flight_view import flight_view
 from coax_env.report.flown import data_blocks, ordered, points_each, prediction_figure
 from coax_env.report.page import (
     Section,
+    bullets,
     callout,
-    card,
-    cards,
     chooser,
     command,
     details,
@@ -38,8 +39,9 @@ from coax_env.report.page import (
     prose,
     side_by_side,
     table,
-    tiles,
 )
+from coax_env.report.worth import FlownControllers, controller_blocks, gain_blocks, gain_tiles
+from coax_env.trajectories import RESTART, trajectories
 from coax_env.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -47,27 +49,37 @@ if TYPE_CHECKING:
 
 Findings = Mapping[str, Any]
 MOST_INNOVATION_FIGURES = 60
+MOST_NAMED = 4
+"""Causes in the headline; of more, the strongest."""
+MOST_RUNS_NAMED = 12
 
 
-def diagnosis_page(result: "Diagnosis", command_line: str = "") -> str:
-    """The report of one diagnosis as HTML text; `command_line` is what was typed."""
-    findings = result.findings
+def diagnosis_page(
+    result: "Diagnosis", command_line: str = "", flown: FlownControllers | None = None
+) -> str:
+    """The report of one diagnosis as HTML text.
+
+    Args:
+        command_line: what was typed. flown: controllers of both models, where they were flown.
+    """
+    findings, before, after = result.findings, result.vehicle_before, result.vehicle_after
     parts = [
-        Section("What was missing", _causes(findings, result.vehicle_before)),
-        Section("What it changes", _gain(findings)),
-        Section("Seen in flight", _seen(result)),
-        Section("What is left", _left(findings, result.vehicle_before)),
-        Section("How sure is this", _sure(result)),
-        Section("The data", data_blocks(result.flight, result.remarks, result.noise)),
-        Section("How this was computed", _computed(result, command_line)),
+        Section("What was flown", _flown(result)),
+        Section("Where the bare model departs", _departs(result)),
+        Section("The causes", cause_blocks(findings, before, after)),
+        Section("Look-alikes", look_alike_blocks(findings)),
+        Section("What mending is worth", gain_blocks(findings)),
+        Section("Still unexplained", _left(findings, before)),
+        Section("Controllers before and after", controller_blocks(flown) if flown else []),
+        Section("Details", _details(result, command_line)),
     ]
     where = result.flight.path.name if result.flight.path else "without a folder"
     return page(
         headline(findings),
         lead(findings),
         [part for part in parts if any(part.blocks)],
-        kicker=f"Diagnosis · flight {where} · vehicle {result.vehicle_before.name} · "
-        f"{len(result.flight.runs)} runs",
+        kicker=f"Diagnosis · flight {where} · vehicle {before.name}",
+        top=gain_tiles(findings) if findings["verdict"] != "consistent" else "",
     )
 
 
@@ -75,12 +87,16 @@ def headline(findings: Findings) -> str:
     """The verdict in one sentence."""
     names = [plain(c["effect"]) for c in findings["causes"]]
     verb = "explains" if len(names) == 1 else "explain"
+    if len(names) > MOST_NAMED:
+        named = f"{count_word(len(names))} effects, above all {and_list(names[:3])},"
+    else:
+        named = and_list(names) if names else ""
     if findings["verdict"] == "consistent":
         return "The simulation agrees with these flights"
     if findings["verdict"] == "explained":
-        return f"{capital(and_list(names))} {verb} what the simulation got wrong"
+        return f"{capital(named)} {verb} what the simulation got wrong"
     if findings["verdict"] == "partly explained":
-        return f"{capital(and_list(names))} {verb} a part; something else is left"
+        return f"{capital(named)} {verb} a part of what the simulation got wrong"
     return "The simulation misses something that no known effect explains"
 
 
@@ -92,18 +108,10 @@ def lead(findings: Findings) -> list[str]:
         sentences.append("What remains is sensor noise and gusts: no effect is worth adding.")
     if gain and findings["causes"]:
         sentences.append(
-            f"On runs that the fit has not seen ({and_list(list(gain['held_out']))}), the extended "
-            f"model removes **{whole_percent(gain['error_removed_percent'])}**{_interval(gain)} of "
-            f"the error of a {seconds(gain['horizon_s'])} prediction. Refitting the bare model's "
-            f"own numbers alone would remove {whole_percent(gain['refitted_base_percent'])}; no "
-            f"model could remove more than {whole_percent(gain['noise_floor_percent'])} with these "
-            "sensors."
+            f"With them in the model, **{whole_percent(gain['error_removed_percent'])}** of the "
+            f"error of a {seconds(gain['horizon_s'])} prediction is gone on runs that the fit has "
+            f"not seen ({and_list(list(gain['held_out']))})."
         )
-        if gain.get("black_box_percent") is not None:
-            sentences.append(
-                f"A black box of {len(AXES) * len(TERMS)} generic terms, fitted to the same runs, "
-                f"removes {whole_percent(gain['black_box_percent'])}."
-            )
     elif not gain:
         sentences.append("No run was held out, so how well this predicts is not known.")
     twins = sorted({t for c in findings["causes"] for t in c["confusable_with"]})
@@ -118,104 +126,48 @@ def lead(findings: Findings) -> list[str]:
     return sentences
 
 
-def _interval(gain: Mapping[str, Any]) -> str:
-    low, high = gain["ci95"]
-    if low is None or high is None:
-        return ""
-    return f" ({low:.0f} to {high:.0f} %, 95 % interval)".replace("-", "−")
+# --- what was flown -------------------------------------------------------------------------------
 
 
-# --- causes ---------------------------------------------------------------------------------------
-
-
-def _causes(findings: Findings, vehicle: Vehicle) -> list[str]:
-    if not findings["causes"]:
-        return [prose("Nothing that these flights can show: no effect of the catalogue is named.")]
-    return [cards(_cause(cause, vehicle) for cause in findings["causes"])]
-
-
-def _cause(cause: Mapping[str, Any], vehicle: Vehicle) -> str:
-    effect, twins = cause["effect"], cause["confusable_with"]
-    own = {name.rpartition(".")[2]: p for name, p in cause["parameters"].items()}
-    values = {name: p["value"] for name, p in own.items()}
-    numbers = ", ".join(
-        f"{plain(name)} {with_std(p['value'], p['std'], p['unit'])}" for name, p in own.items()
+def _flown(result: "Diagnosis") -> list[str]:
+    """The flights in a sentence, and to be looked at."""
+    flight, before, after = result.flight, result.vehicle_before, result.vehicle_after
+    total = sum(run.duration for run in flight.runs)
+    names = list(flight.run_names[:MOST_RUNS_NAMED])
+    if len(flight.runs) > MOST_RUNS_NAMED:
+        names.append(f"{len(flight.runs) - MOST_RUNS_NAMED} more")
+    held = {run.name for run in result.replay_before}
+    models = {"bare": before} | ({"extended": after} if after.effects != before.effects else {})
+    shown = trajectories(flight, after, models)
+    shown.sort(key=lambda one: -float(one.parted().max()))
+    place = (
+        "measured"
+        if "pn" in flight.channels
+        else "what the estimator makes of the readings: no sensor shows it"
     )
-    known = effect in effects.CATALOGUE
-    odd = known and outside_usual(effect, values)
-    meaning = consequence(effect, values, vehicle) if known else ""
-    lines = [
-        effects.CATALOGUE[effect].summary if known else "",
-        f"Value: {numbers}." if meaning else "",
-        f"Showed in {and_list([channel_name(c) for c in cause['channels']])}."
-        if cause["channels"]
-        else "",
-        f"**These flights cannot tell it from {and_list([plain(t) for t in twins])}.**"
-        if twins
-        else "Cannot be mistaken for another effect on these flights.",
-        "**Its size is outside the usual range: take the name with care.**" if odd else "",
-    ]
-    return card(
-        title(effect),
-        capital(meaning or numbers),
-        lines,
-        badge=f"evidence {number(cause['evidence'])} nats",
-        kind="warning" if twins or odd else "",
-    )
-
-
-# --- gain -----------------------------------------------------------------------------------------
-
-
-def _gain(findings: Findings) -> list[str]:
-    gain = findings.get("gain")
-    if not gain:
-        return [prose("All runs were fitted (nothing held out): no gain can be measured.")]
-    low, high = gain["ci95"]
-    interval = "" if low is None else f"{low:.0f} to {high:.0f} %".replace("-", "−")
-    channels = {c: gain["channels"][c] for c in ordered(gain["channels"])}
-    horizon = seconds(gain["horizon_s"])
-    rows = [
-        [
-            channel_name(c),
-            unit_name(e["unit"]),
-            number(e["before"]),
-            number(e["before_refitted"]),
-            number(e["after"]),
-            " .. ".join(number(x) for x in e["ci95"]) if e.get("ci95") else "–",
-            number(e["noise"]),
-        ]
-        for c, e in channels.items()
-    ]
-    header = ["channel", "unit", "before", "refitted", "after", "95 % interval", "noise"]
+    sensors = and_list([channel_name(c) for c in ordered(flight.channels)])
+    count = f"{capital(count_word(len(flight.runs)))} run" + ("s" if len(flight.runs) > 1 else "")
     return [
-        tiles(
-            [
-                (whole_percent(gain["error_removed_percent"]), "of the error removed", interval),
-                (
-                    whole_percent(gain["refitted_base_percent"]),
-                    "by refitting alone",
-                    "the bare model's own numbers",
-                ),
-                (
-                    whole_percent(gain["noise_floor_percent"]),
-                    "is the most possible",
-                    "at these sensors' noise",
-                ),
-                (str(len(gain["held_out"])), "runs held out", ", ".join(gain["held_out"])),
-            ]
+        prose(f"{count} of a {before.name}, {total:.0f} s in all: {and_list(names)}."),
+        flight_view(
+            shown,
+            dict(zip(models, (figures.BEFORE, figures.AFTER), strict=False)),
+            before["rotor_radius"].value,
+            held,
+            f"Grey: as flown, its place {place}. The simulations are put onto it every "
+            f"{seconds(RESTART)} and fly on by themselves with the recorded commands; the curves "
+            "show how far off they get.",
         ),
-        figure(
-            figures.gain_bars(channels),
-            f"Error of a {horizon} prediction on the held-out runs, as a share of what it was "
-            "before. Whisker: 95 % interval. The green mark is the sensor's own noise, which is in "
-            "every bar: no model gets below it.",
-        ),
-        details("The same in numbers", table(header, rows)),
-    ]
+        details("The runs and sensors", prose(f"Measured: {sensors}."), *data_blocks(
+            flight, result.remarks, result.noise)),
+    ]  # fmt: skip
 
 
-def _seen(result: "Diagnosis") -> list[str]:
+# --- where it departs -----------------------------------------------------------------------------
+
+
+def _departs(result: "Diagnosis") -> list[str]:
+    """The bare model's predictions against the held-out runs, the worst channel first."""
     before = {run.name: run for run in result.replay_before}
     if not before:
         return []
@@ -224,14 +176,16 @@ def _seen(result: "Diagnosis") -> list[str]:
     gained = {
         (run, c): _improvement(before[run], after.get(run), c) for run in before for c in channels
     }
-    best = max(channels, key=lambda c: sum(gained[run, c] for run in before))
+    compared = (result.findings["gain"] or {}).get("channels", {})
+    telling = [c for c in channels if c in compared] or channels
+    best = max(telling, key=lambda c: sum(gained[run, c] for run in before))
     runs = sorted(before, key=lambda run: -gained[run, best])
     options = {
         (run, channel_name(c)): prediction_figure(
             result.flight,
             run,
             c,
-            {"as given": before[run], "extended": after.get(run)},
+            {"bare": before[run], "extended": after.get(run)},
             result.noise.get(c),
             points_each(len(runs) * len(channels)),
         )
@@ -241,21 +195,43 @@ def _seen(result: "Diagnosis") -> list[str]:
     }
     lost = [name for name, run in before.items() if run.diverged]
     return [
-        prose("The held-out runs, which the fit has not seen."),
+        prose(_worst_words(result.findings)),
         chooser(
             options,
-            "Each point of a line is where the model, started a second earlier from the estimated "
-            "state and flown with the recorded commands, expects the reading. Below: its error, "
-            "with the sensor's noise as a band.",
+            "Held-out runs. Each point of a line is where the model, started a second earlier from "
+            "the estimated state and flown with the recorded commands, expects the reading. Below: "
+            "its error, with the sensor's noise as a band.",
         ),
         callout(
-            f"The vehicle as given runs away in {and_list(lost)}: where its line ends it has left "
-            "the figure.",
+            f"The bare model runs away in {and_list(lost)}: where its line ends it has left the "
+            "figure.",
             "warning",
         )
         if lost
         else "",
     ]
+
+
+def _worst_words(findings: Findings) -> str:
+    """The channels in which the bare model's error stands out of the noise most."""
+    gain = findings.get("gain")
+    if not gain:
+        return ""
+    errors = {c: e for c, e in gain["channels"].items() if e["before"] is not None and e["noise"]}
+    worst = sorted(errors, key=lambda c: -errors[c]["before"] / errors[c]["noise"])[:3]
+    out = [c for c in worst if errors[c]["before"] > 1.1 * errors[c]["noise"]]
+    if not out:
+        return "Nowhere on the held-out runs does it stand out of the sensors' noise."
+    words = [
+        f"{channel_name(c)} by {number(errors[c]['before'], 2)} {unit_name(errors[c]['unit'])} "
+        f"({_times(errors[c]['before'] / errors[c]['noise'])} the sensor's noise)"
+        for c in out
+    ]
+    return f"Within {seconds(gain['horizon_s'])} the bare model misses {and_list(words)}."
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.1f} times" if ratio < 20.0 else "far above"
 
 
 def _improvement(before: RunReplay, after: RunReplay | None, channel: str) -> float:
@@ -272,20 +248,31 @@ def _improvement(before: RunReplay, after: RunReplay | None, channel: str) -> fl
 # --- what is left ---------------------------------------------------------------------------------
 
 
+LOADS = {
+    "p": "rolling moment", "q": "pitching moment", "r": "yawing moment",
+    "ax": "forward force", "ay": "sideways force", "az": "vertical force",
+}  # fmt: skip
+"""What is missing where a channel of findings.json's `unexplained` has a form."""
+
+
 def _left(findings: Findings, vehicle: Vehicle) -> list[str]:
-    rows = [
-        [
-            channel_name(u["channel"]),
-            f"{100 * u['share']:.0f} %",
-            ", ".join(channel_name(d) for d in u["depends_on"]) or "not known",
-            u.get("form") or "not known",
-        ]
-        for u in findings["unexplained"]
+    described = [u for u in findings["unexplained"] if u["depends_on"]]
+    rest = [u for u in findings["unexplained"] if not u["depends_on"]]
+    lines = [
+        f"A **{LOADS.get(u['channel'], channel_name(u['channel']))}** that follows "
+        f"{and_list([channel_name(d) for d in u['depends_on']])}: {u['form']}. It is "
+        f"{100 * u['share']:.0f} % of what moves the machine there beyond the model."
+        for u in described
     ]
-    caption = "Structure beyond noise and gusts that no effect of the catalogue explains"
+    if rest:
+        shares = and_list([f"{channel_name(u['channel'])} {100 * u['share']:.0f} %" for u in rest])
+        lines.append(
+            "**Without a known form:** so much of what the model did not expect could have been "
+            f"expected from its own past: {shares}. Of noise that would be none."
+        )
     return [
-        table(["channel", "share", "follows", "form"], rows, caption)
-        if rows
+        bullets(lines)
+        if lines
         else callout("Nothing beyond noise and gusts is left in the innovations.", "good"),
         prose(_gust_words(findings["gusts"], vehicle)),
     ]
@@ -303,38 +290,11 @@ def _gust_words(gusts: Mapping[str, Any], vehicle: Vehicle) -> str:
     )
 
 
-# --- how sure -------------------------------------------------------------------------------------
+# --- details --------------------------------------------------------------------------------------
 
 
-def _sure(result: "Diagnosis") -> list[str]:
-    findings = result.findings
-    blocks = [
-        callout(
-            f"{title(c['effect'])} cannot be told from "
-            f"{and_list([plain(t) for t in c['confusable_with']])} on these flights.",
-            "warning",
-        )
-        for c in findings["causes"]
-        if c["confusable_with"]
-    ]
-    following = findings.get("next_maneuver")
-    if following:
-        parted = and_list([plain(s) for s in following["separates"]])
-        blocks.append(
-            callout(
-                f"**Fly next: {plain(following['maneuver'])}.** It parts {parted}: "
-                f"{following['why'].rstrip('.')}."
-            )
-        )
-    rate = findings.get("false_alarm_rate")
-    blocks.append(
-        prose(
-            f"Calibrated on clean synthetic flights: the threshold lets a false cause through in "
-            f"{100 * rate:.2g} % of them."
-            if rate is not None
-            else "How often a cause is named where there is none has not been calibrated yet."
-        )
-    )
+def _details(result: "Diagnosis", command_line: str) -> list[str]:
+    """How the search went, what the innovations look like, and how all of this was computed."""
     pair = []
     if result.evidence_history:
         steps = [(_step_name(name), gain) for name, gain in result.evidence_history]
@@ -360,8 +320,8 @@ def _sure(result: "Diagnosis") -> list[str]:
         )
     options = _innovation_figures(result, shares)
     return [
-        *blocks,
-        side_by_side(pair) if pair else "",
+        command(command_line) if command_line else "",
+        details("How the search went", side_by_side(pair)) if pair else "",
         details(
             "Innovations, run by run",
             chooser(
@@ -373,6 +333,7 @@ def _sure(result: "Diagnosis") -> list[str]:
         )
         if options
         else "",
+        *_computed(result),
     ]
 
 
@@ -400,20 +361,19 @@ def _innovation_figures(
     return options
 
 
-# --- how computed ---------------------------------------------------------------------------------
-
-
-def _computed(result: "Diagnosis", command_line: str) -> list[str]:
+def _computed(result: "Diagnosis") -> list[str]:
     changed = changed_parameters(result.vehicle_before, result.vehicle_after)
     return [
-        command(command_line) if command_line else "",
-        prose(
-            "One extended Kalman filter of the full model runs over each run. Every effect of the "
-            "catalogue is moved a little, and its mark on the innovations is compared with what is "
-            "left unexplained. The best is added, everything is fitted again, and causes already "
-            "chosen are dropped or exchanged where that helps. Base parameters keep their priors. "
-            "Causes and gain come from the runs that were not held out; the vehicle file is then "
-            "fitted on all runs with the same structure."
+        details(
+            "How this was computed",
+            prose(
+                "One extended Kalman filter of the full model runs over each run. Every effect of the "
+                "catalogue is moved a little, and its mark on the innovations is compared with what is "
+                "left unexplained. The best is added, everything is fitted again, and causes already "
+                "chosen are dropped or exchanged where that helps. Base parameters keep their priors. "
+                "Causes and gain come from the runs that were not held out; the vehicle file is then "
+                "fitted on all runs with the same structure."
+            ),
         ),
         details(
             f"{len(changed)} numbers of the vehicle file changed",

@@ -1,15 +1,20 @@
 """One self-contained HTML page from blocks: prose, tables, figures, callouts, cards.
 
 Blocks are HTML text. Figures travel as JSON and are drawn by one script with plotly.js, which is in
-the page once; without figures it is left out. Readable on a phone and on paper, light and dark.
+the page once, packed; without figures it is left out. Readable on a phone and on paper, light and
+dark. A number that a file holds too can be marked with its place there (`datum`).
 """
 
+import base64
+import gzip
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from html import escape
 from importlib import resources
+from typing import Any
 
 from coax_env.errors import require
 from coax_env.figures import Figure, template
@@ -23,13 +28,16 @@ class Section:
     blocks: Sequence[str]
 
 
-def page(title: str, lead: Sequence[str], sections: Iterable[Section], kicker: str = "") -> str:
+def page(
+    title: str, lead: Sequence[str], sections: Iterable[Section], kicker: str = "", top: str = ""
+) -> str:
     """The whole page as HTML text.
 
     Args:
         title: of the page, the verdict if there is one.
         lead: sentences that say it all; plain text.
         kicker: a short line above the title: what this is about.
+        top: a block under the lead.
     """
     parts = list(sections)
     links = "".join(f'<a href="#{_anchor(s.title)}">{escape(s.title)}</a>' for s in parts)
@@ -38,14 +46,13 @@ def page(title: str, lead: Sequence[str], sections: Iterable[Section], kicker: s
         for s in parts
     )
     sentences = "".join(f"<p>{inline(s)}</p>" for s in lead)
-    drawing = _drawing() if 'class="plot"' in body else ""
     above = f'<p class="kicker">{escape(kicker)}</p>' if kicker else ""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{_file('page.css')}</style></head><body><main>"
-        f'<header>{above}<h1>{escape(title)}</h1><div class="lead">{sentences}</div></header>'
-        f"<nav>{links}</nav>{body}</main>{drawing}</body></html>\n"
+        f'<header>{above}<h1>{escape(title)}</h1><div class="lead">{sentences}</div>{top}</header>'
+        f"<nav>{links}</nav>{body}</main>{_scripts(body)}</body></html>\n"
     )
 
 
@@ -53,8 +60,14 @@ def _anchor(title: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
+class Markup(str):
+    """Text that is HTML already."""
+
+
 def inline(text: str) -> str:
-    """Plain text as HTML; ``**words**`` become bold and ```words``` code."""
+    """Plain text as HTML; ``**words**`` become bold and ```words``` code. Markup stays as it is."""
+    if isinstance(text, Markup):
+        return text
     safe = _UNBROKEN.sub("\\1\u00a0\\2", escape(text))
     safe = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)
     return re.sub(r"`(.+?)`", r"<code>\1</code>", safe)
@@ -73,6 +86,17 @@ def bullets(items: Iterable[str]) -> str:
     return "<ul>" + "".join(f"<li>{inline(item)}</li>" for item in items) + "</ul>"
 
 
+def datum(text: str, place: str, value: float | None) -> Markup:
+    """A number in words, marked with its exact value and its place in findings.json.
+
+    Args:
+        place: ``gain/channels/h/after``; parts of lists by their position.
+    """
+    if value is None:
+        return Markup(inline(text))
+    return Markup(f'<data value="{value!r}" data-of="{escape(place)}">{inline(text)}</data>')
+
+
 def command(text: str) -> str:
     """A command line to copy."""
     return f"<pre><code>{escape(text)}</code></pre>"
@@ -89,15 +113,24 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "
     body = "".join(
         "<tr>"
         + f"<th scope='row'>{inline(row[0])}</th>"
-        + "".join(f"<td>{inline(cell)}</td>" for cell in row[1:])
+        + "".join(
+            f'<td data-head="{escape(h)}">{inline(cell)}</td>'
+            for h, cell in zip(header[1:], row[1:], strict=True)
+        )
         + "</tr>"
         for row in rows
     )
-    above = f"<caption>{inline(caption)}</caption>" if caption else ""
+    above = f'<p class="caption">{inline(caption)}</p>' if caption else ""
     return (
-        f'<div class="scroll"><table>{above}<thead><tr>{head}</tr></thead>'
+        f'{above}<div class="scroll"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>"
     )
+
+
+def numbers_table(summary: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table to open; on paper it is open."""
+    body = f"<summary>{inline(summary)}</summary>{table(header, rows)}"
+    return f'<details class="numbers">{body}</details>'
 
 
 def tiles(items: Sequence[tuple[str, str, str]]) -> str:
@@ -115,7 +148,7 @@ def tiles(items: Sequence[tuple[str, str, str]]) -> str:
 
 def card(title: str, big: str, lines: Iterable[str], badge: str = "", kind: str = "") -> str:
     """One finding: a title, its size in words, and what to know about it."""
-    flag = f'<span class="badge {kind}">{escape(badge)}</span>' if badge else ""
+    flag = f'<span class="badge">{inline(badge)}</span>' if badge else ""
     text = "".join(f"<p>{inline(line)}</p>" for line in lines if line)
     return (
         f'<article class="card {kind}"><h3>{escape(title)}{flag}</h3>'
@@ -140,13 +173,12 @@ def details(summary: str, *blocks: str) -> str:
 
 def figure(fig: Figure, caption: str = "", label: str = "") -> str:
     """A plotly figure with a caption; ``label`` describes it to those who cannot see it."""
-    text = json.dumps(fig, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
     height = fig["layout"]["height"]
     below = f"<figcaption>{inline(caption)}</figcaption>" if caption else ""
     return (
         f'<figure><div class="plot" role="img" aria-label="{escape(label or caption)}" '
         f'style="min-height:{height}px"></div>'
-        f'<script type="application/json">{text}</script>{below}</figure>'
+        f"{data_script(fig)}{below}</figure>"
     )
 
 
@@ -179,11 +211,31 @@ def chooser(
     )
 
 
+def data_script(content: Any) -> str:
+    """Data for a script of the page, as JSON that cannot end the script."""
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
+    return f'<script type="application/json">{text}</script>'
+
+
 def _file(name: str) -> str:
     return (resources.files("coax_env.report") / name).read_text(encoding="utf-8")
 
 
-def _drawing() -> str:
-    library = require("plotly.offline", "report").get_plotlyjs()
+def _scripts(body: str) -> str:
+    """What draws the figures and replays the flights that a page has; nothing for others."""
+    plots, flights = 'class="plot"' in body, 'class="flight"' in body
+    if not (plots or flights):
+        return ""
     themes = json.dumps({"light": template(False), "dark": template(True)})
-    return f"<script>{library}</script><script>const THEMES={themes};{_file('page.js')}</script>"
+    code = f"const THEMES={themes};{_file('page.js')}" + (
+        _file("flight_view.js") if flights else ""
+    )
+    return (_packed_plotly() if plots else "") + f"<script>{code}</script>"
+
+
+@cache
+def _packed_plotly() -> str:
+    """plotly.js, gzipped: 2 MB instead of 5. The page's script unpacks it."""
+    library = require("plotly.offline", "report").get_plotlyjs().encode()
+    packed = base64.b64encode(gzip.compress(library, mtime=0)).decode()
+    return f'<script type="text/plain" id="plotly">{packed}</script>'

@@ -5,10 +5,11 @@ larger study contains the smaller one and what is stored stays good.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import injector
 import numpy as np
 
 from study.judge import TIES
@@ -25,9 +26,11 @@ What is left out repeats it: two doublets, a second climb, thirty seconds of hov
 """
 HOVER = ("hover",)
 
-KINDS = ("still", "gusty", "one", "two", "three", "outside", "hover")
+KINDS = ("still", "gusty", "one", "two", "three", "outside", "hover", "many")
 SHARES = {"one": 0.5, "two": 0.2, "three": 0.1, "outside": 0.1, "hover": 0.1}
 """Of the flights with effects."""
+MANY = 5
+"""Effects of a flight of kind "many", always in gusts: it is flown for the intervals in it."""
 
 SIZES: dict[str, dict[str, tuple[float, float, bool]]] = {
     "ground_effect": {"gain": (0.7, 1.3, False)},
@@ -71,6 +74,8 @@ SIZES: dict[str, dict[str, tuple[float, float, bool]]] = {
 
 CARRIERS = {"wind": "rotor_drag"}
 """Effects that act only through another one, which is then hidden with them."""
+OWN_FORM = {name.partition(".")[0] for name in injector.OTHER_FORM}
+"""Effects whose numbers mean something else in the generator than in the catalogue."""
 ALONE = tuple(e for e in SIZES if e not in CARRIERS and e != "outside")
 
 
@@ -99,18 +104,20 @@ class PlannedFlight:
 
 
 def plan(
-    clean: int, effects: int, seed: int = 0, runs: Sequence[str] | None = RICH
+    clean: int, effects: int, seed: int = 0, runs: Sequence[str] | None = RICH, many: int = 0
 ) -> list[PlannedFlight]:
     """The flights of a study, its kinds evenly mixed so that a part of it is a fair sample.
 
     Args:
         clean: flights without an effect. effects: flights with one or more.
         runs: of the flights that are not hover-only; None: all that the generator has.
+        many: flights with MANY effects each.
     """
     counts = {"still": clean - clean // 2, "gusty": clean // 2}
     for kind, share in SHARES.items():
         counts[kind] = round(share * effects)
     counts["one"] += clean + effects - sum(counts.values())
+    counts["many"] = many
     flights = [
         planned(kind, number, seed, tuple(runs) if runs is not None else None)
         for kind in KINDS
@@ -140,8 +147,8 @@ def _gusty(kind: str, number: int) -> bool:
     In these gusts half of the effects cannot be seen at their usual size, so gusts alone would leave
     little to judge.
     """
-    if kind in ("still", "gusty"):
-        return kind == "gusty"
+    if kind in ("still", "gusty", "many"):
+        return kind != "still"
     if kind == "one":
         return (number + number // (2 * len(ALONE))) % 2 == 1
     return (number // 2) % 2 == 1
@@ -155,14 +162,16 @@ def _hidden(kind: str, number: int, rng: np.random.Generator) -> list[str]:
     if kind in ("one", "hover"):  # every effect in turn, with both sets of sensors
         order = np.random.default_rng(KINDS.index(kind)).permutation(len(ALONE))
         return [ALONE[order[(number // 2) % len(ALONE)]]]
+    if kind == "many":
+        return _several(MANY, rng, OWN_FORM)
     return _several(2 if kind == "two" else 3, rng)
 
 
-def _several(count: int, rng: np.random.Generator) -> list[str]:
+def _several(count: int, rng: np.random.Generator, but: Collection[str] = ()) -> list[str]:
     """Different effects, no two of one tie group: of those one alone may be named."""
     names: list[str] = []
     while len(names) < count:
-        name = str(rng.choice([e for e in SIZES if e != "outside"]))
+        name = str(rng.choice([e for e in SIZES if e != "outside" and e not in but]))
         carried = [name] if name not in CARRIERS else [name, CARRIERS[name]]
         new = [e for e in carried if e not in names]
         tied = any({a, b} <= tie for tie in TIES for a in new for b in names)

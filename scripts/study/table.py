@@ -103,7 +103,9 @@ def _names(rows: Sequence[Row], method: str) -> list[Figure]:
             lambda row: _anything_false(row, method),
         )
     )  # fmt: skip
-    for kind, bar in (("two", ">= 80 %"), ("three", ">= 60 %")):
+    for kind, bar in (("two", ">= 80 %"), ("three", ">= 60 %"), ("many", "")):
+        if kind == "many" and not _of(rows, kind):
+            continue
         shown, faint = _split(_of(rows, kind))
         apart = f"{sum(map(exact, faint))} of {len(faint)} exact where one was not expected to show"
         result.append(_share(f"exact set, {kind} effects", bar, shown, exact, apart))
