@@ -26,7 +26,7 @@ from coax_env import flow as F
 from coax_env import parameters as P
 from coax_env.errors import InputError
 from coax_env.jit import compiled
-from coax_env.lanes import anywhere, select, sine_and_cosine
+from coax_env.lanes import sine_and_cosine, sines_and_cosines
 from coax_env.late import late
 from coax_env.layout import CHANNELS, N_CHANNELS, N_COMMANDS, N_FULL, N_INPUTS, N_STATES, TIME
 from coax_env.vehicle import Vehicle, load_vehicle
@@ -91,7 +91,7 @@ def _properties_of(with_effects):
         if with_effects and p[effects.PROPERTY] != 0.0:
             _property_effects(x, f, p)
 
-    return compiled()(properties)
+    return compiled(forceinline=not with_effects)(properties)
 
 
 _properties = _properties_of(True)
@@ -101,19 +101,30 @@ _properties_bare = _properties_of(False)
 @compiled()
 def _follow(start, command, time, lag):
     """Exact first-order response to a held command; without a lag it is its own limit."""
-    lags = lag > SHORTEST_LAG
-    if not anywhere(lags):
+    if lag <= SHORTEST_LAG:
         return command
-    return select(lags, command + (start - command) * math.exp(-time / lag), command)
+    return command + (start - command) * math.exp(-time / lag)
 
 
-@compiled()
-def _actuate(x, u, time, f, out):
-    """Rotor speeds and swash tilt at `time` after the row's command, into the state `out`."""
-    out[16] = _follow(x[16], u[0] * f[F.SPEED_SCALE], time, f[F.MOTOR_LAG_U])
-    out[17] = _follow(x[17], u[1] * f[F.SPEED_SCALE], time, f[F.MOTOR_LAG_L])
-    out[18] = _follow(x[18], u[2], time, f[F.SERVO_LAG])
-    out[19] = _follow(x[19], u[3], time, f[F.SERVO_LAG])
+def _actuate_of(with_effects):
+    """`_actuate` compiled with the lags, or for vehicles without effects, which have none."""
+
+    def actuate(x, u, time, f, out):
+        """Rotor speeds and swash tilt at `time` after the row's command, into the state `out`."""
+        if with_effects:
+            out[16] = _follow(x[16], u[0] * f[F.SPEED_SCALE], time, f[F.MOTOR_LAG_U])
+            out[17] = _follow(x[17], u[1] * f[F.SPEED_SCALE], time, f[F.MOTOR_LAG_L])
+            out[18] = _follow(x[18], u[2], time, f[F.SERVO_LAG])
+            out[19] = _follow(x[19], u[3], time, f[F.SERVO_LAG])
+        else:
+            for i in range(4):
+                out[16 + i] = u[i]
+
+    return compiled(forceinline=not with_effects)(actuate)
+
+
+_actuate = _actuate_of(True)
+_actuate_bare = _actuate_of(False)
 
 
 def _rates_of(with_effects):
@@ -129,8 +140,7 @@ def _rates_of(with_effects):
         Needs `_properties` before it. Leaves loads and rates in the workspace `f`.
         """
         p_, q_, r_ = x[3], x[4], x[5]
-        sin_phi, cos_phi = sine_and_cosine(x[10])
-        sin_theta, cos_theta = sine_and_cosine(x[11])
+        (sin_phi, cos_phi), (sin_theta, cos_theta) = sines_and_cosines(x[10], x[11])
         sin_psi, cos_psi = sine_and_cosine(x[12])
         f[F.SIN_PHI], f[F.COS_PHI] = sin_phi, cos_phi
         f[F.SIN_THETA], f[F.COS_THETA] = sin_theta, cos_theta
@@ -164,13 +174,15 @@ def _rates_of(with_effects):
         f[F.ALPHA_L_DOT] = (gain * f[F.DELTA_LON] - x[6] - p[P.FLAP_COUPLING_LON] * x[7]) / tau - q_
         f[F.BETA_L_DOT] = (gain * f[F.DELTA_LAT] - x[7] + p[P.FLAP_COUPLING_LAT] * x[6]) / tau - p_
 
-        # (13)-(14): thrust along [-tan a, tan b, -1], normalised
-        tan_a, tan_b = math.tan(f[F.ALPHA_U]), math.tan(f[F.BETA_U])
-        along = f[F.THRUST_U] / math.sqrt(1.0 + tan_a * tan_a + tan_b * tan_b)
-        x_u, y_u, z_u = -tan_a * along, tan_b * along, -along
-        tan_a, tan_b = math.tan(f[F.ALPHA_L]), math.tan(f[F.BETA_L])
-        along = f[F.THRUST_L] / math.sqrt(1.0 + tan_a * tan_a + tan_b * tan_b)
-        x_l, y_l, z_l = -tan_a * along, tan_b * along, -along
+        # (13)-(14): thrust along [-tan a, tan b, -1], normalised; here times cos a cos b
+        (sin_a, cos_a), (sin_b, cos_b) = sines_and_cosines(f[F.ALPHA_U], f[F.BETA_U])
+        across = cos_a * sin_b
+        along = f[F.THRUST_U] / math.sqrt(cos_b * cos_b + across * across)
+        x_u, y_u, z_u = -sin_a * cos_b * along, across * along, -cos_a * cos_b * along
+        (sin_a, cos_a), (sin_b, cos_b) = sines_and_cosines(f[F.ALPHA_L], f[F.BETA_L])
+        across = cos_a * sin_b
+        along = f[F.THRUST_L] / math.sqrt(cos_b * cos_b + across * across)
+        x_l, y_l, z_l = -sin_a * cos_b * along, across * along, -cos_a * cos_b * along
 
         # (21): the upper rotor's wake on the fuselage, V_i^2 = T_u / (2 rho pi R^2)
         area = p[P.FUSELAGE_LENGTH] * p[P.FUSELAGE_WIDTH] * p[P.FUSELAGE_DRAG]
@@ -228,6 +240,7 @@ def _rates_of(with_effects):
 
 
 _rates_with_effects = late(_rates_of(True))
+_rates_without = late(_rates_of(False))  # compiled once, not again within every caller
 _rates_bare = compiled(forceinline=True)(_rates_of(False))
 
 
@@ -238,7 +251,7 @@ def _rates(x, p, f, dx):
     if flown + p[effects.UNLISTED] != 0.0:
         _rates_with_effects(x, p, f, dx)
     else:
-        _rates_bare(x, p, f, dx)
+        _rates_without(x, p, f, dx)
 
 
 def _step_of(with_effects):
@@ -267,36 +280,41 @@ def _step_of(with_effects):
         else:
             _properties_bare(out, u, p, f)
         for _ in range(parts):
-            # rotor acceleration: the mean over the step, so that angular momentum is kept exactly
-            f[F.OMEGA_U_DOT] = (
-                _follow(out[16], u[0] * f[F.SPEED_SCALE], h, f[F.MOTOR_LAG_U]) - out[16]
-            ) / h
-            f[F.OMEGA_L_DOT] = (
-                _follow(out[17], u[1] * f[F.SPEED_SCALE], h, f[F.MOTOR_LAG_L]) - out[17]
-            ) / h
+            if with_effects:
+                # rotor acceleration: the mean over the step, so that angular momentum is kept exactly
+                f[F.OMEGA_U_DOT] = (
+                    _follow(out[16], u[0] * f[F.SPEED_SCALE], h, f[F.MOTOR_LAG_U]) - out[16]
+                ) / h
+                f[F.OMEGA_L_DOT] = (
+                    _follow(out[17], u[1] * f[F.SPEED_SCALE], h, f[F.MOTOR_LAG_L]) - out[17]
+                ) / h
             half_gust = math.exp(-0.5 * h / p[P.GUST_MEMORY])
             for k in range(4):
                 time = 0.0 if k == 0 else (h if k == 3 else 0.5 * h)
                 fade = 1.0 if k == 0 else (half_gust * half_gust if k == 3 else half_gust)
                 for i in range(N_STATES):
                     stage[i] = out[i] if k == 0 else out[i] + time * slope[i]
-                _actuate(out, u, time + READING_DELAY, f, stage)
                 for i in range(20, N_FULL):
                     stage[i] = fade * out[i]
                 if with_effects:
+                    _actuate(out, u, time + READING_DELAY, f, stage)
                     _rates(stage, p, f, slope)
                 else:
+                    _actuate_bare(out, u, time + READING_DELAY, f, stage)
                     _rates_bare(stage, p, f, slope)
                 weight = 1.0 if k == 0 or k == 3 else 2.0
                 for i in range(N_STATES):
                     total[i] = weight * slope[i] if k == 0 else total[i] + weight * slope[i]
             for i in range(N_STATES):
                 out[i] += h / 6.0 * total[i]
-            _actuate(out, u, h, f, out)
+            if with_effects:
+                _actuate(out, u, h, f, out)
+            else:
+                _actuate_bare(out, u, h, f, out)
             for i in range(20, N_FULL):
                 out[i] *= half_gust * half_gust
 
-    return compiled()(step)
+    return compiled(forceinline=not with_effects)(step)
 
 
 step = _step_of(True)
@@ -339,25 +357,20 @@ def _measure_of(with_effects):
         f = work[: F.N_FLOW]
         now = work[F.N_FLOW : F.N_FLOW + N_FULL]
         slope = work[F.N_FLOW + N_FULL : F.N_FLOW + N_FULL + N_STATES]
-        if with_effects:
-            _properties(x, u, p, f)
-        else:
-            _properties_bare(x, u, p, f)
         for i in range(N_FULL):
             now[i] = x[i]
-        _actuate(x, u, READING_DELAY, f, now)
-        # a lagging rotor still accelerates; one without lag has arrived
-        lag_u, lag_l = f[F.MOTOR_LAG_U], f[F.MOTOR_LAG_L]
-        slow_u, slow_l = lag_u > 10.0 * READING_DELAY, lag_l > 10.0 * READING_DELAY
-        if anywhere(slow_u):
-            rate = (u[0] * f[F.SPEED_SCALE] - now[16]) / lag_u
-            f[F.OMEGA_U_DOT] = select(slow_u, rate, f[F.OMEGA_U_DOT])
-        if anywhere(slow_l):
-            rate = (u[1] * f[F.SPEED_SCALE] - now[17]) / lag_l
-            f[F.OMEGA_L_DOT] = select(slow_l, rate, f[F.OMEGA_L_DOT])
         if with_effects:
+            _properties(x, u, p, f)
+            _actuate(x, u, READING_DELAY, f, now)
+            # a lagging rotor still accelerates; one without lag has arrived
+            if f[F.MOTOR_LAG_U] > 10.0 * READING_DELAY:
+                f[F.OMEGA_U_DOT] = (u[0] * f[F.SPEED_SCALE] - now[16]) / f[F.MOTOR_LAG_U]
+            if f[F.MOTOR_LAG_L] > 10.0 * READING_DELAY:
+                f[F.OMEGA_L_DOT] = (u[1] * f[F.SPEED_SCALE] - now[17]) / f[F.MOTOR_LAG_L]
             _rates(now, p, f, slope)
         else:
+            _properties_bare(x, u, p, f)
+            _actuate_bare(x, u, READING_DELAY, f, now)
             _rates_bare(now, p, f, slope)
         z = f[F.READING :]
         z[0] = now[16] * (30.0 / math.pi)
@@ -376,7 +389,7 @@ def _measure_of(with_effects):
         for i in range(N_CHANNELS):
             out[i] = z[i]
 
-    return compiled()(measure)
+    return compiled(forceinline=not with_effects)(measure)
 
 
 measure = _measure_of(True)

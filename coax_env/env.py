@@ -164,7 +164,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = action_space()
         self.observation_names = tuple(entry.name for entry in entries)
         self.observation_units = tuple(entry.unit for entry in entries)
-        self._terms = tuple(enumerate(self.fleet.task.terms))
+        self._terms = self.fleet.task.terms
         self._screen = _Screen(self.fleet, render_mode)
 
     def reset(
@@ -188,12 +188,13 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One control period of 0.01 s."""
         outcome = self.fleet.fly(np.array(action, dtype=np.float64).reshape(1, 4), _ALL)
-        self._screen.moved()
-        terms = outcome.terms[0].tolist()
+        if self.render_mode is not None:
+            self._screen.moved()
         info = self._told()
-        info["reward_terms"] = {name: terms[k] for k, name in self._terms}
-        reward = float(outcome.rewards[0])
-        return outcome.observations[0], reward, bool(outcome.over[0]), False, info
+        terms = outcome.terms.tolist()[0]
+        info["reward_terms"] = dict(zip(self._terms, terms))  # noqa: B905 - strict is slow
+        reward, over = outcome.rewards.item(), outcome.over.item()
+        return outcome.observations[0], reward, over, False, info
 
     def render(self) -> np.ndarray | None:
         """The picture (540, 960, 3), uint8, in mode ``rgb_array``; ``human`` shows it, every 40 ms."""
@@ -226,8 +227,9 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     - ``threads``: at most so many; default one per 256 rows and processor.
 
     Infos are those of `CoaxEnv` with a first axis of num_envs, and masks ``_NAME`` as Gymnasium has
-    them: ``info["state"]`` is (num_envs, 26), ``info["reward_terms"]`` and ``info["vehicle"]``
-    (where rows have started anew) are dicts of (num_envs,). ``render`` gives one picture per row.
+    them: ``info["state"]`` is (num_envs, 26) and read-only, ``info["reward_terms"]`` and
+    ``info["vehicle"]`` (where rows have started anew) are dicts of (num_envs,). ``render`` gives one
+    picture per row.
     """
 
     def __init__(
@@ -301,6 +303,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 self.fleet.seed(i, row_seed)
         self._seeded = True
         self._ended &= ~which
+        self.fleet.x = self.fleet.x.copy()
         observations = self.fleet.restart(which, _start_states(options, self.num_envs))
         self._screen.moved()
         return observations, self._told(which) | self._vehicles(which)
@@ -312,7 +315,9 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         fleet, ended = self.fleet, self._ended
         waiting = ended.any()
         active = ~ended if waiting else self._every
-        outcome = fleet.fly(np.array(actions, dtype=np.float64).reshape(self.num_envs, 4), active)
+        anew = ended if waiting and self.autoreset_mode == AutoresetMode.NEXT_STEP else None
+        commands = np.array(actions, dtype=np.float64).reshape(self.num_envs, 4)
+        outcome = fleet.fly(commands, active, anew)
         terminated = outcome.over
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         if self.max_episode_steps is not None:
@@ -322,7 +327,6 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         done = terminated | truncated
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             if waiting:
-                fleet.restart(ended, observations=observations)
                 info |= self._vehicles(ended)
             self._ended = done
         elif self.autoreset_mode == AutoresetMode.DISABLED:
@@ -332,6 +336,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             info["final_obs"] = observations.copy()
             info["final_info"] = self._step_info(outcome.terms)
             info["_final_obs"] = info["_final_info"] = done
+            fleet.x = fleet.x.copy()
             fleet.restart(done, observations=observations)
             info |= self._vehicles(done)
         info |= self._step_info(outcome.terms)
@@ -354,7 +359,9 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _told(self, which: np.ndarray) -> dict[str, Any]:
         fleet = self.fleet
-        info: dict[str, np.ndarray] = {"state": fleet.x.copy()}
+        state = fleet.x.view()
+        state.flags.writeable = False
+        info: dict[str, np.ndarray] = {"state": state}
         if fleet.task.aims:
             info["target"] = fleet.targets.copy()
         if fleet.task.moves_on:

@@ -27,7 +27,7 @@ from coax_env.dynamics import WORK_SIZE, hover_trim, measure, step
 from coax_env.errors import InputError
 from coax_env.jit import compiled
 from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
-from coax_env.period import BIAS, BIAS_STD, DT, LATE, blow, command, read, seen, turned
+from coax_env.period import BIAS, BIAS_STD, DT, LATE, blow, command, read, rest, seen, turned
 from coax_env.random_streams import stream_key, two_normals, uniform
 from coax_env.randomisation import Draws, Randomize
 from coax_env.sensors import Sensor, shake, slow_instruments, suite
@@ -75,12 +75,11 @@ def _advance(x, u, p, swash, at, work):
 
 @compiled()
 def _sense(
-    x, u, p, row, azimuth, sensors, bias, target, places, height_sign,
-    stream, past, held, readings, values, work, out,
-):  # fmt: skip
+    x, u, p, row, azimuth, sensors, bias, flags, stream, past, held, readings, values, work, out
+):
     """New readings where they are due, into `held` (float64) and as an observation into `out`.
 
-    `held`: readings, flags, and the way to the target where `places` (4,) says what it is made of.
+    `held`: readings, this many flags, and the way to the target where the task has one.
     `past` (slots, n_sensors): ring of what the sensors would show without delay; no slots: none has.
     """
     measure(x, u, p, work, readings)
@@ -91,10 +90,7 @@ def _sense(
     if len(past) > 0:
         for k in range(n):
             values[k] = _late(values[k], past, row, k, sensors[k, LATE])
-    aim = len(held) - len(places)
-    read(values, row, sensors, bias, stream, aim - n, held)
-    if len(places) > 0:
-        tasks.point(held, places, height_sign, target, held[aim:])
+    read(values, row, sensors, bias, stream, flags, held)
     for k in range(len(held)):
         out[k] = held[k]
 
@@ -128,21 +124,36 @@ def _stir(x, p, stream, eddies, breeze, wind, air):
 
 
 @compiled()
+def _disturb_rows(first, last, active, params, gust, turbulence, x, streams, eddies, breeze):
+    """Gusts and turbulence of the coming period for the active rows first..last-1. See Fleet."""
+    air = np.empty(3)
+    many = len(params) > 1
+    for i in range(first, last):
+        if active[i]:
+            p = params[i] if many else params[0]
+            if gust[0] > 0.0 or gust[1] > 0.0:
+                blow(x[i], p, gust, streams[i])
+            if turbulence > 0.0:
+                _stir(x[i], p, streams[i], eddies[i], breeze[i], turbulence, air)
+
+
+@compiled()
 def _fly_rows(
-    first, last, active, actions, trim, scale, params, kinds, sensors, limits, gust, turbulence,
-    weights, scales, places, height_sign, course, box, dwell,
-    x, u, rows, azimuth, streams, swash, asked, bias, past, eddies, breeze, targets, progress, held,
+    first, last, active, actions, trim, scale, params, kinds, sensors, limits, flags, weights, scales,
+    x, u, rows, azimuth, streams, swash, asked, bias, past, targets, held,
     observations, rewards, terms, over,
 ):  # fmt: skip
     """One control period of the active rows first..last-1. See Fleet for the arrays."""
     work = np.empty(WORK_SIZE)
     readings, values = np.empty(N_CHANNELS), np.empty(sensors.shape[1])
-    air = np.empty(3)
     many = len(params) > 1
     for i in range(first, last):
+        for k in range(len(weights)):
+            terms[i, k] = 0.0
         if not active[i]:
-            for k in range(held.shape[1]):
-                observations[i, k] = held[i, k]
+            rest(held[i], observations[i])
+            rewards[i] = 0.0
+            over[i] = False
             continue
         p = params[i] if many else params[0]
         kind = kinds[i]
@@ -152,39 +163,53 @@ def _fly_rows(
         at = rows[i] % slots
         swash[i, at, 0], swash[i, at, 1] = u[i, 2], u[i, 3]
         u[i, TIME] = rows[i] * DT
-        if gust[0] > 0.0 or gust[1] > 0.0:
-            blow(x[i], p, gust, streams[i])
-        if turbulence > 0.0:
-            _stir(x[i], p, streams[i], eddies[i], breeze[i], turbulence, air)
         _advance(x[i], u[i], p, swash[i], at, work)
         rows[i] += 1
         azimuth[i] = turned(azimuth[i], x[i, 16])
         u[i, TIME] = rows[i] * DT
         rewards[i] = hover.reward(x[i], actions[i], targets[i], weights, scales, terms[i])
         over[i] = hover.is_over(x[i])
-        if dwell > 0 and tasks.arrive(x[i], targets[i], dwell, progress[i], course):
-            terms[i, hover.N_TERMS] = weights[hover.N_TERMS]
-            rewards[i] += weights[hover.N_TERMS]
-            tasks.aim(streams[i], course, box, progress[i, tasks.REACHED], targets[i])
         _sense(
-            x[i], u[i], p, rows[i], azimuth[i], sensors[kind], bias[i], targets[i],
-            places, height_sign, streams[i], past[i], held[i], readings, values, work,
-            observations[i],
+            x[i], u[i], p, rows[i], azimuth[i], sensors[kind], bias[i], flags,
+            streams[i], past[i], held[i], readings, values, work, observations[i],
         )  # fmt: skip
 
 
 @compiled()
+def _arrive_rows(
+    first, last, active, weights, course, box, dwell, x, streams, targets, progress, rewards, terms
+):
+    """Pay the active rows first..last-1 that have reached their targets, and give them others."""
+    for i in range(first, last):
+        if active[i] and tasks.arrive(x[i], targets[i], dwell, progress[i], course):
+            terms[i, hover.N_TERMS] = weights[hover.N_TERMS]
+            rewards[i] += weights[hover.N_TERMS]
+            tasks.aim(streams[i], course, box, progress[i, tasks.REACHED], targets[i])
+
+
+@compiled()
+def _point_rows(first, last, which, places, height_sign, targets, held, observations):
+    """The way to the target, as the readings tell it, for the rows first..last-1 of a mask."""
+    aim = held.shape[1] - tasks.N_AIM
+    for i in range(first, last):
+        if which[i]:
+            tasks.point(held[i], places, height_sign, targets[i], held[i, aim:])
+            for k in range(aim, held.shape[1]):
+                observations[i, k] = held[i, k]
+
+
+@compiled()
 def _restart_rows(
-    which, keep_state, trim, params, kinds, sensors, limits, wind_speed, turbulence,
-    places, height_sign, course, box,
+    first, last, which, keep_state, trim, params, kinds, sensors, limits, flags,
+    wind_speed, turbulence, course, box,
     x, u, rows, azimuth, streams, swash, asked, bias, past, eddies, breeze, targets, progress, held,
     observations,
 ):  # fmt: skip
-    """New flights for the rows of the mask `which`; with `keep_state` from what stands in `x`."""
+    """New flights for the rows first..last-1 of a mask; with `keep_state` from what stands in `x`."""
     work = np.empty(WORK_SIZE)
     readings, values = np.empty(N_CHANNELS), np.empty(sensors.shape[1])
     many = len(params) > 1
-    for i in range(len(which)):
+    for i in range(first, last):
         if not which[i]:
             continue
         if wind_speed > 0.0:
@@ -203,7 +228,7 @@ def _restart_rows(
             breeze[i, 0], breeze[i, 1] = p[_WIND_NORTH], p[_WIND_NORTH + 1]
             settle(streams[i], eddies[i])
         progress[i, tasks.WITHIN] = progress[i, tasks.REACHED] = 0
-        tasks.aim(streams[i], course, box, 0, targets[i])
+        tasks.aim(streams[i], course, box, progress[i, tasks.REACHED], targets[i])
         for k in range(4):
             u[i, k] = asked[i, k] = trim[k]
         limit(u[i], asked[i], limits[kinds[i]], DT)
@@ -215,9 +240,8 @@ def _restart_rows(
         for k in range(held.shape[1]):
             held[i, k] = 0.0
         _sense(
-            x[i], u[i], p, 0, azimuth[i], table, bias[i], targets[i],
-            places, height_sign, streams[i], past[i], held[i], readings, values, work,
-            observations[i],
+            x[i], u[i], p, rows[i], azimuth[i], table, bias[i], flags,
+            streams[i], past[i], held[i], readings, values, work, observations[i],
         )  # fmt: skip
 
 
@@ -279,16 +303,25 @@ class Fleet:
         self._gust = np.array(gusts if gusts is not None else (0.0, 0.0), dtype=float)
         if self._gust.shape != (2,) or not (self._gust >= 0.0).all():
             raise InputError("gusts must be (force std in N, moment std in N m), both >= 0")
+        self._disturbed = self._turbulence > 0.0 or bool(self._gust.any())
         self.count = count
         self._own = self.draws.random or self._wind_speed > 0.0 or self._turbulence > 0.0
-        self._base = np.tile(self._in_wind(self.vehicle.vector), (count if self._own else 1, 1))
-        self.params = self._base.copy()
+        self._vector = self._in_wind(self.vehicle.vector)
+        self.params = np.tile(self._vector, (count if self._own else 1, 1))
         self._switched_on = bool(self.params[:, STAGES].any())
         self.drawn = np.zeros((count, len(self.draws.names)))
         self.kinds = np.zeros(count, dtype=np.int64)
         self._allocate()
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         self._threads = max(1, min(threads or most or 1, count // ROWS_PER_THREAD))
+        # enough rows, and nothing that lanes do not have
+        self._fit_for_lanes = (
+            count >= LANES_FROM
+            and len(self._table) == 1
+            and self.swash.shape[1] == 1
+            and self.past.shape[1] == 0
+            and not self._turbulence
+        )
 
     def _set_task(self, task: str, target: Any, sensors: str) -> None:
         self.task = tasks.task(task)
@@ -336,16 +369,7 @@ class Fleet:
             states: paper or full states to start from, (count, 16 or 26); random when None.
             observations: where to put the rows' observations, (count, n_observed).
         """
-        if self.draws.random:
-            streams = self.streams[which]
-            self.drawn[which], self.kinds[which] = self.draws.draw(streams)
-            self.streams[which] = streams
-            self._base[which] = self._in_wind(
-                self.draws.vectors(self.drawn[which], self.kinds[which])
-            )
-        if self._own:
-            self.params[which] = self._base[which]
-            self._switched_on = bool(self.params[:, STAGES].any())
+        self._draw(which)
         if states is not None:
             x = np.zeros((self.count, N_FULL))
             x[:, 16:20] = self.trim
@@ -353,67 +377,113 @@ class Fleet:
             self.x[which] = x[which]
         if observations is None:
             observations = self.held.astype(np.float32)
+        self._start(0, self.count, which, states is not None, observations)
+        return observations
+
+    def _draw(self, which: np.ndarray) -> None:
+        """Vehicles for new flights in the rows of a mask, in still air or the env's steady wind."""
+        if self.draws.random:
+            streams = self.streams[which]
+            self.drawn[which], self.kinds[which] = self.draws.draw(streams)
+            self.streams[which] = streams
+            vectors = self.draws.vectors(self.drawn[which], self.kinds[which])
+            self.params[which] = self._in_wind(vectors)
+            self._switched_on = bool(self.params[:, STAGES].any())
+        elif self._own:
+            self.params[which] = self._vector
+
+    def _start(
+        self, first: int, last: int, which: np.ndarray, keep_state: bool, observations: np.ndarray
+    ) -> None:
         _restart_rows(
-            which, states is not None, self.trim, self.params, self.kinds, self._table, self._limits,
-            self._wind_speed, self._turbulence,
-            self._places, self._height_sign, self._course, self._box,
+            first, last, which, keep_state, self.trim, self.params, self.kinds, self._table,
+            self._limits, len(self.flags), self._wind_speed, self._turbulence,
+            self._course, self._box,
             self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked, self.bias,
             self.past, self.eddies, self.breeze, self.targets, self.progress, self.held,
             observations,
         )  # fmt: skip
-        return observations
+        if self.task.aims:
+            self._point(first, last, which, observations)
 
-    def fly(self, actions: np.ndarray, active: np.ndarray) -> Outcome:
-        """One control period. `actions` (count, 4) float64 is clipped to [-1, 1] in place."""
+    def _point(self, first: int, last: int, which: np.ndarray, observations: np.ndarray) -> None:
+        _point_rows(
+            first, last, which, self._places, self._height_sign, self.targets, self.held,
+            observations,
+        )  # fmt: skip
+
+    def fly(
+        self, actions: np.ndarray, active: np.ndarray, anew: np.ndarray | None = None
+    ) -> Outcome:
+        """One control period; `x` is a new array then, and the one before stays as it was.
+
+        Args:
+            actions: (count, 4) float64; whether they are clipped in place is left open.
+            active: which rows fly, (count,). anew: which of the others start a new flight, (count,).
+        """
         n = self.count
         outcome = Outcome(
             np.empty((n, self.n_observed), dtype=np.float32),
-            np.zeros(n),
-            np.zeros((n, len(self._weights))),
-            np.zeros(n, dtype=np.bool_),
+            np.empty(n),
+            np.empty((n, len(self._weights))),
+            np.empty(n, dtype=np.bool_),
         )
-
-        task = (
-            self._weights, self._scales, self._places, self._height_sign, self._course, self._box,
-            self._dwell,
-        )  # fmt: skip
-        results = (outcome.observations, outcome.rewards, outcome.terms, outcome.over)
+        if anew is not None:
+            self._draw(anew)
+        side_by_side = self._fit_for_lanes and not self._switched_on
+        before = self.x
+        self.x = np.empty_like(before) if side_by_side else before.copy()
 
         def rows(first: int, last: int) -> None:
-            if self._side_by_side():
-                self._fly_lanes()(
-                    first, last, active, actions, self.trim, self.scale, self.params,
-                    self._table[0], self._limits[0], self._gust, *task,
-                    self.x, self.u, self.rows, self.azimuth, self.streams, self.asked, self.bias,
-                    self.targets, self.progress, self.held, *results,
+            if side_by_side:
+                self._fly_lanes(first, last, actions, active, before, outcome)
+            else:
+                self._fly_one_by_one(first, last, actions, active, outcome)
+            if self._dwell:
+                _arrive_rows(
+                    first, last, active, self._weights, self._course, self._box, self._dwell,
+                    self.x, self.streams, self.targets, self.progress, outcome.rewards,
+                    outcome.terms,
                 )  # fmt: skip
-                return
-            _fly_rows(
-                first, last, active, actions, self.trim, self.scale, self.params, self.kinds,
-                self._table, self._limits, self._gust, self._turbulence, *task,
-                self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked,
-                self.bias, self.past, self.eddies, self.breeze, self.targets, self.progress,
-                self.held, *results,
-            )  # fmt: skip
+            if self.task.aims:
+                self._point(first, last, active, outcome.observations)
+            if anew is not None:
+                self._start(first, last, anew, False, outcome.observations)
 
         in_threads(rows, n, self._threads)
         return outcome
 
-    def _side_by_side(self) -> bool:
-        """Whether the rows fly in lanes: enough of them, and nothing that lanes do not have."""
-        return (
-            self.count >= LANES_FROM
-            and len(self._table) == 1
-            and self.swash.shape[1] == 1
-            and self.past.shape[1] == 0
-            and not self._turbulence
-            and not self._switched_on
-        )
+    def _fly_one_by_one(
+        self, first: int, last: int, actions: np.ndarray, active: np.ndarray, outcome: Outcome
+    ) -> None:
+        if self._disturbed:
+            _disturb_rows(
+                first, last, active, self.params, self._gust, self._turbulence,
+                self.x, self.streams, self.eddies, self.breeze,
+            )  # fmt: skip
+        _fly_rows(
+            first, last, active, actions, self.trim, self.scale, self.params, self.kinds,
+            self._table, self._limits, len(self.flags), self._weights, self._scales,
+            self.x, self.u, self.rows, self.azimuth, self.streams, self.swash, self.asked,
+            self.bias, self.past, self.targets, self.held,
+            outcome.observations, outcome.rewards, outcome.terms, outcome.over,
+        )  # fmt: skip
 
-    def _fly_lanes(self) -> Callable[..., None]:
+    def _fly_lanes(
+        self, first: int, last: int, actions: np.ndarray, active: np.ndarray, before: np.ndarray,
+        outcome: Outcome,
+    ) -> None:  # fmt: skip
         from coax_env import fleet_lanes  # compiled where it is flown only
 
-        return fleet_lanes.fly_own if len(self.params) > 1 else fleet_lanes.fly_shared
+        fly = fleet_lanes.fly_own if len(self.params) > 1 else fleet_lanes.fly_shared
+        fly(
+            first, last, active, actions, self.trim, self.scale, self.params,
+            self._table[0], self._limits[0], self._gust, len(self.flags),
+            self._weights, self._scales,
+            before, self.u, self.rows, self.azimuth, self.streams, self.asked, self.bias,
+            self.targets, self.held, self.x,
+            outcome.observations, outcome.rewards, outcome.terms, outcome.over,
+        )  # fmt: skip
 
     @property
     def air(self) -> np.ndarray:

@@ -7,20 +7,23 @@ results are dropped.
 
 import numpy as np
 
-from coax_env import effects, hover, tasks
+from coax_env import effects, hover
 from coax_env import parameters as P
 from coax_env.actuators import limit
 from coax_env.dynamics import WORK_SIZE, measure_bare, step_bare
 from coax_env.errors import InputError
 from coax_env.fleet import STAGES, in_threads
 from coax_env.jit import compiled
-from coax_env.lanes import WIDTH, gather, lanes_of, scatter, select, words_of
-from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
-from coax_env.period import BIAS, BIAS_STD, DT, blow, command, read, seen, turned
+from coax_env.lanes import WIDTH, gather, lanes_of, scatter, scratch, select, words_of
+from coax_env.layout import N_CHANNELS, N_FULL, N_INPUTS, N_STATES, TIME
+from coax_env.period import BIAS, BIAS_STD, DT, blow, command, read, rest, seen, turned
 from coax_env.vehicle import Vehicle
 
-CHUNK = 64
-"""Rows that are flown, and then sense: the code of either stays at hand for some groups."""
+CHUNK = 512
+"""Rows that are flown, and then sense: as many as the second-level cache can hold."""
+
+PHASES = 10
+"""Rows after which the shipped sensors' rates, 10 to 100 Hz, come round again."""
 
 _N_PARAMETERS = P.N_FIXED + len(effects.STAGES)
 _ROW, _AZIMUTH, _REWARD, _OVER = range(4)
@@ -41,27 +44,46 @@ def _next_group(i, last, active, which):
     return n, i
 
 
+@compiled()
+def _by_phase(first, last, active, rows, order):
+    """The active rows first..last-1 into `order`, those together whose sensors are due together; how
+    many they are. What no row of a group has due, none of them draws noise for.
+    """
+    places = np.zeros(PHASES + 1, np.int64)
+    for i in range(first, last):
+        if active[i]:
+            places[rows[i] % PHASES + 1] += 1
+    for phase in range(PHASES):
+        places[phase + 1] += places[phase]
+    for i in range(first, last):
+        if active[i]:
+            phase = rows[i] % PHASES
+            order[places[phase]] = i
+            places[phase] += 1
+    return places[PHASES]
+
+
 def _step_of(own):
     """Command, flight and judgement, for parameters of each row's own, or for one vehicle."""
 
     def step_rows(
         first, last, active, actions, trim, scale, params, limits, gust, weights, scales,
-        x, u, rows, azimuth, streams, asked, targets, rewards, terms, over,
+        x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
     ):  # fmt: skip
         """Fly the active rows first..last-1 for one control period. See fleet.Fleet for the arrays."""
         which = np.empty(WIDTH, np.int64)
         x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
         action_block, asked_block = np.empty((4, WIDTH)), np.empty((4, WIDTH))
         target_block, term_block = np.empty((4, WIDTH)), np.zeros((len(weights), WIDTH))
-        stream_block, work_block = np.empty((2, WIDTH), np.uint64), np.empty((WORK_SIZE, WIDTH))
-        row_block = np.empty((_N_SINGLES, WIDTH))
+        stream_block, row_block = np.empty((2, WIDTH), np.uint64), np.empty((_N_SINGLES, WIDTH))
         x_, u_, action_ = lanes_of(x_block), lanes_of(u_block), lanes_of(action_block)
         asked_, target_, terms_ = (
             lanes_of(asked_block),
             lanes_of(target_block),
             lanes_of(term_block),
         )
-        single_, work, stream_ = lanes_of(row_block), lanes_of(work_block), words_of(stream_block)
+        single_, stream_ = lanes_of(row_block), words_of(stream_block)
+        work, flown_ = scratch(WORK_SIZE), scratch(N_FULL)
         if own:
             p_block = np.empty((_N_PARAMETERS, WIDTH))
             p = lanes_of(p_block)
@@ -89,12 +111,14 @@ def _step_of(own):
                 blow(x_, p, gust, stream_)
                 scatter(stream_block, which, n, streams)
             u_[TIME] = single_[_ROW] * DT
-            step_bare(x_, u_, DT, p, work, x_)
+            step_bare(x_, u_, DT, p, work, flown_)
+            for k in range(N_FULL):
+                x_[k] = flown_[k]
             u_[TIME] = (single_[_ROW] + 1.0) * DT
             single_[_AZIMUTH] = turned(single_[_AZIMUTH], x_[16])
             single_[_REWARD] = hover.reward(x_, action_, target_, weights, scales, terms_)
             single_[_OVER] = select(hover.is_over(x_), 1.0, 0.0)
-            scatter(x_block, which, n, x)
+            scatter(x_block, which, n, flown)
             scatter(u_block, which, n, u)
             scatter(term_block, which, n, terms)
             for j in range(n):
@@ -112,24 +136,20 @@ def _sense_of(own):
     """Readings, for parameters of each row's own, or for one vehicle."""
 
     def sense_rows(
-        first, last, active, params, sensors, places, height_sign,
-        x, u, rows, streams, bias, targets, held, observations,
+        first, last, active, params, sensors, flags, x, rows, streams, bias, held, observations,
     ):  # fmt: skip
         """New readings of the active rows first..last-1. See fleet.Fleet for the arrays."""
-        which = np.empty(WIDTH, np.int64)
+        which, order = np.empty(WIDTH, np.int64), np.empty(last - first, np.int64)
         count = len(sensors)
-        x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
-        target_block, held_block = np.empty((4, WIDTH)), np.empty((held.shape[1], WIDTH))
+        x_block, reading_block = np.empty((N_FULL, WIDTH)), np.empty((N_CHANNELS, WIDTH))
+        held_block, row_block = np.empty((held.shape[1], WIDTH)), np.empty((1, WIDTH))
         bias_block, value_block = np.zeros((count, WIDTH)), np.empty((count, WIDTH))
-        reading_block, work_block = np.empty((N_CHANNELS, WIDTH)), np.empty((WORK_SIZE, WIDTH))
-        stream_block, row_block = np.empty((2, WIDTH), np.uint64), np.empty((1, WIDTH))
-        x_, u_, target_, held_ = (
-            lanes_of(x_block), lanes_of(u_block), lanes_of(target_block), lanes_of(held_block)
-        )  # fmt: skip
+        stream_block, work = np.empty((2, WIDTH), np.uint64), scratch(WORK_SIZE)
+        x_, held_, row_ = lanes_of(x_block), lanes_of(held_block), lanes_of(row_block)
         bias_, values_, readings_ = (
             lanes_of(bias_block), lanes_of(value_block), lanes_of(reading_block)
         )  # fmt: skip
-        row_, work, stream_ = lanes_of(row_block), lanes_of(work_block), words_of(stream_block)
+        stream_ = words_of(stream_block)
         if own:
             p_block = np.empty((_N_PARAMETERS, WIDTH))
             p = lanes_of(p_block)
@@ -138,11 +158,12 @@ def _sense_of(own):
         biased = False
         for k in range(count):
             biased = biased or sensors[k, BIAS] != 0.0 or sensors[k, BIAS_STD] != 0.0
-        flags = len(held_) - len(places) - count
-        n, after = _next_group(first, last, active, which)
-        while n > 0:
+        active_rows = _by_phase(first, last, active, rows, order)
+        for at in range(0, active_rows, WIDTH):
+            n = min(WIDTH, active_rows - at)
+            for j in range(WIDTH):
+                which[j] = order[at + j if j < n else at]
             gather(x, which, x_block)
-            gather(u, which, u_block)
             gather(held, which, held_block)
             gather(streams, which, stream_block)
             if biased:
@@ -151,16 +172,13 @@ def _sense_of(own):
                 gather(params, which, p_block)
             for j in range(WIDTH):
                 row_block[0, j] = rows[which[j]]
-            measure_bare(x_, u_, p, work, readings_)
+            # without effects the actuators are where they were sent, and time has no part
+            measure_bare(x_, x_[N_STATES:], p, work, readings_)
             seen(x_, readings_, sensors, values_)
             read(values_, row_[0], sensors, bias_, stream_, flags, held_)
-            if len(places) > 0:
-                gather(targets, which, target_block)
-                tasks.point(held_, places, height_sign, target_, held_[count + flags :])
             scatter(held_block, which, n, held)
             scatter(held_block, which, n, observations)
             scatter(stream_block, which, n, streams)
-            n, after = _next_group(after, last, active, which)
 
     return compiled()(sense_rows)
 
@@ -173,9 +191,8 @@ def _fly_of(own):
     """The batch kernel for parameters of each row's own, or for one vehicle."""
 
     def fly(
-        first, last, active, actions, trim, scale, params, sensors, limits, gust,
-        weights, scales, places, height_sign, course, box, dwell,
-        x, u, rows, azimuth, streams, asked, bias, targets, progress, held,
+        first, last, active, actions, trim, scale, params, sensors, limits, gust, flags,
+        weights, scales, x, u, rows, azimuth, streams, asked, bias, targets, held, flown,
         observations, rewards, terms, over,
     ):  # fmt: skip
         """One control period of the active rows first..last-1. See fleet.Fleet for the arrays."""
@@ -184,30 +201,30 @@ def _fly_of(own):
             if own:
                 _step_own(
                     start, end, active, actions, trim, scale, params, limits, gust, weights, scales,
-                    x, u, rows, azimuth, streams, asked, targets, rewards, terms, over,
+                    x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
                 )  # fmt: skip
             else:
                 _step_shared(
                     start, end, active, actions, trim, scale, params, limits, gust, weights, scales,
-                    x, u, rows, azimuth, streams, asked, targets, rewards, terms, over,
+                    x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
                 )  # fmt: skip
             for i in range(start, end):
                 if not active[i]:
-                    for k in range(held.shape[1]):
-                        observations[i, k] = held[i, k]
-                elif dwell > 0 and tasks.arrive(x[i], targets[i], dwell, progress[i], course):
-                    terms[i, hover.N_TERMS] = weights[hover.N_TERMS]
-                    rewards[i] += weights[hover.N_TERMS]
-                    tasks.aim(streams[i], course, box, progress[i, tasks.REACHED], targets[i])
+                    rest(x[i], flown[i])
+                    rest(held[i], observations[i])
+                    for k in range(terms.shape[1]):
+                        terms[i, k] = 0.0
+                    rewards[i] = 0.0
+                    over[i] = False
             if own:
                 _sense_own(
-                    start, end, active, params, sensors, places, height_sign,
-                    x, u, rows, streams, bias, targets, held, observations,
+                    start, end, active, params, sensors, flags, flown, rows, streams, bias, held,
+                    observations,
                 )  # fmt: skip
             else:
                 _sense_shared(
-                    start, end, active, params, sensors, places, height_sign,
-                    x, u, rows, streams, bias, targets, held, observations,
+                    start, end, active, params, sensors, flags, flown, rows, streams, bias, held,
+                    observations,
                 )  # fmt: skip
 
     return compiled()(fly)
@@ -221,13 +238,15 @@ fly_own = _fly_of(True)
 def _dynamics_rows(first, last, x, u, p):
     which, active = np.empty(WIDTH, np.int64), np.ones(len(x), np.bool_)
     x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
-    work_block = np.empty((WORK_SIZE, WIDTH))
-    x_, u_, work = lanes_of(x_block), lanes_of(u_block), lanes_of(work_block)
+    x_, u_ = lanes_of(x_block), lanes_of(u_block)
+    work, flown_ = scratch(WORK_SIZE), scratch(N_FULL)
     n, after = _next_group(first, last, active, which)
     while n > 0:
         gather(x, which, x_block)
         gather(u, which, u_block)
-        step_bare(x_, u_, DT, p, work, x_)
+        step_bare(x_, u_, DT, p, work, flown_)
+        for k in range(N_FULL):
+            x_[k] = flown_[k]
         scatter(x_block, which, n, x)
         n, after = _next_group(after, last, active, which)
 

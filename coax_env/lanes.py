@@ -284,42 +284,60 @@ _PI_3 = float.fromhex("0x1.3198a2e037073p-69")
 _FARTHEST = 1e6  # [quarter turns]; beyond it, n times the parts is not exact
 
 
+_EIGHTH = 0.25 * math.pi
+
+
 def sine_and_cosine(x):
     """Sine and cosine of a number or of lanes [rad]."""
     return math.sin(x), math.cos(x)
 
 
+def sines_and_cosines(x, y):
+    """Sine and cosine of one angle [rad], and of another: of two numbers, or of lanes."""
+    return sine_and_cosine(x), sine_and_cosine(y)
+
+
 @_by_kind(sine_and_cosine)
 def _sine_and_cosine_of(x):
-    return (
-        (lambda x: _lanes_sine_and_cosine(x))
-        if x == LANES
-        else lambda x: (math.sin(x), math.cos(x))
-    )
+    def of_lanes(x):
+        return _wound(x) if anywhere(abs(x) > _EIGHTH) else _within_an_eighth(x)
+
+    return of_lanes if x == LANES else lambda x: (math.sin(x), math.cos(x))
+
+
+@_by_kind(sines_and_cosines)
+def _sines_and_cosines_of(x, y):
+    def of_lanes(x, y):
+        if anywhere(max(abs(x), abs(y)) > _EIGHTH):
+            return _wound(x), _wound(y)
+        return _within_an_eighth(x), _within_an_eighth(y)
+
+    return of_lanes if x == LANES else lambda x, y: (sine_and_cosine(x), sine_and_cosine(y))
 
 
 @numba.njit(error_model="numpy", **_INLINE)
-def _lanes_sine_and_cosine(x):
-    """Sine and cosine to 1e-15; NaN beyond a million quarter turns.
-
-    Reduced to a quarter turn about zero, then Taylor's polynomials as Cephes has them (Moshier 1989).
-    """
-    n = math.floor(x * (2.0 / math.pi) + 0.5)
-    n = select(abs(n) < _FARTHEST, n, math.nan)
-    r = ((x - n * _PI_1) - n * _PI_2) - n * _PI_3
+def _within_an_eighth(r):
+    """Sine and cosine to 1e-15 within an eighth of a turn: the polynomials of Cephes (Moshier 1989)."""
     z = r * r
     s = 1.58962301576546568060e-10 * z - 2.50507477628578072866e-8
     s = s * z + 2.75573136213857245213e-6
     s = s * z - 1.98412698295895385996e-4
     s = s * z + 8.33333333332211858878e-3
     s = s * z - 1.66666666666666307295e-1
-    s = s * z * r + r
     c = 2.08757008419747316778e-9 - 1.13585365213876817300e-11 * z
     c = c * z - 2.75573141792967388112e-7
     c = c * z + 2.48015872888517045348e-5
     c = c * z - 1.38888888888730564116e-3
     c = c * z + 4.16666666666665929218e-2
-    c = c * z * z - 0.5 * z + 1.0
+    return s * z * r + r, c * z * z - 0.5 * z + 1.0
+
+
+@numba.njit(error_model="numpy", **_INLINE)
+def _wound(x):
+    """Sine and cosine to 1e-15 of angles however many turns; NaN beyond a million quarter turns."""
+    n = math.floor(x * (2.0 / math.pi) + 0.5)
+    n = select(abs(n) < _FARTHEST, n, math.nan)
+    s, c = _within_an_eighth(((x - n * _PI_1) - n * _PI_2) - n * _PI_3)
     half = math.floor(0.5 * n)
     odd = n - 2.0 * half  # 0 or 1: quarter turns
     back = half - 2.0 * math.floor(0.5 * half)  # 0 or 1: half turns
@@ -338,28 +356,47 @@ def _cosine(x):
     return (lambda x: sine_and_cosine(x)[1]) if x == LANES else None
 
 
-@_by_kind(math.tan)
-def _tangent(x):
-    def tangent(x):
-        sine, cosine = sine_and_cosine(x)
-        return sine / cosine
-
-    return tangent if x == LANES else None
-
-
 # --- powers ----------------------------------------------------------------------------------------
 
 
-def _bits(x):
-    """The bits of lanes."""
+def bits_of(x):
+    """The bits of a double, or of lanes, as 64-bit numbers."""
 
 
-def _from_bits(words):
-    """Lanes from their bits."""
+def from_bits(words):
+    """The double, or the lanes, of these bits."""
 
 
-_define(_bits, (LANES,), WORDS, lambda b, x: b.bitcast(x, WORDS.vector))
-_define(_from_bits, (WORDS,), LANES, lambda b, x: b.bitcast(x, LANES.vector))
+_define(bits_of, (LANES,), WORDS, lambda b, x: b.bitcast(x, WORDS.vector))
+_define(from_bits, (WORDS,), LANES, lambda b, x: b.bitcast(x, LANES.vector))
+
+
+def _same_bits(result: types.Type) -> Callable:
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], context.get_value_type(result))
+
+    return lambda typingctx, x: (result(x), emit)
+
+
+@intrinsic
+def _bits_of_one(typingctx, x):
+    return _same_bits(types.uint64)(typingctx, x)
+
+
+@intrinsic
+def _from_bits_of_one(typingctx, words):
+    return _same_bits(types.float64)(typingctx, words)
+
+
+@_by_kind(bits_of)
+def _bits_of_number(x):
+    return (lambda x: _bits_of_one(x)) if x == types.float64 else None
+
+
+@_by_kind(from_bits)
+def _number_of_bits(words):
+    return (lambda words: _from_bits_of_one(words)) if words == types.uint64 else None
+
 
 _WHOLE = np.uint64(0x4330000000000000)  # the bits of 2^52: under them a whole number fits
 _MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
@@ -373,7 +410,7 @@ def _whole_number(words):
     """Words under 2^52 as lanes."""
     if words != WORDS:
         return None
-    return lambda words: _from_bits(words | _WHOLE) - 2.0**52
+    return lambda words: from_bits(words | _WHOLE) - 2.0**52
 
 
 @_by_kind(math.exp)
@@ -389,7 +426,7 @@ def _exponential(x):
         a = (a * z + 9.99999999999999999910e-1) * r
         b = 3.00198505138664455042e-6 * z + 2.52448340349684104192e-3
         b = (b * z + 2.27265548208155028766e-1) * z + 2.0
-        scale = _from_bits(_bits(n + (1.5 * 2.0**52 + 1023.0)) << _EXPONENT)
+        scale = from_bits(bits_of(n + (1.5 * 2.0**52 + 1023.0)) << _EXPONENT)
         return (1.0 + 2.0 * (a / (b - a))) * scale
 
     return exponential if x == LANES else None
@@ -403,9 +440,9 @@ def _logarithm(x):
     """
 
     def logarithm(x):
-        bits = _bits(x)
+        bits = bits_of(x)
         exponent = float(bits >> _EXPONENT) - 1022.0
-        m = _from_bits((bits & _MANTISSA) | _HALF)
+        m = from_bits((bits & _MANTISSA) | _HALF)
         low = m < math.sqrt(0.5)
         exponent = select(low, exponent - 1.0, exponent)
         r = select(low, 2.0 * m, m) - 1.0
@@ -457,6 +494,28 @@ def lanes_of(typingctx, array):
 def words_of(typingctx, array):
     """An array (n, WIDTH) of 64-bit numbers, contiguous, as n `Words`, the same memory."""
     return _view(WORDS)(typingctx, array)
+
+
+@intrinsic
+def scratch(typingctx, n):
+    """So many `Lanes` on the stack, not set; `n` is a constant.
+
+    Where the code that uses them is inlined and its indices are constant, they become registers.
+    """
+    if not isinstance(n, types.IntegerLiteral):
+        return None
+    row = types.Array(LANES, 1, "C", aligned=False)
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        count, size = (context.get_constant(types.intp, k) for k in (n.literal_value, 8 * WIDTH))
+        with builder.goto_entry_block():
+            place = builder.alloca(ir.ArrayType(LANES.vector, n.literal_value))
+        rows = make_array(row)(context, builder)
+        data = builder.bitcast(place, LANES.vector.as_pointer())
+        populate_array(rows, data, shape=[count], strides=[size], itemsize=size, meminfo=None)
+        return rows._getvalue()
+
+    return row(types.literal(n.literal_value)), emit
 
 
 def _four_by_four(builder: Any, rows: list) -> list:

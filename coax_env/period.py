@@ -11,8 +11,15 @@ from coax_env import parameters as P
 from coax_env.jit import compiled
 from coax_env.lanes import anywhere, select
 from coax_env.layout import N_CHANNELS
-from coax_env.random_streams import bits_ahead, chance_of, normals_of, skip, two_normals
-from coax_env.sensors import is_new
+from coax_env.random_streams import (
+    bits_ahead,
+    chance_of,
+    normals_of,
+    place_of,
+    skip,
+    two_normals,
+)
+from coax_env.sensors import new_samples
 
 DT = hover.CONTROL_PERIOD
 
@@ -63,6 +70,13 @@ def seen(x, readings, sensors, out):
 
 
 @compiled()
+def rest(row, out):
+    """One row of numbers into another: of a helicopter that does not fly."""
+    for k in range(len(row)):
+        out[k] = row[k]
+
+
+@compiled()
 def read(values, row, sensors, bias, stream, flags, held):
     """New readings where they are due, into `held`: readings, then this many flags.
 
@@ -72,36 +86,38 @@ def read(values, row, sensors, bias, stream, flags, held):
     n = len(sensors)
     for k in range(n, n + flags):
         held[k] = 0.0
+    place = place_of(stream)
     noisy = 0
     pair = -1
     rate = -1.0
-    due = row < 0
-    first = second = 0.0 * row
+    new = first = second = 0.0 * row
     for k in range(n):
         noise = sensors[k, NOISE]
-        place = noisy // 2
+        here = noisy // 2
         even = noisy % 2 == 0
         noisy += noise > 0.0
         if sensors[k, RATE] != rate:
             rate = sensors[k, RATE]
-            due = is_new(row, rate)
-        if not anywhere(due):
+            new = new_samples(row, rate)
+        if not anywhere(new > 0.0):
             continue
         value = values[k] + bias[k]
         if noise > 0.0:
-            if place != pair:
-                pair = place
-                first, second = normals_of(bits_ahead(stream, pair))
+            if here != pair:
+                pair = here
+                first, second = normals_of(bits_ahead(place, pair))
             value += noise * (first if even else second)
         if sensors[k, WRAPS] != 0.0:
             value -= _TURN * math.floor((value + math.pi) / _TURN)
-        here = due
+        got = new
         if sensors[k, DROPOUT] > 0.0:
-            chance = chance_of(bits_ahead(stream, n + int(sensors[k, INSTRUMENT])))
-            here = due & ((row <= 0) | (chance >= sensors[k, DROPOUT]))
-        kept = min(max(value, sensors[k, LOW]), sensors[k, HIGH])
-        held[k] = select(here & math.isfinite(value), kept, held[k])
+            chance = chance_of(bits_ahead(place, n + int(sensors[k, INSTRUMENT])))
+            got = select((row <= 0) | (chance >= sensors[k, DROPOUT]), got, 0.0)
+        before = held[k]
+        value = select(math.isfinite(value), value, before)
+        value = select(got < 1.0, before, value)
+        held[k] = min(max(value, sensors[k, LOW]), sensors[k, HIGH])
         flag = int(sensors[k, FLAG])
         if flag >= 0:
-            held[flag] = select(here, 1.0, held[flag])
+            held[flag] = max(held[flag], min(got, 1.0))
     skip(stream, 2 * n)

@@ -193,14 +193,20 @@ def shake(readings: np.ndarray, azimuth: float, amplitude: float) -> None:
 
 
 @compiled()
-def is_new(row: int, rate: float) -> bool:
-    """Whether a sensor of `rate` [Hz] has a new sample in a row of the 100 Hz loop; row 0 always.
+def new_samples(row: int, rate: float) -> float:
+    """How many samples a sensor of `rate` [Hz] has taken since the row before, up to this one.
 
-    Samples are rounded up to the loop's rows: at 40 Hz they come after 3, 2, 3, 2 ... rows.
+    Rows are those of the 100 Hz loop; samples are rounded up to them: at 40 Hz they come after
+    3, 2, 3, 2 ... rows.
     """
     now = math.floor(row * (rate / BASE_RATE) + 1e-9)
-    before = math.floor((row - 1) * (rate / BASE_RATE) + 1e-9)
-    return now > before
+    return now - math.floor((row - 1) * (rate / BASE_RATE) + 1e-9)
+
+
+@compiled()
+def is_new(row: int, rate: float) -> bool:
+    """Whether a sensor of `rate` [Hz] has a new sample in a row of the 100 Hz loop; row 0 always."""
+    return new_samples(row, rate) > 0.0
 
 
 def log_readings(

@@ -12,8 +12,9 @@ from coax_env.dynamics import WORK_SIZE, full_state, hover_trim, measure, step
 from coax_env.dynamics import measure_bare as measure_any
 from coax_env.dynamics import step_bare as step_any
 from coax_env.env import CoaxVectorEnv
-from coax_env.lanes import WIDTH, lanes_of
+from coax_env.lanes import WIDTH, lanes_of, words_of
 from coax_env.layout import N_CHANNELS
+from coax_env.random_streams import normals_of
 
 LAMA = coax_env.load_vehicle("lama400d")
 
@@ -44,6 +45,12 @@ def _exponential(x, out):
 def _logarithm(x, out):
     for i in range(len(x)):
         lanes_of(out)[i] = math.log(lanes_of(x)[i])
+
+
+@numba.njit
+def _normals(bits, first, second):
+    for i in range(len(bits)):
+        lanes_of(first)[i], lanes_of(second)[i] = normals_of(words_of(bits)[i])
 
 
 def applied(function, x: np.ndarray, results: int = 1) -> list[np.ndarray]:
@@ -88,6 +95,36 @@ def test_exponential_and_logarithm_are_right_to_the_last_bits():
     assert (np.abs(error) <= 3e-16 * np.abs(np.log(x)) + 1e-300).all()
     for wrong in (0.0, -1.0, math.nan):
         assert np.isnan(applied(_logarithm, np.full(WIDTH, wrong))).all()
+
+
+def test_angles_within_and_beyond_an_eighth_of_a_turn_do_not_hurt_each_other():
+    x = np.random.default_rng(4).uniform(-0.7, 0.7, 800 * WIDTH)
+    small = applied(_sine_and_cosine, x, 2)
+    beside = x.copy()
+    beside[::WIDTH] = 50.0
+    beside[1::WIDTH] = math.nan
+    mixed = applied(_sine_and_cosine, beside, 2)
+    kept = np.ones(len(x), dtype=bool)
+    kept[::WIDTH] = kept[1::WIDTH] = False
+    for one, other in zip(small, mixed, strict=True):
+        assert np.abs(one - other)[kept].max() < 4e-16
+        assert np.isnan(other[1::WIDTH]).all()
+
+
+def test_normal_numbers_are_those_of_box_and_muller():
+    rng = np.random.default_rng(3)
+    bits = rng.integers(0, 2**64, 16000, dtype=np.uint64, endpoint=False)
+    corners = [0, 1, 2**30, 2**31 - 1, 2**31, 2**31 + 1, 2**32 - 1]
+    pairs = [(a << 32) | b for a in corners for b in corners]
+    bits = np.concatenate([bits, np.array(pairs * WIDTH, dtype=np.uint64)])
+    radius = np.sqrt(-2.0 * np.log(((bits >> np.uint64(32)) + 0.5) / 2.0**32))
+    angle = 2.0 * math.pi * (bits & np.uint64(0xFFFFFFFF)) / 2.0**32
+    for found, expected in zip(
+        applied(_normals, bits, 2), (radius * np.cos(angle), radius * np.sin(angle)), strict=True
+    ):
+        assert np.abs(found - expected).max() < 5e-11
+    alone = np.array([normals_of(number) for number in bits[:2000]]).T
+    assert np.abs(alone - applied(_normals, bits[: 250 * WIDTH], 2)).max() < 1e-14
 
 
 # --- dynamics -------------------------------------------------------------------------------------
