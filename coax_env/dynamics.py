@@ -240,18 +240,23 @@ def _rates_of(with_effects):
 
 
 _rates_with_effects = late(_rates_of(True))
-_rates_without = late(_rates_of(False))  # compiled once, not again within every caller
 _rates_bare = compiled(forceinline=True)(_rates_of(False))
+
+
+@compiled()
+def _switched_on(p):
+    """How many of the stages that act in flight have an effect; they are 0 or 1."""
+    flown = p[effects.AIR] + p[effects.SWASH] + p[effects.ROTOR] + p[effects.LOAD]
+    return flown + p[effects.UNLISTED]
 
 
 @compiled()
 def _rates(x, p, f, dx):
     """Rates of the paper's sixteen states, (26)-(44), shape (16,), into `dx`."""
-    flown = p[effects.AIR] + p[effects.SWASH] + p[effects.ROTOR] + p[effects.LOAD]
-    if flown + p[effects.UNLISTED] != 0.0:
+    if _switched_on(p) != 0.0:
         _rates_with_effects(x, p, f, dx)
     else:
-        _rates_without(x, p, f, dx)
+        _rates_bare(x, p, f, dx)
 
 
 def _step_of(with_effects):
@@ -314,12 +319,21 @@ def _step_of(with_effects):
             for i in range(20, N_FULL):
                 out[i] *= half_gust * half_gust
 
-    return compiled(forceinline=not with_effects)(step)
+    return late(step) if with_effects else compiled(forceinline=True)(step)
 
 
-step = _step_of(True)
+_step_with_effects = _step_of(True)
 step_bare = _step_of(False)
 """`step` for a vehicle whose effects are all off: less to compile, and fit for lanes (lanes.py)."""
+
+
+@compiled()
+def step(x, u, dt, p, work, out):
+    """Fly one row, with the effects that are on; arguments as in `_step_of`."""
+    if _switched_on(p) + p[effects.PROPERTY] != 0.0:
+        _step_with_effects(x, u, dt, p, work, out)
+    else:
+        step_bare(x, u, dt, p, work, out)
 
 
 @compiled()
@@ -389,11 +403,20 @@ def _measure_of(with_effects):
         for i in range(N_CHANNELS):
             out[i] = z[i]
 
-    return compiled(forceinline=not with_effects)(measure)
+    return late(measure) if with_effects else compiled(forceinline=True)(measure)
 
 
-measure = _measure_of(True)
+_measure_with_effects = _measure_of(True)
 measure_bare = _measure_of(False)
+
+
+@compiled()
+def measure(x, u, p, work, out):
+    """Readings of every canonical channel, with the effects that are on; as in `_measure_of`."""
+    if _switched_on(p) + p[effects.PROPERTY] + p[effects.SENSOR] != 0.0:
+        _measure_with_effects(x, u, p, work, out)
+    else:
+        measure_bare(x, u, p, work, out)
 
 
 @compiled()

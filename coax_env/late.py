@@ -28,9 +28,13 @@ _kept: list[Any] = []  # cells and makers: compiled code has their addresses
 
 
 def late(function: Callable) -> Any:
-    """Make a function of 3 or 4 arrays of doubles one that compiled code can call; see above."""
+    """Make a function of 3 to 6 arguments one that compiled code can call; see above.
+
+    All are arrays of doubles, but for one called ``dt``, a number.
+    """
     name = name_apart(function).__qualname__
-    signature = types.void(*[_ARRAY] * function.__code__.co_argcount)
+    arguments = function.__code__.co_varnames[: function.__code__.co_argcount]
+    signature = types.void(*(float64 if a == "dt" else _ARRAY for a in arguments))
     cell = ctypes.c_size_t(0)
 
     def compile_now() -> int:
@@ -77,4 +81,11 @@ def late(function: Callable) -> Any:
     def of_four(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
         return signature, emit
 
-    return intrinsic({3: of_three, 4: of_four}[len(signature.args)])  # numba takes no *args here
+    def of_five(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any) -> Any:
+        return signature, emit
+
+    def of_six(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> Any:
+        return signature, emit
+
+    # numba takes no *args here
+    return intrinsic({3: of_three, 4: of_four, 5: of_five, 6: of_six}[len(signature.args)])

@@ -812,11 +812,11 @@ print(*compiled)
 
 
 def test_effects_are_compiled_when_first_flown():
-    """Of a bare vehicle its rates only; an interrupt reaches the caller, the next call compiles."""
+    """None for a bare vehicle; an interrupt reaches the caller, and the next call compiles."""
     done = subprocess.run(
         [sys.executable, "-c", LATE_PROGRAM], capture_output=True, text=True, check=True
     )
-    assert done.stdout.strip() == "rates;interrupted;rates _property_effects"
+    assert done.stdout.strip() == ";interrupted;step _property_effects"
 
 
 @pytest.mark.slow
