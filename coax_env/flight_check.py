@@ -175,8 +175,7 @@ def check_flight(
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     label = str(flight.vehicle if vehicle is None else getattr(vehicle, "name", vehicle))
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
-    rates = logged_rates(flight)
-    channels = tuple(_channel(flight, c, rates[c]) for c in flight.channels)
+    channels = _channels(flight)
     suspicions = [*_suspicions(flight, vehicle), *_sick(channels)]
     say("linearising along the records")
     shown, own, undetermined, directions, doubted = _learnable(flight, vehicle)
@@ -213,6 +212,11 @@ def _run(run: Run) -> RunCheck:
         run.name, run.duration, run.t.size, (run.t.size - 1) / run.duration,
         int(np.count_nonzero(steps > GAP)), tuple(run.measured),
     )  # fmt: skip
+
+
+def _channels(flight: Flight) -> tuple[ChannelCheck, ...]:
+    rates = logged_rates(flight)
+    return tuple(_channel(flight, c, rates[c]) for c in flight.channels)
 
 
 def _channel(flight: Flight, channel: str, rate: float) -> ChannelCheck:

@@ -35,8 +35,9 @@ def test_a_fault_is_seen(column, what, monkeypatch):
 
     def spoilt(actions):
         observation, reward, terminated, truncated, info = keep(actions)
-        (observation if what == "observation" else info["state"])[5, column] = np.nan
-        return observation, reward, terminated, truncated, info
+        told = {"observation": observation, "state": info["state"].copy()}
+        told[what][5, column] = np.nan
+        return told["observation"], reward, terminated, truncated, info | {"state": told["state"]}
 
     monkeypatch.setattr(flying.env, "step", spoilt)
     with pytest.raises(

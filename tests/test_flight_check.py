@@ -15,7 +15,7 @@ from coax_env.errors import InputError
 from coax_env.flight import Flight, read_flight, write_flight
 from coax_env.flight_check import (
     FlightCheck,
-    _channel,
+    _channels,
     _next_step,
     _sick,
     _suspicions,
@@ -53,9 +53,7 @@ def changed(flight: Flight, **factors: float) -> Flight:
 
 
 def suspicions(flight: Flight) -> str:
-    return "; ".join(
-        [*_suspicions(flight, LAMA), *_sick([_channel(flight, c) for c in flight.channels])]
-    )
+    return "; ".join([*_suspicions(flight, LAMA), *_sick(_channels(flight))])
 
 
 # --- what is there --------------------------------------------------------------------------------
