@@ -105,7 +105,6 @@ class Flying:
         if ended.any():
             self.check("last observation", info["final_obs"], self.low, self.high)
             self.check("last state", info["final_info"]["state"], -self.bounds, self.bounds)
-            assert self.lqg.tracker is not None
             self.lqg.tracker.reset(ended)
         self.observation = observation
         np.maximum(self.farthest, np.abs(info["state"]).max(axis=0), out=self.farthest)

@@ -86,13 +86,8 @@ def each(
     flights: list[PlannedFlight], options: Any
 ) -> Iterator[tuple[PlannedFlight, dict[str, Any]]]:
     """Results as they come, of flights worked on in parallel; one job works in this process."""
-    work = partial(row_of, options.no_baselines)
+    work = partial(fly_and_diagnose, only_own=options.no_baselines)
     return workers.each(work, flights, options.jobs, options.backend)
-
-
-def row_of(alone: bool, flight: PlannedFlight) -> dict[str, Any]:
-    """The result of a flight; `alone`: without the baselines."""
-    return fly_and_diagnose(flight, alone)
 
 
 def adopt(out: Path) -> None:

@@ -397,6 +397,18 @@ def test_a_parameter_without_effect_has_no_signature():
     assert lin.information[0] == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("parameter", [prior("bias", 0.05), prior("sine", 0.5, probe=0.5)])
+def test_a_run_without_readings_has_no_signature(parameter):
+    record = swing(1)
+    silent = replace(record, z=np.full_like(record.z, np.nan))
+    both, alone = Engine(Pendulum(), [record, silent]), Engine(Pendulum(), [record])
+    _, lin = both.linearise(TRUTH, NOISE, [parameter])
+    _, heard = alone.linearise(TRUTH, NOISE, [parameter])
+    assert heard.information[0, 0, 0] > 0.0
+    assert lin.information[0] == pytest.approx(heard.information[0])
+    assert not lin.information[1].any()
+
+
 # --- fits ----------------------------------------------------------------------------------------
 
 FREE = [prior("stiffness", 3.0, 10.5, lower=1.0), prior("damping", 0.5, 0.3, lower=0.0),

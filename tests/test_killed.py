@@ -120,7 +120,7 @@ def test_the_study(tmp_path, monkeypatch):
     flown = tmp_path / "flown"
     flown.write_text("")
 
-    def quick(flight: Any, alone: bool = False) -> dict[str, Any]:
+    def quick(flight: Any, only_own: bool = False) -> dict[str, Any]:
         time.sleep(0.005)
         with flown.open("a") as file:
             file.write(flight.name + "\n")

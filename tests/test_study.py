@@ -129,7 +129,7 @@ def study(
     ) -> tuple[list[str], list[PlannedFlight]]:
         flown: list[str] = []
 
-        def stub(flight: PlannedFlight, alone: bool) -> dict[str, Any]:
+        def stub(flight: PlannedFlight, only_own: bool) -> dict[str, Any]:
             flown.append(flight.name)
             if flight.name == stops:
                 raise KeyboardInterrupt

@@ -263,7 +263,7 @@ class Engine:
                     J[:, k] = 0.0
                     if self._frozen(i, run, moved[k], probed):
                         change = probed[there] - e
-                        if np.abs(change).max() < HUGE:
+                        if np.abs(change).max(initial=0.0) < HUGE:
                             J[:, k] = change / steps[k]
                 information = J.T @ J
                 wild = ~np.isfinite(np.diag(information))
