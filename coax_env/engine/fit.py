@@ -32,8 +32,9 @@ class RunPass:
     """What a filter pass leaves of one run.
 
     innovations: (n, m) whitened, NaN where there is no reading. states: (n, nx) filtered.
-    gains, whitening: see kalman.py, empty unless kept. start_covariances: (s, nx, nx) of the filtered
-    state at `start_rows`. deweighted: how many readings were beyond the gate.
+    gains: (readings, nx), per_sigma: (readings,), H: (n / REFRESH, m, nx), see kalman.py, empty unless
+    kept. start_covariances: (s, nx, nx) of the filtered state at `start_rows`. deweighted: how many
+    readings were beyond the gate.
     """
 
     record: Record
@@ -43,7 +44,8 @@ class RunPass:
     states: np.ndarray
     deweighted: int
     gains: np.ndarray
-    whitening: np.ndarray
+    per_sigma: np.ndarray
+    H: np.ndarray
     start_rows: np.ndarray
     start_covariances: np.ndarray
 
@@ -52,12 +54,12 @@ class RunPass:
 class Along:
     """What a filter pass linearised the model at.
 
-    H: (n, m, nx) Jacobians of the readings, F: (n, nx, nx) of the step. predicted: (n, nx) states
-    before each row's readings.
+    F: (<= n, nx, nx) Jacobians of the step, F_of: (n,) which of them a row has. predicted: (n, nx)
+    states before each row's readings.
     """
 
-    H: np.ndarray
     F: np.ndarray
+    F_of: np.ndarray
     predicted: np.ndarray
 
 
@@ -124,6 +126,7 @@ class Engine:
         self.threads = threads or int(os.environ.get("COAX_THREADS", "2"))
         self.starts = [model.start(r) for r in self.records]
         self.intervals = [np.append(np.diff(r.t), 0.0) for r in self.records]
+        self._readings = [int((~np.isnan(r.z)).sum()) for r in self.records]
         self._rooms: list[_Room] = []  # that no thread works in
 
     def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
@@ -186,7 +189,7 @@ class Engine:
     ) -> tuple[RunPass, Along]:
         """The filter pass of a run, and what it went along.
 
-        keep: room for gains and whitening, along: room for the rest; empty without one.
+        keep: room for what a mean pass needs, along: room for the rest; empty without one.
         """
         record = self.records[i]
         n, m = record.z.shape
@@ -196,12 +199,13 @@ class Engine:
         P0 = P0 + np.diag(self.model.start_noise(noise))
         e = np.full((n, m), np.nan)
         states = np.zeros((n, nx))
-        rows, room = (0, _Room()) if keep is None else (n, keep)
-        K = room.array("K", (rows, m, nx), np.float32)
-        W = room.array("W", (rows, m, m), np.float32)
+        count, rows, room = (0, 0, _Room()) if keep is None else (self._readings[i], n, keep)
+        K = room.array("K", (count, nx), np.float32)
+        per_sigma = room.array("per_sigma", (count,))
+        H = room.array("H", (math.ceil(rows / REFRESH), m, nx), np.float32)
         rows, room = (0, _Room()) if along is None else (n, along)
-        H = room.array("H", (rows, m, nx), np.float32)
         F = room.array("F", (rows, nx, nx), np.float32)
+        F_of = room.array("F_of", (rows,), np.int64)
         predicted = room.array("predicted", (rows, nx))
         starts = np.empty(0, np.int64) if start_rows is None else start_rows
         slots = np.full(n, -1, np.int64)
@@ -211,12 +215,12 @@ class Engine:
             self.model.step, self.model.measure, self.model.drift, self.model.exact,
             self.intervals[i], u, record.z, self.model.wraps, x0, P0, R, q, p,
             self.model.state_scale, self.model.work_size, GATE, REFRESH,
-            keep is not None, states, e, K, W, slots, P, H, F, predicted,
+            keep is not None, states, e, K, per_sigma, H, slots, P, F, F_of, predicted,
         )  # fmt: skip
         if not np.isfinite(log_likelihood):
-            K[:], W[:] = 0.0, 0.0
-        run = RunPass(record, u, log_likelihood, e, states, deweighted, K, W, starts, P)
-        return run, Along(H, F, predicted)
+            K[:], per_sigma[:], H[:] = 0.0, 0.0, 0.0
+        run = RunPass(record, u, log_likelihood, e, states, deweighted, K, per_sigma, H, starts, P)
+        return run, Along(F, F_of, predicted)
 
     def log_likelihood(
         self, values: Mapping[str, float], noise: Noise, which: Sequence[int] | None = None
@@ -310,8 +314,8 @@ class Engine:
         kalman.signature_pass(
             self.model.drift, self.model.measure, self.intervals[i], np.array(sets), which,
             along.predicted, run.states, run.innovations, p, np.array(moved), steps, reading_only,
-            self.model.exact, self.model.work_size, run.gains, run.whitening, along.H, along.F, columns,
-            J,
+            self.model.exact, self.model.work_size, run.gains, run.per_sigma, run.H, along.F,
+            along.F_of, REFRESH, columns, J,
         )  # fmt: skip
 
     def descend(
@@ -359,7 +363,7 @@ class Engine:
         return kalman.mean_pass(
             self.model.step, self.model.measure, self.intervals[i],
             self.model.inputs(run.record, p), run.record.z, self.model.wraps,
-            self.starts[i][0], p, self.model.work_size, run.gains, run.whitening, out,
+            self.starts[i][0], p, self.model.work_size, run.gains, run.per_sigma, run.H, REFRESH, out,
         )  # fmt: skip
 
     def fit(
@@ -427,8 +431,8 @@ class Engine:
                 run, along = self._filter_run(i, p, q, R, noise, room, room)
                 if np.isfinite(run.log_likelihood):
                     kalman.score_pass(
-                        self.intervals[i], run.innovations, run.gains, run.whitening, along.H,
-                        along.F, stretch, by_noise, by_start,
+                        self.intervals[i], run.innovations, run.gains, run.per_sigma, run.H,
+                        along.F, along.F_of, REFRESH, stretch, by_noise, by_start,
                     )  # fmt: skip
             return run.log_likelihood, by_noise, by_start
 

@@ -1,15 +1,18 @@
 """The two passes over a run: the extended Kalman filter, and the mean pass with its gains frozen.
 
-The filter gives whitened innovations e = L^-1 (z - h), L L' = S, and so the likelihood
+The readings of a row are taken in one after the other (their errors are independent), each with what
+the ones before it have left open: its residual v, of variance s^2, gives a whitened innovation
+e = v / s, the state moves by K v, and so the likelihood is
 
-    -2 log L = sum over rows of  e'e + log det S + m log 2 pi.
+    -2 log L = sum over readings of  e^2 + log s^2 + log 2 pi.
 
-It keeps its gains K and whitening matrices L^-1. The mean pass repeats only the propagation of the
-mean with those gains: with a parameter moved a little, the change of e is that parameter's
-*signature*. A row's missing readings have zero columns in K and zero rows in L^-1.
+It keeps its gains K, 1 / s and the Jacobians H of the readings. The mean pass repeats only the
+propagation of the mean with those: with a parameter moved a little, the change of e is that
+parameter's *signature*.
 
-Bar-Shalom, Li and Kirubarajan 2001, ch. 5 and 10; Maybeck 1979; the frozen gains are the
-approximation of Maine and Iliff 1985 (NASA RP-1138, filter error method).
+Bar-Shalom, Li and Kirubarajan 2001, ch. 5 and 10; Durbin and Koopman 2012, sec. 6.4 (one reading at a
+time); Maybeck 1979; the frozen gains are the approximation of Maine and Iliff 1985 (NASA RP-1138,
+filter error method).
 """
 
 import math
@@ -29,6 +32,8 @@ REORDER = {"fastmath": {"reassoc", "contract"}}
 """Sums may be taken in the order that is fastest."""
 MOST_DECAY = 0.5
 """Share of a state that may decay in a row for the series of the exponential to be used."""
+SAME_STEP = 1e-6
+"""Steps that differ by no more of themselves are the same: what is left of a clock's rounding."""
 BLOCK = 16
 """Rows of matrices are as long as a multiple of this, zeros at the end: no loop has a scalar rest."""
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -127,14 +132,14 @@ def _transition(
 @compiled(
     types.Tuple((float64, int64))(
         STEP, MEASURE, STEP, boolean[::1], _A, _M, _M, boolean[::1], _A, _M, _A, _A, _A, _A, int64,
-        float64, int64, boolean, _M, _M, float32[:, :, ::1], float32[:, :, ::1], int64[::1],
-        float64[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], _M,
+        float64, int64, boolean, _M, _M, float32[:, ::1], _A, float32[:, :, ::1], _N,
+        float64[:, :, ::1], float32[:, :, ::1], _N, _M,
     ),
     **REORDER,
 )  # fmt: skip
 def filter_pass(
     step, measure, drift, exact, dt, u, z, wraps, x0, P0, R, q, p, scale, work_size, gate, refresh,
-    keep, states, e, K_all, W_all, slots, P_all, H_all, F_all, predicted,
+    keep, states, e, K_all, per_sigma_all, H_all, slots, P_all, F_all, F_of, predicted,
 ):  # fmt: skip
     """Extended Kalman filter over one run.
 
@@ -146,14 +151,14 @@ def filter_pass(
             distance, without a jump (a heavy tail; Huber and Ronchetti 2009, ch. 7). A lasting one
             is followed all the same, slowly at first.
         refresh: rows between new Jacobians where dt does not change.
-        keep: also store gains and whitening matrices.
+        keep: also store gains, standard deviations and Jacobians of the readings.
         states: (n, nx) filtered states, out. e: (n, m) whitened innovations, out, NaN where missing.
-        K_all: (n, m, nx) gain of each reading, W_all: (n, m, m) transposed L^-1, out, if `keep`.
+        K_all: (readings, nx) gain and per_sigma_all: (readings,) 1 / s of each reading that there is,
+            in the order of e; H_all: (n / refresh, m, nx) Jacobians, out, if `keep`.
         slots: (n,) place in P_all where a row's filtered covariance is stored, or -1.
         P_all: (slots, nx, nx), out.
-        H_all: (n, m, nx), F_all: (n, nx, nx) Jacobians of the readings and of the step, out; empty:
-            not stored.
-        predicted: (n, nx) states before each row's readings, out, stored where H_all is.
+        F_all: (<= n, nx, nx) Jacobians of the step, F_of: (n,) which of them a row has, predicted:
+            (n, nx) states before each row's readings, out; not stored where `predicted` is empty.
 
     Returns:
         log-likelihood (-inf where the filter diverged) and the number of readings beyond the gate.
@@ -180,15 +185,14 @@ def filter_pass(
     AA = np.zeros((nx, width))
     dt_of_F = -1.0  # step at which F was computed, and the one it is scaled to
     dt_now = -1.0
-    HP = np.zeros((m, width))
-    S = np.zeros((m, m))
-    W = np.zeros((m, m))
+    slot = -1
+    HP = np.zeros(width)
     FP = np.zeros((nx, width))
     PF = np.zeros((nx, width))
-    gain = np.zeros(width)
-    tell = H_all.shape[0] == n
-    who = np.zeros(m, dtype=np.int64)
+    tell = predicted.shape[0] == n
+    there = 0
     nu = np.zeros(m)
+    noise = np.zeros(m)
     log_likelihood = 0.0
     deweighted = 0
     for k in range(n):
@@ -204,13 +208,15 @@ def filter_pass(
                 for i in range(m):
                     H[i, j] = (h_probe[i] - h[i]) / scale[j]
             _non_zeros(H, H_places, H_counts)
-        if tell:
-            for i in range(m):
-                for j in range(nx):
-                    H_all[k, i, j] = H[i, j]
-            for j in range(nx):
+            if keep:
+                for i in range(m):
+                    for j in range(nx):
+                        H_all[k // refresh, i, j] = H[i, j]
+        for j in range(nx):
+            x_probe[j] = x[j]
+            if tell:
                 predicted[k, j] = x[j]
-        count = 0
+        # how far each reading is believed, before any of the row has been
         for i in range(m):
             e[k, i] = np.nan
             if not math.isnan(z[k, i]):
@@ -219,92 +225,50 @@ def filter_pass(
                     innovation = wrap_angle(innovation)
                 if not math.isfinite(innovation):
                     return -np.inf, deweighted
-                # H P of this channel
-                for b in range(width):
-                    HP[count, b] = 0.0
-                for c in range(H_counts[i]):
-                    a = H_places[i, c]
-                    weight = H[i, a]
-                    for b in range(width):
-                        HP[count, b] += weight * P[a, b]
                 variance = R[i]
                 for c in range(H_counts[i]):
                     a = H_places[i, c]
-                    variance += HP[count, a] * H[i, a]
+                    total = 0.0
+                    for d in range(H_counts[i]):
+                        total += P[a, H_places[i, d]] * H[i, H_places[i, d]]
+                    variance += total * H[i, a]
+                nu[i] = innovation
+                noise[i] = R[i]
                 if innovation * innovation > gate * gate * variance:
                     inflated = innovation * innovation / (gate * gate)
                     log_likelihood -= 0.5 * (gate * gate - 1.0) * math.log(inflated / variance)
-                    variance = inflated
+                    noise[i] += inflated - variance
                     deweighted += 1
-                who[count] = i
-                nu[count] = innovation
-                S[count, count] = variance
-                count += 1
-        for a in range(count):
-            for b in range(a):
-                total = 0.0
-                for c in range(H_counts[who[b]]):
-                    j = H_places[who[b], c]
-                    total += HP[a, j] * H[who[b], j]
-                S[a, b] = total
-        # Cholesky in place, then its inverse W
-        for a in range(count):
-            for b in range(a + 1):
-                total = S[a, b]
-                for c in range(b):
-                    total -= S[a, c] * S[b, c]
-                if a == b:
-                    if not total > 0.0:
-                        return -np.inf, deweighted
-                    S[a, a] = math.sqrt(total)
-                    log_likelihood -= math.log(S[a, a])
-                else:
-                    S[a, b] = total / S[b, b]
-        for a in range(count):
-            for b in range(a):
-                total = 0.0
-                for c in range(b, a):
-                    total -= S[a, c] * W[c, b]
-                W[a, b] = total / S[a, a]
-            W[a, a] = 1.0 / S[a, a]
-        # G = W H P, then P -= G'G, x += G' e
-        for a in range(count - 1, -1, -1):
+        for i in range(m):
+            if math.isnan(z[k, i]):
+                continue
             for j in range(width):
-                HP[a, j] *= W[a, a]
-            for b in range(a):
-                weight = W[a, b]
+                HP[j] = 0.0
+            variance = noise[i]
+            residual = nu[i]
+            for c in range(H_counts[i]):
+                a = H_places[i, c]
+                weight = H[i, a]
+                residual -= weight * (x[a] - x_probe[a])
                 for j in range(width):
-                    HP[a, j] += weight * HP[b, j]
-        for a in range(count):
-            total = 0.0
-            for b in range(a + 1):
-                total += W[a, b] * nu[b]
-            e[k, who[a]] = total
-            log_likelihood -= 0.5 * (total * total + _LOG_2PI)
-            for j in range(nx):
-                x[j] += HP[a, j] * total
-        for a in range(count):
-            for i in range(nx):
-                weight = HP[a, i]
+                    HP[j] += weight * P[a, j]
+            for c in range(H_counts[i]):
+                variance += HP[H_places[i, c]] * H[i, H_places[i, c]]
+            if not variance > 0.0:
+                return -np.inf, deweighted
+            per_sigma = 1.0 / math.sqrt(variance)
+            e[k, i] = residual * per_sigma
+            log_likelihood -= 0.5 * (e[k, i] * e[k, i] + math.log(variance) + _LOG_2PI)
+            for a in range(nx):
+                weight = HP[a] / variance
+                x[a] += weight * residual
                 for j in range(width):
-                    P[i, j] -= weight * HP[a, j]
-        if keep:
-            for i in range(m):
-                for j in range(m):
-                    W_all[k, i, j] = 0.0
-                if math.isnan(z[k, i]):
-                    for j in range(nx):
-                        K_all[k, i, j] = 0.0
-            for b in range(count):
-                for j in range(width):
-                    gain[j] = 0.0
-                for a in range(b, count):
-                    weight = W[a, b]
-                    W_all[k, who[b], who[a]] = weight
-                    for j in range(width):
-                        gain[j] += HP[a, j] * weight
-                for j in range(nx):
-                    K_all[k, who[b], j] = gain[j]
+                    P[a, j] -= weight * HP[j]
+                if keep:
+                    K_all[there, a] = weight
+            if keep:
+                per_sigma_all[there] = per_sigma
+            there += 1
         for j in range(nx):
             states[k, j] = x[j]
             if not math.isfinite(x[j]):
@@ -317,11 +281,13 @@ def filter_pass(
         if k == n - 1:
             break
         step(x, u[k], dt[k], p, work, x_next)
+        changed = False
         if fresh or abs(dt[k] - dt_of_F) > 0.5 * dt_of_F:
             dt_of_F = dt_now = dt[k]
             _transition(drift, step, exact, x, u[k], dt[k], p, work, scale, x_next, x_probe, x_moved,
                         A, AA, F_places, F_counts, F)  # fmt: skip
-        elif dt[k] != dt_now:
+            changed = True
+        elif abs(dt[k] - dt_now) > SAME_STEP * dt_now:
             # same Jacobian, other step: rows of slow states follow the step to first order
             ratio = dt[k] / dt_now
             dt_now = dt[k]
@@ -330,15 +296,19 @@ def filter_pass(
                     for j in range(nx):
                         own = 1.0 if i == j else 0.0
                         F[i, j] = own + ratio * (F[i, j] - own)
+            changed = True
+        if tell:
+            if changed:
+                slot += 1
+                for i in range(nx):
+                    for j in range(nx):
+                        F_all[slot, i, j] = F[i, j]
+            F_of[k] = slot
         # P = F (F P)'
         _product(F, F_places, F_counts, P, FP)
         for i in range(nx):
             for j in range(nx):
                 PF[j, i] = FP[i, j]
-        if tell:
-            for i in range(nx):
-                for j in range(nx):
-                    F_all[k, i, j] = F[i, j]
         _product(F, F_places, F_counts, PF, P)
         for i in range(nx):
             for j in range(i):
@@ -348,14 +318,24 @@ def filter_pass(
     return log_likelihood, deweighted
 
 
+@compiled(types.void(float32[:, :, ::1], int64, _M, _I, _N))
+def _unpack(stored, slot, A, places, counts):
+    """One of the stored matrices, and what is not zero in it."""
+    for i in range(stored.shape[1]):
+        for j in range(stored.shape[2]):
+            A[i, j] = stored[slot, i, j]
+    _non_zeros(A, places, counts)
+
+
 @compiled(
     types.void(
-        _A, _M, float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1],
-        int64[::1], _M, _A,
+        _A, _M, float32[:, ::1], _A, float32[:, :, ::1], float32[:, :, ::1], _N, int64, _N, _M, _A,
     ),
     **REORDER,
 )  # fmt: skip
-def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
+def score_pass(
+    dt, e, K_all, per_sigma_all, H_all, F_all, F_of, refresh, stretch, by_noise, by_start
+):  # fmt: skip
     """Slope of the log-likelihood in the process noise, by the disturbance smoother, backwards.
 
     With r the slope in the predicted state and N its variance, the slope in a variance added to
@@ -363,7 +343,7 @@ def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
     linear model; here of the model as linearised along the filter's path).
 
     Args:
-        dt, e, K_all, W_all, H_all, F_all: of the filter pass.
+        dt, e, K_all, per_sigma_all, H_all, F_all, F_of, refresh: of the filter pass.
         stretch: (n,) which stretch of time each row is in.
         by_noise: (stretches, nx) slope in each state's growth of variance per second, out.
         by_start: (nx,) slope in each variance of the first state, out.
@@ -373,27 +353,30 @@ def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
     width = _whole_blocks(nx)
     r = np.zeros(nx)
     N = np.zeros((nx, width))
+    NF = np.zeros((nx, width))
     B = np.zeros((nx, width))
-    moved = np.zeros(width)
+    moved = np.zeros(nx)
+    NK = np.zeros(width)
+    K = np.zeros(width)
     FT = np.zeros((nx, nx))
     F_places = np.zeros((nx, nx), dtype=np.int64)
     F_counts = np.zeros(nx, dtype=np.int64)
-    NF = np.zeros((nx, width))
-    who = np.zeros(m, dtype=np.int64)
     H = np.zeros((m, nx))
     H_places = np.zeros((m, nx), dtype=np.int64)
     H_counts = np.zeros(m, dtype=np.int64)
-    K = np.zeros((m, width))
-    NK = np.zeros((m, width))
-    Kr = np.zeros(m)
+    F_slot = H_slot = -1
+    there = per_sigma_all.size
     by_noise[:, :] = 0.0
     for k in range(n - 1, -1, -1):
         if k < n - 1:
             for i in range(nx):
                 by_noise[stretch[k], i] += 0.5 * dt[k] * (r[i] * r[i] - N[i, i])
-                for j in range(nx):
-                    FT[j, i] = F_all[k, i, j]
-            _non_zeros(FT, F_places, F_counts)
+            if F_of[k] != F_slot:
+                F_slot = F_of[k]
+                for i in range(nx):
+                    for j in range(nx):
+                        FT[j, i] = F_all[F_slot, i, j]
+                _non_zeros(FT, F_places, F_counts)
             # r = F' r, N = F' (F' N)'
             for i in range(nx):
                 moved[i] = 0.0
@@ -405,60 +388,37 @@ def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
                 for j in range(nx):
                     NF[j, i] = B[i, j]
             _product(FT, F_places, F_counts, NF, N)
-        count = 0
-        for b in range(m):
-            if W_all[k, b, b] != 0.0:
-                who[count] = b
-                for j in range(nx):
-                    H[count, j] = H_all[k, b, j]
-                    K[count, j] = K_all[k, b, j]
-                count += 1
-        _non_zeros(H[:count], H_places, H_counts[:count])
-        # with A = I - sum of K_b H_b': r = A' r, N = A' N A, which is N less the symmetric part of
-        # twice the sum of H_b w_b', w_b = N K_b - half the sum of H_a (K_a' N K_b)
-        for b in range(count):
-            Kr[b] = 0.0
+        if k // refresh != H_slot:
+            H_slot = k // refresh
+            _unpack(H_all, H_slot, H, H_places, H_counts)
+        for b in range(m - 1, -1, -1):
+            if math.isnan(e[k, b]):
+                continue
+            there -= 1
+            # with A = I - K H: r = A' r + H' e / s, N = A' N A + H' H / s^2, where N loses the
+            # symmetric part of twice H' w, w = N K - H' (K' N K + 1 / s^2) / 2
+            pull = e[k, b] * per_sigma_all[there]
+            curve = per_sigma_all[there] * per_sigma_all[there]
             for j in range(width):
-                NK[b, j] = 0.0
+                NK[j] = 0.0
             for i in range(nx):
-                weight = K[b, i]
-                Kr[b] += weight * r[i]
+                K[i] = K_all[there, i]
+                pull -= K[i] * r[i]
                 for j in range(width):
-                    NK[b, j] += weight * N[i, j]
-        for b in range(count):
+                    NK[j] += K[i] * N[i, j]
             for j in range(width):
-                moved[j] = NK[b, j]
-            for a in range(count):
-                total = 0.0
-                for j in range(width):
-                    total += K[a, j] * NK[b, j]
-                for c in range(H_counts[a]):
-                    moved[H_places[a, c]] -= 0.5 * total * H[a, H_places[a, c]]
+                curve += K[j] * NK[j]
             for c in range(H_counts[b]):
                 j = H_places[b, c]
-                r[j] -= H[b, j] * Kr[b]
-                weight = 2.0 * H[b, j]
-                for i in range(width):
-                    N[j, i] -= weight * moved[i]
-        # the readings' own part: g_a = sum of (L^-1)_ab H_b
-        for a in range(count):
-            for j in range(width):
-                moved[j] = 0.0
-            for b in range(a + 1):
-                weight = float64(W_all[k, who[b], who[a]])
-                for c in range(H_counts[b]):
-                    moved[H_places[b, c]] += weight * H[b, H_places[b, c]]
-            for i in range(nx):
-                weight = moved[i]
-                if weight != 0.0:
-                    r[i] += weight * e[k, who[a]]
-                    for j in range(width):
-                        N[i, j] += weight * moved[j]
-        for i in range(nx):
-            for j in range(i):
-                mean = 0.5 * (N[i, j] + N[j, i])
-                N[i, j] = mean
-                N[j, i] = mean
+                NK[j] -= 0.5 * curve * H[b, j]
+                r[j] += H[b, j] * pull
+            for c in range(H_counts[b]):
+                a = H_places[b, c]
+                weight = H[b, a]
+                for j in range(width):
+                    N[a, j] -= weight * NK[j]
+                for i in range(nx):
+                    N[i, a] -= weight * NK[i]
     for i in range(nx):
         by_start[i] = 0.5 * (r[i] * r[i] - N[i, i])
 
@@ -466,11 +426,13 @@ def score_pass(dt, e, K_all, W_all, H_all, F_all, stretch, by_noise, by_start):
 @compiled(
     boolean(
         STEP, MEASURE, _A, _M, _M, boolean[::1], _A, _A, int64,
-        float32[:, :, ::1], float32[:, :, ::1], _M,
+        float32[:, ::1], _A, float32[:, :, ::1], int64, _M,
     ),
     **REORDER,
 )  # fmt: skip
-def mean_pass(step, measure, dt, u, z, wraps, x0, p, work_size, K_all, W_all, e):
+def mean_pass(
+    step, measure, dt, u, z, wraps, x0, p, work_size, K_all, per_sigma_all, H_all, refresh, e
+):  # fmt: skip
     """Whitened innovations (n, m) of the mean with the gains of a filter pass; 0 where missing.
 
     Returns False where the mean diverged.
@@ -481,21 +443,31 @@ def mean_pass(step, measure, dt, u, z, wraps, x0, p, work_size, K_all, W_all, e)
     x_next = np.zeros(nx)
     work = np.zeros(work_size)
     h = np.zeros(m)
+    H = np.zeros((m, nx))
+    H_places = np.zeros((m, nx), dtype=np.int64)
+    H_counts = np.zeros(m, dtype=np.int64)
+    there = 0
     for k in range(n):
+        if k % refresh == 0:
+            _unpack(H_all, k // refresh, H, H_places, H_counts)
         measure(x, u[k], p, work, h)
-        for a in range(m):
-            e[k, a] = 0.0
-        for b in range(m):
-            if W_all[k, b, b] != 0.0:
-                innovation = z[k, b] - h[b]
-                if wraps[b]:
-                    innovation = wrap_angle(innovation)
-                if not math.isfinite(innovation):
+        for j in range(nx):
+            x_next[j] = x[j]
+        for i in range(m):
+            e[k, i] = 0.0
+            if not math.isnan(z[k, i]):
+                residual = z[k, i] - h[i]
+                if wraps[i]:
+                    residual = wrap_angle(residual)
+                if not math.isfinite(residual):
                     return False
-                for a in range(b, m):
-                    e[k, a] += W_all[k, b, a] * innovation
+                for c in range(H_counts[i]):
+                    a = H_places[i, c]
+                    residual -= H[i, a] * (x[a] - x_next[a])
+                e[k, i] = residual * per_sigma_all[there]
                 for j in range(nx):
-                    x[j] += K_all[k, b, j] * innovation
+                    x[j] += K_all[there, j] * residual
+                there += 1
         if k < n - 1:
             step(x, u[k], dt[k], p, work, x_next)
             for j in range(nx):
@@ -505,23 +477,21 @@ def mean_pass(step, measure, dt, u, z, wraps, x0, p, work_size, K_all, W_all, e)
 
 @compiled(
     types.void(
-        STEP, MEASURE, _A, float64[:, :, ::1], int64[::1], _M, _M, _M, _A, _M, _A, boolean[::1],
-        boolean[::1], int64,
-        float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[:, :, ::1],
-        int64[::1], _M,
+        STEP, MEASURE, _A, float64[:, :, ::1], _N, _M, _M, _M, _A, _M, _A, boolean[::1], boolean[::1],
+        int64, float32[:, ::1], _A, float32[:, :, ::1], float32[:, :, ::1], _N, int64, _N, _M,
     ),
     **REORDER,
 )  # fmt: skip
 def signature_pass(
     drift, measure, dt, u_sets, u_of, predicted, states, e, p, moved, steps, reading_only, exact,
-    work_size, K_all, W_all, H_all, F_all, columns, J,
+    work_size, K_all, per_sigma_all, H_all, F_all, F_of, refresh, columns, J,
 ):  # fmt: skip
     """Derivatives of the whitened innovations in many parameters at once, gains frozen.
 
     What `mean_pass` gives with a parameter moved a little, to first order: with s the state's
     derivative, and b what the parameter adds to the state over a row,
 
-        dh = H s + dh/dp,   s -= K dh,   s <- F (s + b/2) + b/2
+        dv = -(dh/dp + H s),   s += K dv  for one reading after the other,   s <- F (s + b/2) + b/2
 
     where `measure` at the predicted state gives dh/dp and `drift` at the filtered one b (Maine and
     Iliff 1985, the sensitivity equations). A state that the drift takes exactly becomes F s + b.
@@ -530,7 +500,7 @@ def signature_pass(
         u_sets: (sets, n, nu) inputs, the first those of `p`; u_of: (k,) which of them a parameter has.
         predicted, states, e: of the filter pass. p: parameters; moved: (k, np) those with one moved,
             steps: (k,) by how much. reading_only: (k,) those that add nothing to the state.
-        K_all, W_all, H_all, F_all: of the filter pass.
+        K_all, per_sigma_all, H_all, F_all, F_of, refresh: of the filter pass.
         columns: (k,) where in J a parameter stands. J: derivatives, out, one row for each reading that
             there is, in the order of e.
     """
@@ -546,50 +516,50 @@ def signature_pass(
     h_here = np.zeros(m)
     width = _whole_blocks(k_all)
     b = np.zeros((nx, width))
-    dh = np.zeros((m, width))
-    de = np.zeros((m, width))
+    dv = np.zeros((m, width))
     s = np.zeros((nx, width))
     half = np.zeros((nx, width))
     before = np.zeros((nx, width))
+    F = np.zeros((nx, nx))
+    F_places = np.zeros((nx, nx), dtype=np.int64)
+    F_counts = np.zeros(nx, dtype=np.int64)
+    H = np.zeros((m, nx))
+    H_places = np.zeros((m, nx), dtype=np.int64)
+    H_counts = np.zeros(m, dtype=np.int64)
+    F_slot = -1
     for row in range(n):
         measure(predicted[row], u_sets[0, row], p, work, h_base)
         drift(states[row], u_sets[0, row], dt[row], p, work, x_base)
         for k in range(k_all):
             measure(predicted[row], u_sets[u_of[k], row], moved[k], work, h_here)
             for i in range(m):
-                dh[i, k] = (h_here[i] - h_base[i]) * per_step[k]
+                dv[i, k] = (h_base[i] - h_here[i]) * per_step[k]
             if not reading_only[k] and row < n - 1:
                 drift(states[row], u_sets[u_of[k], row], dt[row], moved[k], work, x_here)
                 for i in range(nx):
                     b[i, k] = (x_here[i] - x_base[i]) * per_step[k]
+        if row % refresh == 0:
+            _unpack(H_all, row // refresh, H, H_places, H_counts)
         for i in range(m):
-            for k in range(width):
-                de[i, k] = 0.0
-            if not math.isnan(e[row, i]):
-                for j in range(nx):
-                    weight = float64(H_all[row, i, j])
-                    if weight != 0.0:
-                        for k in range(width):
-                            dh[i, k] += weight * s[j, k]
-        for i in range(m):
-            if not math.isnan(e[row, i]):
-                for a in range(i, m):
-                    weight = float64(W_all[row, i, a])
-                    if weight != 0.0:
-                        for k in range(width):
-                            de[a, k] -= weight * dh[i, k]
-                for j in range(nx):
-                    weight = float64(K_all[row, i, j])
-                    if weight != 0.0:
-                        for k in range(width):
-                            s[j, k] -= weight * dh[i, k]
-        for i in range(m):
-            if not math.isnan(e[row, i]):
-                for k in range(k_all):
-                    J[there, columns[k]] = de[i, k]
-                there += 1
+            if math.isnan(e[row, i]):
+                continue
+            for c in range(H_counts[i]):
+                j = H_places[i, c]
+                weight = H[i, j]
+                for k in range(width):
+                    dv[i, k] -= weight * s[j, k]
+            for j in range(nx):
+                gain = float64(K_all[there, j])
+                for k in range(width):
+                    s[j, k] += gain * dv[i, k]
+            for k in range(k_all):
+                J[there, columns[k]] = dv[i, k] * per_sigma_all[there]
+            there += 1
         if row == n - 1:
             break
+        if F_of[row] != F_slot:
+            F_slot = F_of[row]
+            _unpack(F_all, F_slot, F, F_places, F_counts)
         for j in range(nx):
             for k in range(width):
                 half[j, k] = s[j, k] + 0.5 * b[j, k]
@@ -599,11 +569,11 @@ def signature_pass(
             own = 1.0 if exact[i] else 0.5
             for k in range(width):
                 s[i, k] = own * b[i, k]
-            for j in range(nx):
-                weight = float64(F_all[row, i, j])
-                if weight != 0.0:
-                    for k in range(width):
-                        s[i, k] += weight * source[j, k]
+            for c in range(F_counts[i]):
+                j = F_places[i, c]
+                weight = F[i, j]
+                for k in range(width):
+                    s[i, k] += weight * source[j, k]
 
 
 @compiled(boolean(STEP, MEASURE, _A, _M, _A, _A, int64, int64, int64[::1], _A))
