@@ -336,12 +336,45 @@ def step(x, u, dt, p, work, out):
         step_bare(x, u, dt, p, work, out)
 
 
-@compiled()
-def drift(x, u, dt, p, work, out):
-    """What a row adds to the full state (26,), into `out`, from one evaluation of the rates.
+def _read_of(with_effects):
+    """`_read` compiled with the effects, or for vehicles that have none."""
 
-    For derivatives with respect to states and parameters: first order in `dt` for the paper's states,
-    exact for actuators and gusts. The rotors' acceleration is the row's mean, as in `step`.
+    def read(x, now, slope, p, f, out):
+        """Readings of every channel, contract units, (18,), from what `f` holds. Eq. (45)."""
+        z = f[F.READING :]
+        z[0] = now[16] * (30.0 / math.pi)
+        z[1] = now[17] * (30.0 / math.pi)
+        z[2], z[3], z[4] = x[3], x[4], x[5]
+        z[5] = f[F.FORCE_X] / f[F.MASS]
+        z[6] = f[F.FORCE_Y] / f[F.MASS]
+        z[7] = f[F.FORCE_Z] / f[F.MASS]
+        z[8], z[9], z[10] = x[10], x[11], x[12]
+        z[11] = -x[15]
+        z[12], z[13], z[14] = slope[13], slope[14], slope[15]
+        z[15], z[16] = x[13], x[14]
+        z[17] = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+        if with_effects and p[effects.SENSOR] != 0.0:
+            _sensor_effects(x, f, p)
+        for i in range(N_CHANNELS):
+            out[i] = z[i]
+
+    return compiled(forceinline=not with_effects)(read)
+
+
+_read = _read_of(True)
+_read_bare = _read_of(False)
+
+
+@compiled()
+def drift_and_readings(x, u, dt, p, work, out):
+    """What a row adds to the full state, and the readings at its start, from one look at the rates.
+
+    For derivatives with respect to states and parameters: the drift is first order in `dt` for the
+    paper's states, exact for actuators and gusts. The rotors' acceleration is the row's mean, as in
+    `step`, for the readings too.
+
+    Args:
+        x, u, dt, p, work: as in `step`. out: drift (26,) and readings (18,), shape (44,).
     """
     f = work[: F.N_FLOW]
     now = work[F.N_FLOW : F.N_FLOW + N_FULL]
@@ -352,8 +385,9 @@ def drift(x, u, dt, p, work, out):
     _actuate(x, u, dt, f, now)
     for i in range(N_STATES, N_STATES + 4):
         out[i] = now[i] - x[i]
-    f[F.OMEGA_U_DOT] = out[16] / dt
-    f[F.OMEGA_L_DOT] = out[17] / dt
+    if dt > 0.0:
+        f[F.OMEGA_U_DOT] = out[16] / dt
+        f[F.OMEGA_L_DOT] = out[17] / dt
     _actuate(x, u, READING_DELAY, f, now)
     _rates(now, p, f, slope)
     for i in range(N_STATES):
@@ -361,6 +395,7 @@ def drift(x, u, dt, p, work, out):
     fade = math.exp(-dt / p[P.GUST_MEMORY]) - 1.0
     for i in range(20, N_FULL):
         out[i] = fade * x[i]
+    _read(x, now, slope, p, f, out[N_FULL:])
 
 
 def _measure_of(with_effects):
@@ -386,22 +421,10 @@ def _measure_of(with_effects):
             _properties_bare(x, u, p, f)
             _actuate_bare(x, u, READING_DELAY, f, now)
             _rates_bare(now, p, f, slope)
-        z = f[F.READING :]
-        z[0] = now[16] * (30.0 / math.pi)
-        z[1] = now[17] * (30.0 / math.pi)
-        z[2], z[3], z[4] = x[3], x[4], x[5]
-        z[5] = f[F.FORCE_X] / f[F.MASS]
-        z[6] = f[F.FORCE_Y] / f[F.MASS]
-        z[7] = f[F.FORCE_Z] / f[F.MASS]
-        z[8], z[9], z[10] = x[10], x[11], x[12]
-        z[11] = -x[15]
-        z[12], z[13], z[14] = slope[13], slope[14], slope[15]
-        z[15], z[16] = x[13], x[14]
-        z[17] = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
-        if with_effects and p[effects.SENSOR] != 0.0:
-            _sensor_effects(x, f, p)
-        for i in range(N_CHANNELS):
-            out[i] = z[i]
+        if with_effects:
+            _read(x, now, slope, p, f, out)
+        else:
+            _read_bare(x, now, slope, p, f, out)
 
     return late(measure) if with_effects else compiled(forceinline=True)(measure)
 

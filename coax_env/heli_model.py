@@ -102,9 +102,9 @@ def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
 
 
 @pointer(STEP)
-def _drift(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """`dynamics.drift` and what the commands tell, in the engine's form."""
-    dynamics.drift(x, u, dt, p, work, out)
+def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.drift_and_readings` and what the commands tell, in the engine's form."""
+    dynamics.drift_and_readings(x, u, dt, p, work, out)
     _heed(u, p, out)
 
 
@@ -115,7 +115,7 @@ class HeliModel:
     wraps = np.array([c in ANGLES for c in CHANNELS])
     step = _step
     measure = _measure
-    drift = _drift
+    drift_and_readings = _drift_and_readings
     exact = np.arange(N_FULL) >= N_STATES
     work_size = dynamics.WORK_SIZE
     state_scale = np.array(

@@ -340,16 +340,38 @@ def test_drift_is_a_step_to_first_order(lag):
     start, command = settled_state(2)
     start[16:26] = [1990.0, 2150.0, 0.02, -0.01, 0.1, -0.1, 0.2, 1e-3, -1e-3, 1e-4]
     vehicle = LAMA.with_effect("motor_lag", upper=lag, lower=lag)
-    work, added = np.zeros(dynamics.WORK_SIZE), np.zeros(26)
+    work, out = np.zeros(dynamics.WORK_SIZE), np.zeros(26 + len(CHANNELS))
     errors = []
     steps = np.array([4e-3, 2e-3, 1e-3])
     for dt in steps:
-        dynamics.drift(start, dynamics.kernel_input(command), dt, vehicle.vector, work, added)
-        error = start + added - fly(start, command, dt, dt, vehicle)
+        u = dynamics.kernel_input(command)
+        dynamics.drift_and_readings(start, u, dt, vehicle.vector, work, out)
+        error = start + out[:26] - fly(start, command, dt, dt, vehicle)
         np.testing.assert_allclose(error[16:], 0.0, atol=1e-10)
         errors.append(np.abs(error[:16]).max())
     slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
     assert 1.8 < slope < 2.2, (slope, errors)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.01])
+@pytest.mark.parametrize(
+    "effect", [{}, {"motor_lag": {"upper": 0.05, "lower": 0.07}}, {"rotor_drag": {"coefficient": 3e-4},
+               "gyro_bias": {"x": 0.02}, "imu_lever_arm": {"x": 0.03}}],
+)  # fmt: skip
+def test_readings_beside_the_drift_are_the_readings(dt, effect):
+    start, command = settled_state(4)
+    start[16:20] = [1990.0, 2150.0, 0.02, -0.01]
+    vehicle = LAMA
+    for name, values in effect.items():
+        vehicle = vehicle.with_effect(name, **values)
+    work, out = np.zeros(dynamics.WORK_SIZE), np.zeros(26 + len(CHANNELS))
+    dynamics.drift_and_readings(
+        start, dynamics.kernel_input(command), dt, vehicle.vector, work, out
+    )
+    expected = dynamics.readings(start, command, vehicle)
+    np.testing.assert_allclose(out[26:], list(expected.values()), rtol=1e-12, atol=1e-14)
+    if dt == 0.0:
+        assert not out[:16].any() and not out[20:26].any()
 
 
 def test_a_long_row_is_split():

@@ -53,10 +53,13 @@ def _measure(x, u, p, work, out):
 
 
 @pointer(types.void(_A, _A, types.float64, _A, _A, _A))
-def _drift(x, u, dt, p, work, out):
+def _drift_and_readings(x, u, dt, p, work, out):
     pull = (1.0 - p[SINE]) * x[ANGLE] + p[SINE] * math.sin(x[ANGLE])
     out[RATE] = dt * (u[0] - p[STIFFNESS] * pull - p[DAMPING] * x[RATE])
     out[ANGLE] = dt * (x[RATE] + out[RATE])
+    out[2] = x[ANGLE]
+    out[3] = x[RATE] + p[BIAS]
+    out[4] = x[RATE]
 
 
 class Pendulum:
@@ -67,7 +70,7 @@ class Pendulum:
     state_scale = np.array([1e-4, 1e-4])
     step = _step
     measure = _measure
-    drift = _drift
+    drift_and_readings = _drift_and_readings
     exact = np.array([True, True])
     work_size = 1
     start_at = np.array([0.2, 0.0])

@@ -180,10 +180,12 @@ def test_news_corrects_the_states_it_tells_of(gain):
     MODEL.step.__wrapped__(x, heard, 0.01, vector, work, out)
     np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-14)
     # the drift says the same to first order: what is heard comes on top of what is flown
-    MODEL.drift.__wrapped__(x, heard, 0.01, vector, work, out)
-    flown = np.zeros(26)
-    dynamics.drift(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, flown)
-    np.testing.assert_allclose(out - flown, told - x, rtol=1e-9, atol=1e-13)
+    both, flown = np.zeros((2, 26 + len(CHANNELS)))
+    MODEL.drift_and_readings.__wrapped__(x, heard, 0.01, vector, work, both)
+    dynamics.drift_and_readings(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, flown)
+    heeded = both - flown
+    np.testing.assert_allclose(heeded[:26], told - x, rtol=1e-9, atol=1e-13)
+    assert not heeded[26:].any()
     # and who hears nothing flies the kernel's own step
     MODEL.step.__wrapped__(x, heard[:5].copy(), 0.01, vector, work, out)
     dynamics.step(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
@@ -262,7 +264,7 @@ def test_what_may_be_fitted_lies_within_its_bounds():
     for name, entry in effects.CATALOGUE.items():
         for free, own in zip(MODEL.effect_parameters(name), entry.parameters, strict=True):
             assert own.lower <= free.lower <= own.off <= free.upper <= own.upper
+            assert free.reading_only == (entry.stage == effects.SENSOR)
             reach = max(free.upper - own.off, own.off - free.lower)
             assert reach <= FARTHEST * own.usual * (1.0 + 1e-12)
             assert reach == pytest.approx(FARTHEST * own.usual) or math.isfinite(own.upper)
-            assert free.reading_only == (entry.stage == effects.SENSOR)

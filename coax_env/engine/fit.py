@@ -212,7 +212,7 @@ class Engine:
         slots[starts] = np.arange(starts.size)
         P = np.zeros((starts.size, nx, nx))
         log_likelihood, deweighted = kalman.filter_pass(
-            self.model.step, self.model.measure, self.model.drift, self.model.exact,
+            self.model.step, self.model.measure, self.model.drift_and_readings, self.model.exact,
             self.intervals[i], u, record.z, self.model.wraps, x0, P0, R, q, p,
             self.model.state_scale, self.model.work_size, GATE, REFRESH,
             keep is not None, states, e, K, per_sigma, H, slots, P, F, F_of, predicted,
@@ -312,7 +312,7 @@ class Engine:
                 which[k] = len(sets)
                 sets.append(inputs)
         kalman.signature_pass(
-            self.model.drift, self.model.measure, self.intervals[i], np.array(sets), which,
+            self.model.drift_and_readings, self.model.measure, self.intervals[i], np.array(sets), which,
             along.predicted, run.states, run.innovations, p, np.array(moved), steps, reading_only,
             self.model.exact, self.model.work_size, run.gains, run.per_sigma, run.H, along.F,
             along.F_of, REFRESH, columns, J,

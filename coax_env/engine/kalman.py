@@ -77,36 +77,31 @@ def _product(A, places, counts, B, out):
 
 
 @compiled(types.void(STEP, _A, _A, float64, _A, _A, _A, _A, _A, _A, _M), **REORDER)
-def _differences(flow, x, u, dt, p, work, scale, base, x_probe, x_moved, out):
-    """Jacobian of a flow in the state, from its value `base` at x, into `out`."""
+def _differences(flow, x, u, dt, p, work, scale, base, x_probe, moved, out):
+    """Jacobian in the state of a flow, or of its first values, from those at x, `base`, into `out`."""
     nx = x.size
     for j in range(nx):
         for i in range(nx):
             x_probe[i] = x[i]
         x_probe[j] += scale[j]
-        flow(x_probe, u, dt, p, work, x_moved)
-        for i in range(nx):
-            out[i, j] = (x_moved[i] - base[i]) / scale[j]
+        flow(x_probe, u, dt, p, work, moved)
+        for i in range(base.size):
+            out[i, j] = (moved[i] - base[i]) / scale[j]
 
 
 @compiled(**REORDER)
-def _transition(
-    drift, step, exact, x, u, dt, p, work, scale, x_next, x_probe, x_moved, A, AA, places, counts, F,
-):  # fmt: skip
-    """Jacobian F of a step at x: the exponential of that of the drift, to third order; its non-zeros.
+def _transition(step, exact, x, u, dt, p, work, scale, x_next, x_probe, A, AA, places, counts, F):
+    """Jacobian F of a step: the exponential of that of the drift, A, to third order; its non-zeros.
 
     A step too long for that has its own Jacobian taken, by differences of `step` (x_next at x).
     """
     nx = x.size
-    base = np.zeros(nx)
-    drift(x, u, dt, p, work, base)
-    _differences(drift, x, u, dt, p, work, scale, base, x_probe, x_moved, A)
     largest = 0.0
     for i in range(nx):
         if not exact[i]:
             largest = max(largest, abs(A[i, i]))
     if largest > MOST_DECAY:
-        _differences(step, x, u, dt, p, work, scale, x_next, x_probe, x_moved, F)
+        _differences(step, x, u, dt, p, work, scale, x_next, x_probe, np.zeros(nx), F)
         _non_zeros(F, places, counts)
         return
     # F = I + A (I + A/2 (I + A/3)), a row at a time; exact rows are I + A
@@ -138,12 +133,13 @@ def _transition(
     **REORDER,
 )  # fmt: skip
 def filter_pass(
-    step, measure, drift, exact, dt, u, z, wraps, x0, P0, R, q, p, scale, work_size, gate, refresh,
+    step, measure, both, exact, dt, u, z, wraps, x0, P0, R, q, p, scale, work_size, gate, refresh,
     keep, states, e, K_all, per_sigma_all, H_all, slots, P_all, F_all, F_of, predicted,
 ):  # fmt: skip
     """Extended Kalman filter over one run.
 
     Args:
+        step, measure, both: the model's (model.py), `both` its `drift_and_readings`.
         dt: (n,) seconds from each row to the next. u: (n, nu). z: (n, m), NaN where missing.
         R: (m,) reading variances. q: (nx,) growth of state variance per second. p: parameters.
         gate: readings further than this many sigmas from their prediction are believed less, as if
@@ -172,16 +168,17 @@ def filter_pass(
     work = np.zeros(work_size)
     x_next = np.zeros(nx)
     x_probe = np.zeros(nx)
-    x_moved = np.zeros(nx)
+    base = np.zeros(nx + m)
+    moved = np.zeros(nx + m)
     h = np.zeros(m)
-    h_probe = np.zeros(m)
     H = np.zeros((m, nx))
     H_places = np.zeros((m, nx), dtype=np.int64)
     H_counts = np.zeros(m, dtype=np.int64)
     F = np.zeros((nx, width))
     F_places = np.zeros((nx, nx), dtype=np.int64)
     F_counts = np.zeros(nx, dtype=np.int64)
-    A = np.zeros((nx, width))
+    AH = np.zeros((nx + m, width))  # of the drift, and of the readings
+    A = AH[:nx]
     AA = np.zeros((nx, width))
     dt_of_F = -1.0  # step at which F was computed, and the one it is scaled to
     dt_now = -1.0
@@ -200,13 +197,11 @@ def filter_pass(
         # --- correct ---------------------------------------------------------------------------
         measure(x, u[k], p, work, h)
         if fresh:
-            for j in range(nx):
-                for i in range(nx):
-                    x_probe[i] = x[i]
-                x_probe[j] += scale[j]
-                measure(x_probe, u[k], p, work, h_probe)
-                for i in range(m):
-                    H[i, j] = (h_probe[i] - h[i]) / scale[j]
+            both(x, u[k], dt[k], p, work, base)
+            _differences(both, x, u[k], dt[k], p, work, scale, base, x_probe, moved, AH)
+            for i in range(m):
+                for j in range(nx):
+                    H[i, j] = AH[nx + i, j]
             _non_zeros(H, H_places, H_counts)
             if keep:
                 for i in range(m):
@@ -283,9 +278,12 @@ def filter_pass(
         step(x, u[k], dt[k], p, work, x_next)
         changed = False
         if fresh or abs(dt[k] - dt_of_F) > 0.5 * dt_of_F:
+            if not fresh:
+                both(x, u[k], dt[k], p, work, base)
+                _differences(both, x, u[k], dt[k], p, work, scale, base, x_probe, moved, AH)
             dt_of_F = dt_now = dt[k]
-            _transition(drift, step, exact, x, u[k], dt[k], p, work, scale, x_next, x_probe, x_moved,
-                        A, AA, F_places, F_counts, F)  # fmt: skip
+            _transition(step, exact, x, u[k], dt[k], p, work, scale, x_next, x_probe, A, AA,
+                        F_places, F_counts, F)  # fmt: skip
             changed = True
         elif abs(dt[k] - dt_now) > SAME_STEP * dt_now:
             # same Jacobian, other step: rows of slow states follow the step to first order
@@ -483,7 +481,7 @@ def mean_pass(
     **REORDER,
 )  # fmt: skip
 def signature_pass(
-    drift, measure, dt, u_sets, u_of, predicted, states, e, p, moved, steps, reading_only, exact,
+    both, measure, dt, u_sets, u_of, predicted, states, e, p, moved, steps, reading_only, exact,
     work_size, K_all, per_sigma_all, H_all, F_all, F_of, refresh, columns, J,
 ):  # fmt: skip
     """Derivatives of the whitened innovations in many parameters at once, gains frozen.
@@ -493,8 +491,11 @@ def signature_pass(
 
         dv = -(dh/dp + H s),   s += K dv  for one reading after the other,   s <- F (s + b/2) + b/2
 
-    where `measure` at the predicted state gives dh/dp and `drift` at the filtered one b (Maine and
+    where `measure` at the predicted state gives dh/dp and the drift at the filtered one b (Maine and
     Iliff 1985, the sensitivity equations). A state that the drift takes exactly becomes F s + b.
+
+    One look at one state would not do for both: b at the predicted state lacks what the row's readings
+    told, and dh/dp at the filtered one would follow the innovation that it is compared with.
 
     Args:
         u_sets: (sets, n, nu) inputs, the first those of `p`; u_of: (k,) which of them a parameter has.
@@ -510,8 +511,8 @@ def signature_pass(
     nx = exact.size
     work = np.zeros(work_size)
     per_step = 1.0 / steps
-    x_base = np.zeros(nx)
-    x_here = np.zeros(nx)
+    base = np.zeros(nx + m)
+    here = np.zeros(nx + m)
     h_base = np.zeros(m)
     h_here = np.zeros(m)
     width = _whole_blocks(k_all)
@@ -528,18 +529,18 @@ def signature_pass(
     H_counts = np.zeros(m, dtype=np.int64)
     F_slot = -1
     for row in range(n):
+        if row % refresh == 0:
+            _unpack(H_all, row // refresh, H, H_places, H_counts)
         measure(predicted[row], u_sets[0, row], p, work, h_base)
-        drift(states[row], u_sets[0, row], dt[row], p, work, x_base)
+        both(states[row], u_sets[0, row], dt[row], p, work, base)
         for k in range(k_all):
             measure(predicted[row], u_sets[u_of[k], row], moved[k], work, h_here)
             for i in range(m):
                 dv[i, k] = (h_base[i] - h_here[i]) * per_step[k]
             if not reading_only[k] and row < n - 1:
-                drift(states[row], u_sets[u_of[k], row], dt[row], moved[k], work, x_here)
+                both(states[row], u_sets[u_of[k], row], dt[row], moved[k], work, here)
                 for i in range(nx):
-                    b[i, k] = (x_here[i] - x_base[i]) * per_step[k]
-        if row % refresh == 0:
-            _unpack(H_all, row // refresh, H, H_places, H_counts)
+                    b[i, k] = (here[i] - base[i]) * per_step[k]
         for i in range(m):
             if math.isnan(e[row, i]):
                 continue

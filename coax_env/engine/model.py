@@ -57,15 +57,19 @@ class Noise:
 
 
 class Model(Protocol):
-    """A system that can be put through the engine."""
+    """A system that can be put through the engine.
+
+    Derivatives are taken of `drift_and_readings`: into `out`, (nx + m,), what a row of `dt` seconds
+    adds to the state, to first order at least, and the readings at its start. A run's last row has 0.
+    """
 
     channels: tuple[str, ...]
     wraps: np.ndarray  # (m,) True where an innovation is an angle
     state_scale: np.ndarray  # (nx,) size of a small change of each state, for derivatives
     step: Any  # compiled pointer: (x, u, dt, p, work, out)
     measure: Any  # compiled pointer: (x, u, p, work, out)
-    drift: Any  # compiled pointer: (x, u, dt, p, work, out): what a row adds, roughly
-    exact: np.ndarray  # (nx,) True where `drift` is more than first order in dt
+    drift_and_readings: Any  # compiled pointer: (x, u, dt, p, work, out), see below
+    exact: np.ndarray  # (nx,) True where the drift is more than first order in dt
     work_size: int
 
     def vector(self, values: Mapping[str, float]) -> np.ndarray:
