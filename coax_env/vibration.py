@@ -95,22 +95,27 @@ class _Segment:
     azimuth: np.ndarray
     ahead: float
 
-    def _waves(self, beside: float) -> tuple[np.ndarray, np.ndarray]:
-        """Sine and cosine beside the rotor's frequency [Hz], (n, 2), and the trend, (n, TREND + 1)."""
-        angle = self.azimuth + 2.0 * np.pi * beside * self.t
-        trend = np.vander(self.t / SEGMENT, TREND + 1)
-        return np.column_stack([np.sin(angle), np.cos(angle)]), trend
+    def _waves(self, beside: np.ndarray) -> np.ndarray:
+        """Sines and cosines beside the rotor's frequency by so much (f,) [Hz], shape (f, 2, n)."""
+        angle = self.azimuth + 2.0 * np.pi * beside[:, None] * self.t
+        return np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
-    def power(self, beside: float) -> float:
-        """Sum of squares that a wave beside the rotor's frequency explains beyond the trend."""
-        waves, trend = self._waves(beside)
-        basis, _ = np.linalg.qr(np.column_stack([trend, waves]))
-        return float(np.sum((basis[:, -2:].T @ self.y) ** 2))
+    def _trend(self) -> np.ndarray:
+        return np.vander(self.t / SEGMENT, TREND + 1)
+
+    def powers(self, beside: np.ndarray) -> np.ndarray:
+        """Sums of squares that waves beside the rotor's frequency explain beyond the trend, (f,)."""
+        trend, _ = np.linalg.qr(self._trend())
+        waves = self._waves(beside)
+        waves -= (waves @ trend) @ trend.T
+        answer = waves @ self.y
+        inverse = np.linalg.pinv(waves @ waves.transpose(0, 2, 1), hermitian=True, rcond=1e-9)
+        return np.einsum("fi,fij,fj->f", answer, inverse, answer)
 
     def line(self) -> np.ndarray:
         """The wave at the rotor's frequency itself, (n,)."""
-        waves, trend = self._waves(0.0)
-        fit = np.linalg.lstsq(np.column_stack([trend, waves]), self.y, rcond=None)[0]
+        waves = self._waves(np.zeros(1))[0].T
+        fit = np.linalg.lstsq(np.column_stack([self._trend(), waves]), self.y, rcond=None)[0]
         return waves @ fit[-2:]
 
 
@@ -149,15 +154,17 @@ def _line(flight: Flight, rotor: str) -> Line | None:
     for run in flight.runs:
         for channel in set(ACCELEROMETERS) & set(run.measured):
             segments = list(_segments(run, channel, rotor))
-            beside = [
-                segment.power(f)
-                for segment in segments
-                for f in NEIGHBOURS
-                if abs(f - segment.ahead) > 1.0
-            ]
+            powers, beside = [], []  # at the rotor's own frequency; beside it, but not at the other's
+            for segment in segments:
+                own, *rest = segment.powers(np.array([0.0, *NEIGHBOURS])).tolist()
+                powers.append(own)
+                beside += [
+                    p
+                    for f, p in zip(NEIGHBOURS, rest, strict=True)
+                    if abs(f - segment.ahead) > 1.0
+                ]
             level = float(np.mean(beside)) if beside else 0.0
             if level > 0.0:
-                powers = [segment.power(0.0) for segment in segments]
                 ratio[channel] += [p / level for p in powers]
                 squares += [
                     2.0 * (p - level) / s.t.size for p, s in zip(powers, segments, strict=True)
