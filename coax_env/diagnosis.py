@@ -384,20 +384,23 @@ def _look_alikes(
             if change < 3.0 * tie and does_something:
                 near.append((change, other, move))
 
-    def in_its_place(other: str, move: np.ndarray) -> State:
+    def in_its_place(other: str, move: np.ndarray, steps: int) -> State:
         values = dict(zip(quadratic.names, (quadratic.at + move).tolist(), strict=True))
         active = [other if e == effect else e for e in state.active]
-        return search.settle(State(active, state.values | values, state.noise), steps=2)
+        return search.settle(State(active, state.values | values, state.noise), steps)
 
     result = {}
     for _, other, move in sorted(near, key=lambda n: n[0])[:3]:
-        trial = in_its_place(other, move)
+        trial = in_its_place(other, move, steps=2)
         if trial.objective - state.objective < tie:
             result[other] = trial
+    # a lag is far from a delay of nothing: the quadratic has no say, and both may be there
     for twin in sorted(together(effect) & set(search.candidates) - set(result)):
-        if search.score(quadratic, state.active, twin)[1] > EVIDENCE:  # a mixture of the two
-            _, move = search.swap(quadratic, state.active, effect, twin)
-            result[twin] = in_its_place(twin, move)
+        _, move = search.swap(quadratic, state.active, effect, twin)
+        trial = in_its_place(twin, move, steps=6)
+        mixed = search.score(quadratic, state.active, twin)[1] > EVIDENCE
+        if mixed or trial.objective - state.objective < tie:
+            result[twin] = trial
     return result
 
 

@@ -54,6 +54,8 @@ BEYOND_DOUBT = 10.0
 """A cause worth so many thresholds after the first refit without it needs no closer one."""
 CLEAR = 10.0
 """An effect worth so many times what another step promises is added before the fit has settled."""
+NEAR = 0.5
+"""Share of EVIDENCE from which an effect that the quadratic does not carry is fitted to see."""
 TOGETHER = (frozenset({"servo_lag", "servo_delay"}),)
 """Effects of which one at most is named: a real servo is a mixture of both (design/effects.md)."""
 BUFFET_SHARE = 0.2
@@ -583,7 +585,9 @@ class Search:
                     most, failures = len(state.active) - 1, 0
                     banned = {e for e, count in drops.items() if count > 1}
             elif not complete and (
-                self._swap(state, quadratic, tried) or self.look_for_buffet(state)
+                self._swap(state, quadratic, tried)
+                or self._add_near(state, quadratic, banned, tried)
+                or self.look_for_buffet(state)
             ):
                 pass
             else:  # nothing more to add: what is in must also stand against coloured residuals
@@ -654,14 +658,56 @@ class Search:
                 return True
         return False
 
+    def _add_near(
+        self,
+        state: State,
+        quadratic: Quadratic,
+        banned: Collection[str],
+        tried: set[tuple[str, ...]],
+    ) -> bool:
+        """Put in an effect that the quadratic nearly carries, where a fit says that it is worth it.
+
+        The quadratic at nothing is not that at the effect's size: a damping changes what the filter
+        makes of gusts, and may be worth twice what its slope promised.
+        """
+        near = []
+        for effect in self._addable(state, banned):
+            active = (*state.active, effect)
+            if active in tried or effects.CATALOGUE[effect].replaces:
+                continue
+            score, evidence, large = self.score(quadratic, state.active, effect)
+            if large and NEAR * EVIDENCE < evidence <= EVIDENCE:
+                near.append((score, effect, active))
+        for _, effect, active in sorted(near, reverse=True)[:3]:
+            tried.add(active)
+            occam = quadratic.occam(self.candidate_names(effect), self.free_names(state.active))
+            trial = self.settle(self.moved(state, quadratic, list(active), {}))
+            worth = state.objective - trial.objective - occam
+            if worth > EVIDENCE and self.is_large(effect, trial.values):
+                self.history.append((f"+ {effect}", worth))
+                self.say(f"added {effect}: {worth:.1f} nats, once fitted")
+                self.strongest = max(self.strongest, (worth, effect))
+                state.active, state.values = trial.active, trial.values
+                state.objective = trial.objective
+                return True
+        return False
+
+    def _addable(self, state: State, banned: Collection[str]) -> list[str]:
+        """Effects that are not in, and may be."""
+        return [
+            effect
+            for effect in self.candidates
+            if effect not in state.active
+            and effect not in banned
+            and not together(effect) & set(state.active)
+        ]
+
     def _ranked(
         self, state: State, quadratic: Quadratic, banned: Collection[str]
     ) -> list[tuple[float, str]]:
         """Effects that may be added, with their scores, the best first."""
         ranked = []
-        for effect in self.candidates:
-            if effect in state.active or effect in banned or together(effect) & set(state.active):
-                continue
+        for effect in self._addable(state, banned):
             score, evidence, large = self.score(quadratic, state.active, effect)
             if large and score > 0.0:
                 self.strongest = max(self.strongest, (evidence, effect))

@@ -154,14 +154,15 @@ def _line(flight: Flight, rotor: str) -> Line | None:
     for run in flight.runs:
         for channel in set(ACCELEROMETERS) & set(run.measured):
             segments = list(_segments(run, channel, rotor))
-            powers, beside = [], []  # at the rotor's own frequency; beside it, but not at the other's
+            powers, beside = (
+                [],
+                [],
+            )  # at the rotor's own frequency; beside it, but not at the other's
             for segment in segments:
                 own, *rest = segment.powers(np.array([0.0, *NEIGHBOURS])).tolist()
                 powers.append(own)
                 beside += [
-                    p
-                    for f, p in zip(NEIGHBOURS, rest, strict=True)
-                    if abs(f - segment.ahead) > 1.0
+                    p for f, p in zip(NEIGHBOURS, rest, strict=True) if abs(f - segment.ahead) > 1.0
                 ]
             level = float(np.mean(beside)) if beside else 0.0
             if level > 0.0:
