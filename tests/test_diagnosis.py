@@ -165,6 +165,32 @@ def test_a_polished_fit_is_at_the_top_of_the_likelihood(tmp_path):
         assert abs(slope) < 0.35, name
 
 
+def test_what_the_quadratic_nearly_carries_is_fitted_to_see(tmp_path, monkeypatch):
+    """A damping in gusts is worth more than its slope at nothing promised: found all the same."""
+    folder = injector.fly(
+        tmp_path / "flight", {"axial_damping": 0.055}, gusts=True, sensors="onboard",
+        runs=("heave_3211", "climb_descend"), seed=1,
+    )  # fmt: skip
+    flight = read_flight(folder)
+    model = HeliModel(LAMA)
+    search = Search(Engine(model, [record_of(r) for r in flight.runs]), model, ("axial_damping",))
+    bare = search.begin(starting_noise(flight, LAMA))
+    bare = search.settle(search.refit_noise(search.settle(bare)))
+    _, quadratic = search.linearise(bare)
+    promised = search.score(quadratic, [], "axial_damping")[0]
+    full = search.settle(search.moved(bare, quadratic, ["axial_damping"], {}))
+    occam = quadratic.occam(["axial_damping.coefficient"], search.free_names([]))
+    worth = bare.objective - full.objective - occam
+    assert worth > promised + 0.5
+
+    def found(threshold: float) -> list[str]:
+        monkeypatch.setattr("coax_env.search.EVIDENCE", threshold)
+        return search.run(replace(bare, active=[]))[0].active
+
+    assert found(0.5 * (promised + worth)) == ["axial_damping"]
+    assert found(1.05 * worth) == []
+
+
 # --- hidden effects ------------------------------------------------------------------------------
 
 
