@@ -4,9 +4,13 @@ Closed forms for the filters, simulated truth for the states, planted coefficien
 of their intervals for the regressions, and what design/paper.md found in Table VIII.
 """
 
+import itertools
+import math
+
 import gymnasium
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import binom
 from scipy.stats import t as student
@@ -27,6 +31,9 @@ from coax_env.two_step.processing import (
 from coax_env.two_step.published import direction, lift_artefact, predicted, table_viii
 from coax_env.two_step.reconstruction import BIAS, THETA, H, W, _filter, flapping, longitudinal
 from coax_env.two_step.regression import (
+    _autocovariance,
+    _from_draws,
+    _gusts,
     _memory,
     _over_lags,
     _parzen,
@@ -352,6 +359,168 @@ def test_scores_are_summed_over_lags_as_their_covariance_says():
     assert total == pytest.approx((1 + pole) / (1 - pole), rel=0.08)
     halves = _over_lags(rows[:, None], [100_000] * 2, 60)[0, 0] / 200_000
     assert halves == pytest.approx(total, rel=0.02)
+
+
+def summed_over_lags(scores: np.ndarray, memory: float, runs: list[int]) -> np.ndarray:
+    """Newey and West's sum written out, Parzen's weights over four memories."""
+    which = np.repeat(np.arange(len(runs)), runs)
+    lags = math.ceil(4.0 * memory)
+    meat = np.zeros((scores.shape[1],) * 2)
+    for i, j in itertools.product(range(len(scores)), repeat=2):
+        x = abs(i - j) / min(lags, runs[which[i]] - 1)
+        if which[i] == which[j] and x < 1.0:
+            weight = 1.0 - 6.0 * x**2 + 6.0 * x**3 if x < 0.5 else 2.0 * (1.0 - x) ** 3
+            meat += weight * np.outer(scores[i], scores[j])
+    return meat
+
+
+def remembered(residual: np.ndarray, runs: list[int]) -> float:
+    """Bartlett's sum written out, up to where the autocorrelation is first below a twentieth."""
+    parts = np.split(residual - residual.mean(), np.cumsum(runs)[:-1])
+    shape = [
+        sum(float(p[lag:] @ p[: len(p) - lag]) for p in parts) for lag in range(min(runs) // 4)
+    ]
+    shape = np.array(shape) / shape[0]
+    end = next(lag for lag, value in enumerate(shape) if abs(value) < 0.05)
+    return 1.0 + 2.0 * sum(value**2 for value in shape[1:end])
+
+
+@pytest.mark.parametrize("runs", [[90], [50, 40]])
+@pytest.mark.parametrize("total", [False, True])
+def test_the_covariance_is_the_sandwich_of_the_criterions_slopes(runs, total):
+    """Slopes and curvature by differences of sum r^2 / [b; -1]' S [b; -1], nothing else assumed."""
+    rng = np.random.default_rng(13)
+    X, y = noisy_rows(6, 90, False)
+    y = y + 0.5 * lfilter([1.0], [1.0, -0.6], rng.standard_normal(90))
+    errors = LOWER @ LOWER.T
+    if total:
+        found = total_least_squares(X, y, "abc", errors, (True, False, False), runs)
+    else:
+        found = least_squares(X, y, "abc", runs)
+
+    def per_row(b: np.ndarray) -> np.ndarray:
+        signed = np.append(b[1:], -1.0)
+        return 0.5 * (y - X @ b) ** 2 / (signed @ errors @ signed if total else 1.0)
+
+    best = minimize(lambda b: per_row(b).sum(), found.values + 0.05, method="BFGS", tol=1e-9).x
+    np.testing.assert_allclose(found.values, best, atol=2e-5)
+    steps = 1e-4 * np.eye(3)
+    slopes = np.stack([per_row(best + d) - per_row(best - d) for d in steps], 1) / 2e-4
+    curvature = np.array([
+        [
+            sum(i * j * per_row(best + i * c + j * d).sum() for i in (1, -1) for j in (1, -1)) / 4e-8
+            for d in steps
+        ]
+        for c in steps
+    ])  # fmt: skip
+    memory = remembered(y - X @ best, runs)
+    meat = summed_over_lags(slopes, memory, runs)
+    rows = len(y) / memory
+    expected = np.linalg.solve(curvature, np.linalg.solve(curvature, meat).T) * rows / (rows - 3)
+    assert found.rows == pytest.approx(rows, rel=1e-3)
+    np.testing.assert_allclose(found.covariance, expected, rtol=2e-3, atol=1e-9)
+
+
+def test_an_autocovariance_is_a_mean_of_products():
+    rng = np.random.default_rng(14)
+    values = 2.0 + rng.standard_normal((3, 50))
+    centred = values - values.mean()
+    expected = np.zeros(25)
+    for row, (start, stop), lag in itertools.product(centred, [(0, 30), (30, 50)], range(25)):
+        expected[lag] += sum(row[i] * row[i - lag] for i in range(start + lag, stop)) / 150
+    np.testing.assert_allclose(_autocovariance(values, [30, 20], 25), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("size", "memory"), [(0.2, 12.0), (1.0, 12.0), (1.0, 40.0)])
+def test_gusts_are_those_of_largest_restricted_likelihood(size, memory):
+    """Scores' covariance X' C X of the C that a continuous search of the dense likelihood finds."""
+    rng = np.random.default_rng(15)
+    runs, n = [240, 200], 440
+    pole = math.exp(-1.0 / memory)
+    X = np.column_stack([np.ones(n), np.sin(0.05 * np.arange(n))])
+    white = 0.3
+    off = white * rng.standard_normal((200, n))
+    gust = np.concatenate([
+        math.sqrt(1.0 - pole**2) * lfilter([1.0], [1.0, -pole], rng.standard_normal(k + 500))[500:]
+        for k in runs
+    ])  # fmt: skip
+    y = white * rng.standard_normal(n) + size * gust
+    residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    found = _gusts(residual, X, off, runs)
+
+    lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    together = np.less.outer(np.arange(n), [240])[:, 0]
+    same = together[:, None] == together[None]
+
+    def shaken(level: float, tau: float) -> np.ndarray:
+        return level * same * np.exp(-lag / tau)
+
+    kept = np.concatenate([np.arange(0, 240, 2), np.arange(240, n, 2)])  # white noise: every other
+
+    def cost(logs: np.ndarray) -> float:
+        V = (white**2 * np.eye(n) + shaken(*np.exp(logs)))[np.ix_(kept, kept)]
+        W = np.linalg.inv(V)
+        A = X[kept].T @ W @ X[kept]
+        c = X[kept].T @ W @ residual[kept]
+        told = np.linalg.slogdet(V)[1] + np.linalg.slogdet(A)[1]
+        return 0.5 * float(told + residual[kept] @ W @ residual[kept] - c @ np.linalg.solve(A, c))
+
+    bounds = [(math.log(1e-4), math.log(5.0)), (math.log(2.0), math.log(50.0))]
+    best = minimize(cost, np.log([max(size, 0.1) ** 2, memory]), bounds=bounds, method="L-BFGS-B")
+    expected = X.T @ shaken(*np.exp(best.x)) @ X
+    # sizes and memories are searched in steps
+    assert np.trace(found) == pytest.approx(np.trace(expected), rel=0.35)
+    np.testing.assert_allclose(found / np.trace(found), expected / np.trace(expected), atol=0.05)
+    assert (np.linalg.eigvalsh(found) >= -1e-9).all()
+
+
+def test_draws_of_the_errors_make_the_scores_covariance():
+    """Independent rows: n times the residual's variance times the instruments' own products.
+
+    Errors that a second draw puts into the instruments are a stranger's, and are taken off again.
+    """
+    rng = np.random.default_rng(16)
+    n, d = 60, 6000
+    X = np.column_stack([np.ones(n), 2.0 * rng.standard_normal(n)])
+    errors = np.array([[0.5, 0.1], [0.1, 0.3]]) ** 2
+    draws = rng.standard_normal((d, n, 2)) @ np.linalg.cholesky(errors).T
+    signed = np.array([1.5, -1.0])
+    off = draws @ -signed
+    spread = errors @ signed
+    found = _from_draws(draws, off, X, np.array([1]), spread / float(signed @ spread))
+    expected = float(signed @ spread) * X.T @ X
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        found / np.outer(size, size), expected / np.outer(size, size), atol=0.06
+    )
+
+
+def test_inflation_is_what_the_others_explain_of_a_column():
+    """VIF = 1 / (1 - R^2) of each column on the others (Belsley 1991)."""
+    rng = np.random.default_rng(17)
+    X = 3.0 + rng.standard_normal((200, 3)) @ rng.standard_normal((3, 3))
+    found = collinearity(X, ("a", "b", "c"))
+    for i, name in enumerate("abc"):
+        others = np.column_stack([np.ones(200), np.delete(X, i, axis=1)])
+        left = X[:, i] - others @ np.linalg.lstsq(others, X[:, i], rcond=None)[0]
+        assert found.inflation[name] == pytest.approx(X[:, i].var() / left.var(), rel=1e-6)
+    unit = (X - X.mean(0)) / np.linalg.norm(X - X.mean(0), axis=0)
+    np.testing.assert_allclose(found.singular**2, np.linalg.eigvalsh(unit.T @ unit)[::-1])
+    still = collinearity(np.column_stack([X, np.full(200, 7.0)]), ("a", "b", "c", "d"))
+    assert still.inflation == pytest.approx(found.inflation), "what stands still is no column"
+
+
+def test_a_weak_direction_says_how_little_it_moves():
+    """What is left of the smaller column, over what the larger part of the combination moves."""
+    a, b, other = np.random.default_rng(18).standard_normal((3, 4000))
+    X = np.column_stack([a, -0.2 * a + 0.002 * b, other])
+    (weak,) = collinearity(X, ("a", "c", "other")).directions
+    weights = dict(zip(weak.names, weak.weights, strict=True))
+    assert set(weights) == {"a", "c"} and 1.0 in weights.values()
+    assert weights["a"] / weights["c"] == pytest.approx(0.2, rel=0.01)
+    rest = 0.2 * X[:, 0] + X[:, 1]
+    share = np.std(rest) / np.std(X[:, 1])
+    assert weak.share == pytest.approx(share, rel=0.02)
 
 
 def test_collinearity_is_named_in_words():

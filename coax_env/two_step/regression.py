@@ -30,6 +30,10 @@ from scipy.stats import t as student
 
 LAGS_PER_MEMORY = 4.0
 """Lags summed, per row that residuals remember."""
+GUST_SIZES = np.geomspace(0.02, 3.0, 24)
+"""Variances of a gust that are tried, in those of the residual."""
+GUST_MEMORIES = 7
+"""How many memories of a gust are tried."""
 ENOUGH = 3.0
 """Standard errors by which the weakest direction must stand out of its own errors for total least
 squares to be trusted: (r^2 - 1) sqrt(rows / 2), r = smin(X) / smin([X y])."""
@@ -170,9 +174,9 @@ def _gusts(
     most = max(len(block) for block in blocks)
     shape = _autocovariance(off, lengths, step * most)[::step]
     size = float(residual.var())
-    levels = size * np.geomspace(0.02, 3.0, 24)
+    levels = size * GUST_SIZES
     # beyond a quarter of a run, what is remembered cannot be told from the offset
-    memories = np.geomspace(step, max(min(lengths) / 4.0, 2.0 * step), 7)
+    memories = np.geomspace(step, max(min(lengths) / 4.0, 2.0 * step), GUST_MEMORIES)
     best, level, memory = -math.inf, 0.0, 1.0
     for tau in memories:
         parts = []
