@@ -6,20 +6,24 @@ of their intervals for the regressions, and what design/paper.md found in Table 
 
 import itertools
 import math
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import binom
 from scipy.stats import t as student
 
-from coax_env import identify, load_vehicle, simulate
+import coax_env
+from coax_env import dynamics, identify, load_vehicle, simulate
 from coax_env.errors import InputError
 from coax_env.files import write_text
+from coax_env.flight import Run
 from coax_env.simulation import Gusts, fly_all
-from coax_env.two_step import modes
+from coax_env.two_step import method, modes
 from coax_env.two_step.modes import MODES, PHYSICS, fit_mode, fit_physics, joined, rows_of
 from coax_env.two_step.processing import (
     even_grid,
@@ -29,8 +33,18 @@ from coax_env.two_step.processing import (
     spectral_amplitude_filter,
 )
 from coax_env.two_step.published import direction, lift_artefact, predicted, table_viii
-from coax_env.two_step.reconstruction import BIAS, THETA, H, W, _filter, flapping, longitudinal
+from coax_env.two_step.reconstruction import (
+    BIAS,
+    THETA,
+    H,
+    W,
+    _filter,
+    _smooth,
+    flapping,
+    longitudinal,
+)
 from coax_env.two_step.regression import (
+    Regression,
     _autocovariance,
     _from_draws,
     _gusts,
@@ -113,6 +127,55 @@ def test_integrating_the_imu_gives_the_flown_path():
     assert np.abs(path["h"] - c["h"]).max() < 0.1
 
 
+def test_integrating_a_tumble_is_integrating_the_rigid_body():
+    """Large rates and speeds, against SciPy's solver on (46)-(49) written out again."""
+    g, dt = 9.8, 0.002
+    t = dt * np.arange(1001)
+    imu = {"q": lambda t: 1.5 * np.cos(3.0 * t), "ax": lambda t: 2.0 * np.sin(2.0 * t) + 1.0,
+           "az": lambda t: -9.0 + 3.0 * np.cos(t)}  # fmt: skip
+
+    def slopes(t: float, x: np.ndarray) -> list[float]:
+        theta, u, w, _ = x
+        return [
+            imu["q"](t),
+            imu["ax"](t) - imu["q"](t) * w - g * math.sin(theta),
+            imu["az"](t) + imu["q"](t) * u + g * math.cos(theta),
+            u * math.sin(theta) - w * math.cos(theta),
+        ]
+
+    truth = solve_ivp(
+        slopes, (0.0, t[-1]), [0.0, 0.0, 0.0, 1.5], t_eval=t, rtol=1e-10, atol=1e-12
+    ).y
+    found = integrated(imu["q"](t), imu["ax"](t), imu["az"](t), dt, g, 1.5)
+    for name, expected in zip(("theta", "u", "w", "h"), truth, strict=True):
+        np.testing.assert_allclose(found[name], expected, atol=2e-5, err_msg=name)
+
+
+def test_an_even_grid_has_straight_lines_between_readings():
+    t = 5.0 + np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.5, 0.6, 0.7])
+    line, thin = 2.0 * t - 1.0, np.full(8, np.nan)
+    line[2] = np.nan
+    thin[:3] = 1.0
+    run = Run("bumpy", t, np.zeros((8, 4)), {"p": line, "q": thin})
+    dt, even, columns = even_grid(run, ("p", "q", "r"))
+    assert dt == pytest.approx(0.1) and set(columns) == {"p"}
+    np.testing.assert_allclose(even, 5.0 + 0.1 * np.arange(8))
+    np.testing.assert_allclose(columns["p"], 2.0 * even - 1.0)
+
+
+def test_the_spectral_filter_takes_the_noises_amplitude_off_each_frequency():
+    """A tone over a flat floor: what is left of its amplitude is what stood above the floor's."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, 20.0, 0.01)
+    tone = np.sin(2 * np.pi * 8.0 * t)
+    floor = 3.0 + 0.5 * np.sin(2 * np.pi * 8.0 * t + 1.0) + 1e-6 * rng.standard_normal(t.size)
+    left = spectral_amplitude_filter(tone, floor, 0.01)[200:-200]
+    assert np.sqrt(2.0) * left.std() == pytest.approx(0.5, rel=0.02)
+    assert np.corrcoef(left, tone[200:-200])[0, 1] > 0.999, "its phase is kept"
+    with pytest.raises(InputError, match="99 rows is shorter than a segment of 100"):
+        spectral_amplitude_filter(tone, floor[:99], 0.01)
+
+
 # --- step 1 ---------------------------------------------------------------------------------------
 
 
@@ -163,6 +226,89 @@ def test_the_smoother_knows_more_and_the_speed_is_dead_reckoned(doublets):
     for states, _ in doublets:
         assert np.all(states.smoothed_std <= states.std + 1e-12)
         assert states.std[-1, 1] > 2.0 * states.std[100, 1]
+
+
+def test_step_one_is_the_posterior_of_its_own_linear_system():
+    """Filter and smoother against the stacked least squares over all rows, with the filter's F and Q.
+
+    F is the exponential of the slope of (46)-(49) to second order, Q the IMU's noise through them.
+    """
+    rng = np.random.default_rng(19)
+    n, dt, g = 14, 0.05, 9.8
+    q, ax = 0.8 * rng.standard_normal(n), rng.standard_normal(n)
+    az = -9.8 + rng.standard_normal(n)
+    sonar = 1.5 + 0.1 * rng.standard_normal(n)
+    sonar[[3, 4, 9]] = np.nan
+    start, spread = np.array([0.1, 1.0, -0.6, 1.5, 0.2]), np.array([0.1, 0.5, 0.5, 0.3, 0.2]) ** 2
+    shake, echo = np.array([0.03, 0.2, 0.1]) ** 2, 0.05**2
+    predicted, P_predicted, filtered, P_filtered, transition = _filter(
+        q, ax, az, sonar, dt, g, shake, echo, start, spread
+    )
+    smooth, P_smooth = _smooth(predicted, P_predicted, filtered, P_filtered, transition)
+
+    def slopes(x: np.ndarray, imu: np.ndarray) -> np.ndarray:
+        sin, cos = math.sin(x[0]), math.cos(x[0])
+        return np.array([
+            imu[0], imu[1] - imu[0] * x[2] - g * sin, imu[2] - x[4] + imu[0] * x[1] + g * cos,
+            x[1] * sin - x[2] * cos, 0.0,
+        ])  # fmt: skip
+
+    imu = np.column_stack([q, ax, az])
+    for k in range(n - 1):
+        x = filtered[k]
+        middle = x + 0.5 * dt * slopes(x, imu[k])
+        between = 0.5 * (imu[k] + imu[k + 1])
+        np.testing.assert_allclose(predicted[k + 1], x + dt * slopes(middle, between), rtol=1e-9)
+        h = 1e-6
+        A = np.array([
+            (slopes(middle + d, imu[k]) - slopes(middle - d, imu[k])) / (2 * h)
+            for d in h * np.eye(5)
+        ]).T  # fmt: skip
+        F = np.eye(5) + dt * A + 0.5 * dt**2 * A @ A
+        np.testing.assert_allclose(transition[k], F, atol=1e-8)
+        G = np.array([
+            (slopes(middle, imu[k] + d) - slopes(middle, imu[k] - d)) / (2 * h)
+            for d in h * np.eye(3)
+        ]).T  # fmt: skip
+        Q = P_predicted[k + 1] - F @ P_filtered[k] @ F.T
+        np.testing.assert_allclose(Q, dt**2 * G @ np.diag(shake) @ G.T, atol=1e-9)
+
+    # the least squares of all rows at once: first state, steps, sonar
+    information, pull = np.zeros((5 * n, 5 * n)), np.zeros(5 * n)
+
+    def add(rows: np.ndarray, target: np.ndarray, variance: np.ndarray) -> None:
+        nonlocal information, pull
+        weight = np.linalg.inv(variance)
+        information += rows.T @ weight @ rows
+        pull += rows.T @ weight @ target
+
+    whole = np.eye(5 * n).reshape(n, 5, 5 * n)
+    add(whole[0], start, np.diag(spread))
+    for k in range(n - 1):
+        F = transition[k]
+        Q = P_predicted[k + 1] - F @ P_filtered[k] @ F.T + 1e-9 * np.eye(5)
+        add(whole[k + 1] - F @ whole[k], predicted[k + 1] - F @ filtered[k], Q)
+    for k in np.flatnonzero(np.isfinite(sonar)):
+        add(whole[k][H : H + 1], sonar[k : k + 1], np.array([[echo]]))
+    joint = np.linalg.inv(information)
+    np.testing.assert_allclose(smooth.ravel(), joint @ pull, atol=2e-4)
+    for k in range(n):
+        own = joint[5 * k : 5 * k + 5, 5 * k : 5 * k + 5]
+        np.testing.assert_allclose(np.sqrt(np.diag(P_smooth[k])), np.sqrt(np.diag(own)), rtol=5e-3)
+    np.testing.assert_allclose(smooth[-1], filtered[-1])
+
+
+def test_step_one_starts_from_rest_at_the_median_of_the_first_echoes():
+    sonar = np.full(400, np.nan)
+    sonar[5::5] = 2.0
+    sonar[5:65:5] = 1.0
+    sonar[10] = 9.0  # a wild one
+    sonar[65:105:5] = 1.2
+    still = np.zeros(400)
+    found = longitudinal(still, still, still - 9.8, sonar, 0.01, 9.8, (0.03, 0.1, 0.05))
+    np.testing.assert_allclose(found.states[0], [0.0, 0.0, 0.0, 1.0, 0.0])
+    np.testing.assert_allclose(found.std[0], [0.02, 0.05, 0.05, 0.05, 0.1])
+    assert np.isnan(found.residual[::5]).sum() == 1 and np.isnan(found.residual[1])
 
 
 def test_flapping_follows_its_closed_form():
@@ -582,6 +728,136 @@ def test_intervals_cover_in_gusts():
             plain += int(np.sum((low < truth[: len(low)]) & (truth[: len(low)] < high)))
     assert 0.91 < inside / count < 0.985, inside / count
     assert plain / count < 0.75
+
+
+@pytest.fixture(scope="module")
+def clean_runs():
+    """Every axis stirred, no noise."""
+    return simulate(
+        LAMA, ("lon_3211", "lat_3211", "heave_3211", "yaw_3211"), sensors="state"
+    ).runs  # fmt: skip
+
+
+def columns_of(run, vehicle=LAMA):
+    dt, t, signals = even_grid(run, (*modes.IMU, "rpm_upper", "rpm_lower"))
+    return modes._columns(signals, run.command[: len(t)], dt, vehicle)
+
+
+def test_columns_of_a_clean_flight_obey_the_model(clean_runs):
+    """Each response is what its law, and its pooled regressors, say: (15)-(20), (26)-(37)."""
+    told: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for run in clean_runs:
+        columns = columns_of(run)
+        for response, law in modes._LAWS.items():
+            told.setdefault(response, []).append((columns[response], law(columns, LAMA)))
+        for physics in PHYSICS:
+            pooled = sum(columns[name] for name in physics.regressors)
+            told.setdefault(physics.response, []).append((columns[physics.response], pooled))
+    assert set(told) == set(modes._LAWS) | {physics.response for physics in PHYSICS}
+    for response, pairs in told.items():
+        measured, law = max(pairs, key=lambda pair: pair[0][50:-50].std())
+        measured, law = (low_pass(column, 0.01)[50:-50] for column in (measured, law))
+        assert np.std(measured - law) < 0.06 * measured.std(), response
+        assert abs(np.mean(measured - law)) < 0.03 * np.abs(law).max(), response
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_laws_are_the_kernels_equations(seed):
+    """At any state: readings and angular accelerations of the compiled model, made coefficients."""
+    rng = np.random.default_rng(seed)
+    x = np.zeros(16)
+    x[3:6] = rng.uniform(-1.0, 1.0, 3)
+    x[6:10] = rng.uniform(-0.02, 0.02, 4)
+    command = np.array([*rng.uniform(180.0, 220.0, 2), 0.0, 0.0])
+    v = LAMA.values()
+    T_u, T_l, Q_u, Q_l = modes.thrusts(LAMA, *command[:2])
+    columns = {
+        "T_u": T_u, "T_l": T_l, "Q_u": Q_u, "Q_l": Q_l, "p": x[3], "q": x[4], "r": x[5],
+        "alpha_l": x[6], "beta_l": x[7], "alpha_u": v["flybar_to_rotor_lon"] * x[8],
+        "beta_u": v["flybar_to_rotor_lat"] * x[9],
+    }  # fmt: skip
+    rates = coax_env.derivative(x, command, LAMA)
+    force = 0.5 * v["air_density"] * np.pi * v["rotor_radius"] ** 4 * command[0] ** 2
+    moment = force * v["rotor_radius"]
+    felt = dynamics.readings(x, command, LAMA)
+    expected = {
+        "C_X": v["mass"] * felt["ax"] / force,
+        "C_Y": v["mass"] * felt["ay"] / force,
+        "C_Z": -v["mass"] * felt["az"] / force,
+        "C_l": v["inertia_xx"] * rates[3] / moment,
+        "C_m": v["inertia_yy"] * rates[4] / moment,
+        "C_n": v["inertia_zz"] * rates[5] / moment,
+    }
+    for response, value in expected.items():
+        found = modes._LAWS[response](columns, LAMA)
+        assert found == pytest.approx(value, rel=1e-3, abs=1e-6), response
+
+
+def test_a_run_stirs_what_its_commands_move():
+    command = np.tile([200.0, 100.0, 0.0, 0.0], (8, 1))
+    command[:, 2] = [0.0, 0.02] * 4
+    command[:, 3] = [0.01, 0.05] * 4
+    command[:, 0] += [10.0, -10.0] * 4
+    command[:, 1] += [5.0, -5.0] * 4
+    run = Run("moving", np.arange(8.0), command, {})
+    assert modes.stir(run, "delta_lon") == pytest.approx(0.01)
+    assert modes.stir(run, "delta_lat") == pytest.approx(0.02)
+    assert modes.stir(run, "collective") == pytest.approx(0.05)
+    assert modes.stir(run, "differential") == pytest.approx(0.0, abs=1e-12)
+    command[:, 1] -= [10.0, -10.0] * 4
+    assert modes.stir(run, "differential") == pytest.approx(0.05)
+    assert modes.stir(run, "collective") == pytest.approx(0.0, abs=1e-12)
+
+
+def test_errors_of_a_row_are_what_the_sensors_noise_does(clean_runs):
+    """Scatter of the draws against two flights that differ in nothing but their sensors' noise."""
+    (run,) = (run for run in clean_runs if run.name.startswith("lon_3211"))
+    rng = np.random.default_rng(20)
+    rows = rows_of(run, LAMA, NOISE, 5.0, seed=1)
+    clean = modes._columns(*signals_of(run)[1:])
+    scatter = {name: [] for name in rows.errors}
+    for _ in range(12):
+        shaken = {
+            c: v + NOISE.get(c, 0.0) * rng.standard_normal(v.shape) for c, v in run.measured.items()
+        }
+        noisy = modes._columns(*signals_of(replace(run, measured=shaken))[1:])
+        for name, values in scatter.items():
+            values.append(low_pass(noisy[name] - clean[name], 0.01)[50:-50])
+    for name in ("q", "alpha_u", "alpha_l", "T_u", "C_X", "C_Z", "C_m", "driven_y"):
+        ratio = rows.errors[name].std() / np.std(scatter[name])
+        assert ratio == pytest.approx(1.0, abs=0.15), name
+        assert rows.errors[name].shape == (len(rows.t), modes.DRAWS)
+    assert rows.t[0] == pytest.approx(0.5, abs=0.01) and rows.lengths == (len(rows.t),)
+
+
+def signals_of(run):
+    dt, t, signals = even_grid(run, (*modes.IMU, "rpm_upper", "rpm_lower"))
+    return t, signals, run.command[: len(t)], dt, LAMA
+
+
+def test_a_number_is_joined_with_the_files_own_by_precision():
+    """Logs of independent factors: weights are the inverse squares of the relative stds."""
+    physics = next(p for p in PHYSICS if p.name == "pitch")
+    old = LAMA["inertia_yy"]
+    fit = Regression(
+        ("1", "driven_y"), np.array([0.3, 1.25]), np.diag([1.0, 0.05**2]), np.zeros(9), 9.0,
+        math.inf, "least squares",
+    )  # fmt: skip
+    (found,) = method._parameters(physics, fit, LAMA, "made")
+    own, said = (old.std / old.value) ** -2, (0.05 / 1.25) ** -2
+    log = -math.log(1.25) * said / (own + said)  # it divides
+    assert found.value == pytest.approx(old.value * math.exp(log))
+    assert found.std == pytest.approx(found.value / math.sqrt(own + said))
+    assert found.source == "made" and found.unit == old.unit
+    wrong = replace(fit, values=np.array([0.3, -1.25]))
+    assert method._parameters(physics, wrong, LAMA, "made") == (old,)
+
+
+def test_the_noise_record_is_the_run_that_moves_least(clean_runs):
+    hover = simulate(LAMA, "hover", sensors="state").runs[0]
+    assert method._noise_record([*clean_runs, hover]) is hover
+    still = method._still(hover, 5.0, 2.0)
+    assert set(still) == set(modes.IMU) and {len(v) for v in still.values()} == {202}
 
 
 def test_the_doublet_ties_what_equation_26_ties():
