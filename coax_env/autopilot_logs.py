@@ -14,7 +14,7 @@ motor controllers report are found without.
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from coax_env.layout import CHANNELS, RPM_PER_RAD_S
 from coax_env.log_units import ROTOR_COMMANDS, SWASH_COMMANDS
 
 ROWS = 100.0  # a second
+LONGEST_LOG = 24.0 * 3600.0  # s
 DEGREE = np.pi / 180.0
 Signal = tuple[np.ndarray, np.ndarray]
 """Times [s] and values, both (n,)."""
@@ -125,6 +126,8 @@ def import_log(
     begin = min(t[0] for t, _ in channels.values())
     channels = {name: (t - begin, values) for name, (t, values) in channels.items()}
     end = max(t[-1] for t, _ in channels.values())
+    if not end < LONGEST_LOG:
+        raise InputError(f"{path}: its time stamps run over {end:.3g} s, which no flight lasts")
     runs = []
     for k, (start, stop) in enumerate(cuts or [(0.0, end)], 1):
         runs.append(_run(f"run_{k}" if cuts else path.stem, channels, start, min(stop, end), path))
@@ -246,14 +249,14 @@ def px4_signals(path: Path) -> dict[str, Signal]:
         raise InputError(f"{path}: not a ULog that pyulog can read ({error})") from None
     signals: dict[str, Signal] = {}
     for topic in log.data_list:
-        if topic.multi_id != 0:
+        if topic.multi_id != 0 or "timestamp" not in topic.data:
             continue
         t = np.asarray(topic.data["timestamp"], float) * 1e-6
         order = np.argsort(t, kind="stable")
         for field, values in topic.data.items():
             if np.issubdtype(np.asarray(values).dtype, np.number) and field != "timestamp":
                 signals[f"{topic.name}.{field}"] = (t[order], np.asarray(values, float)[order])
-        if topic.name == "vehicle_attitude":
+        if topic.name == "vehicle_attitude" and all(f"q[{k}]" in topic.data for k in range(4)):
             q = [np.asarray(topic.data[f"q[{k}]"], float)[order] for k in range(4)]
             for name, angle in zip(("phi", "theta", "psi"), euler_angles(*q), strict=True):
                 signals[f"vehicle_attitude.{name}"] = (t[order], angle)
@@ -273,6 +276,25 @@ def euler_angles(
     return phi, theta, psi
 
 
+def _messages(log: Any) -> dict[str, tuple[list[float], list[float]]]:
+    """Times [s] and values of every field, as the messages come."""
+    columns: dict[str, tuple[list[float], list[float]]] = {}
+    while (message := log.recv_msg()) is not None:
+        fields = message.to_dict()
+        stamp = fields.get("TimeUS")
+        if stamp is None:
+            continue
+        instance = fields.get("I", fields.get("Instance", fields.get("C", 0)))
+        suffix = f"[{instance}]" if isinstance(instance, int) and instance > 0 else ""
+        for field, value in fields.items():
+            if isinstance(value, int | float) and field != "TimeUS":
+                name = f"{fields['mavpackettype']}.{field}{suffix}"
+                t, values = columns.setdefault(name, ([], []))
+                t.append(1e-6 * float(stamp))
+                values.append(float(value))
+    return columns
+
+
 def ardupilot_signals(path: Path) -> dict[str, Signal]:
     """Every numeric field of a DataFlash log as ``MSG.field``; other instances as ``MSG.field[1]``."""
     DFReader = require("pymavlink.DFReader", "logs")
@@ -282,20 +304,8 @@ def ardupilot_signals(path: Path) -> dict[str, Signal]:
             log: Any = DFReader.DFReader_text(str(path))
         else:
             log = DFReader.DFReader_binary(str(path))
-        columns: dict[str, tuple[list[float], list[float]]] = {}
-        while (message := log.recv_msg()) is not None:
-            fields = message.to_dict()
-            stamp = fields.get("TimeUS")
-            if stamp is None:
-                continue
-            instance = fields.get("I", fields.get("Instance", fields.get("C", 0)))
-            suffix = f"[{instance}]" if isinstance(instance, int) and instance > 0 else ""
-            for field, value in fields.items():
-                if isinstance(value, int | float) and field != "TimeUS":
-                    name = f"{fields['mavpackettype']}.{field}{suffix}"
-                    t, values = columns.setdefault(name, ([], []))
-                    t.append(1e-6 * float(stamp))
-                    values.append(float(value))
+        with closing(log):
+            columns = _messages(log)
     except InputError:
         raise
     except Exception as error:  # pymavlink raises whatever it stumbles over

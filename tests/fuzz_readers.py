@@ -13,6 +13,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 if __name__ == "__main__" and sys.argv[1:2] == [
@@ -22,7 +23,8 @@ if __name__ == "__main__" and sys.argv[1:2] == [
 
     with atheris.instrument_imports(
         include=["coax_env.flight", "coax_env.vehicle", "coax_env.log_units", "coax_env.outliers",
-                 "coax_env.foreign_columns", "coax_env.autopilot_logs", "pyulog.core"],
+                 "coax_env.foreign_columns", "coax_env.autopilot_logs", "pyulog.core",
+                 "pymavlink.DFReader"],
     ):  # fmt: skip
         import pyulog.core  # noqa: F401
 
@@ -30,6 +32,7 @@ if __name__ == "__main__" and sys.argv[1:2] == [
         import coax_env.vehicle  # noqa: F401
 
 import numpy as np
+from autopilot_files import dataflash, px4_flight
 
 from coax_env.autopilot_logs import import_log
 from coax_env.errors import InputError
@@ -52,6 +55,8 @@ maneuver = "hover"
 LOG = "t,rpm_upper_cmd,rpm_lower_cmd,delta_lon,gyro_y,h\n" + "".join(
     f"{0.1 * k:.1f},1994,2138,0.0,{'' if k % 3 else 0.5},1.0\n" for k in range(30)
 )
+ULOG = px4_flight(seconds=2.2, share=0.04)
+DATAFLASH = dataflash(seconds=2.2, rate=10.0)
 VEHICLE = (SHIPPED / "lama400d.toml").read_text(encoding="utf-8") + """
 [effects.ground_effect]
 gain = { value = 0.1, std = 0.02, unit = "1", source = "a guess" }
@@ -132,29 +137,37 @@ def a_vehicle(folder: Path, content: bytes) -> None:
     refused_in_one_line(read)
 
 
-def an_autopilot_log(folder: Path, content: bytes, ending: str = ".ulg") -> None:
+def an_autopilot_log(folder: Path, content: bytes, ending: str) -> None:
     """What import_log.py is given."""
     path = folder / f"log{ending}"
     path.write_bytes(content)
-    refused_in_one_line(lambda: import_log(path, "lama400d"))
+
+    def read() -> None:
+        for run in import_log(path, "lama400d").runs:
+            assert np.isfinite(run.command).all() and (np.diff(run.t) > 0).all()
+
+    refused_in_one_line(read)
 
 
-TARGETS: dict[str, tuple[Callable[[Path, bytes], None], str]] = {
+TARGETS: dict[str, tuple[Callable[[Path, bytes], None], str | bytes]] = {
     "card": (a_card, CARD),
     "log": (a_log, LOG),
     "vehicle": (a_vehicle, VEHICLE),
-    "ulog": (an_autopilot_log, ""),
+    "ulog": (partial(an_autopilot_log, ending=".ulg"), ULOG),
+    "dataflash": (partial(an_autopilot_log, ending=".log"), DATAFLASH),
 }
-"""Name -> what takes the bytes, and a sound file."""
+"""Name -> what takes the bytes, and a sound file: a text is spoilt word by word, bytes as they are."""
 
 
 # --- libFuzzer ----------------------------------------------------------------------------------
 
 
-def changed(data: bytes, text: str) -> bytes:
-    """Bytes from libFuzzer: as they are, or as changes of a sound file."""
+def changed(data: bytes, sound: str | bytes) -> bytes:
+    """Bytes from libFuzzer: as they are, or as changes of a sound text."""
+    if isinstance(sound, bytes):
+        return data
     provider = atheris.FuzzedDataProvider(data)
-    if not text or provider.ConsumeBool():
+    if provider.ConsumeBool():
         return provider.ConsumeBytes(len(data))
     changes = []
     for _ in range(provider.ConsumeIntInRange(1, 4)):
@@ -164,15 +177,15 @@ def changed(data: bytes, text: str) -> bytes:
         else:
             new = provider.ConsumeUnicode(12)
         changes.append((place, new))
-    return spoilt(text, changes)
+    return spoilt(sound, changes)
 
 
 def fuzz(name: str, words: Sequence[str]) -> None:
     """Let libFuzzer run one target; it leaves the process when it is done."""
-    target, text = TARGETS[name]
+    target, sound = TARGETS[name]
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        atheris.Setup([sys.argv[0], *words], lambda data: target(place, changed(data, text)))
+        atheris.Setup([sys.argv[0], *words], lambda data: target(place, changed(data, sound)))
         atheris.Fuzz()
 
 
@@ -188,12 +201,14 @@ def main() -> None:
     for name in options.names or TARGETS:
         corpus = options.out / name
         corpus.mkdir(parents=True, exist_ok=True)
-        text = TARGETS[name][1]
-        (corpus / "sound").write_bytes(text.encode() + b"\x01")  # the last byte: as they are
+        sound = TARGETS[name][1]
+        if isinstance(sound, str):
+            sound = sound.encode() + b"\x01"  # the last byte: as they are
+        (corpus / "sound").write_bytes(sound)
         done = subprocess.run(
             [sys.executable, __file__, "--target", name, str(corpus), "-timeout=20",
              f"-max_total_time={options.seconds}", f"-artifact_prefix={options.out}/{name}-",
-             "-print_final_stats=1", "-max_len=4096", "-verbosity=1"],
+             "-print_final_stats=1", "-max_len=8192", "-verbosity=1"],
             check=False,
         )  # fmt: skip
         if done.returncode:

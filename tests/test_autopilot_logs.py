@@ -1,10 +1,10 @@
-"""Autopilot logs, written here byte by byte from their specifications, through the importers."""
+"""Autopilot logs (autopilot_files.py) through the importers."""
 
-import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from autopilot_files import dataflash, px4_flight, ulog
 
 from coax_env import read_flight
 from coax_env.autopilot_logs import Taken, euler_angles, import_log
@@ -15,58 +15,14 @@ from coax_env.layout import RPM_PER_RAD_S
 TAKE = {"delta_lon": Taken("actuator_servos.control[0]", 0.2)}
 
 
-def ulog(path: Path, topics: dict[str, tuple[list[str], float, np.ndarray]]) -> Path:
-    """A ULog (PX4 file format, version 1): topic -> field names, rate [Hz], rows (n, fields)."""
-
-    def message(kind: bytes, body: bytes) -> bytes:
-        return struct.pack("<Hc", len(body), kind) + body
-
-    content = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
-    content += message(b"B", bytes(40))
-    for name, (fields, _, _) in topics.items():
-        text = f"{name}:uint64_t timestamp;" + "".join(f"float {field};" for field in fields)
-        content += message(b"F", text.encode())
-    for k, name in enumerate(topics):
-        content += message(b"A", struct.pack("<BH", 0, k) + name.encode())
-    for k, (_, rate, rows) in enumerate(topics.values()):
-        for i, row in enumerate(rows):
-            stamp = struct.pack("<Q", 1_000_000 + round(1e6 * i / rate))
-            content += message(
-                b"D", struct.pack("<H", k) + stamp + struct.pack(f"<{len(row)}f", *row)
-            )
-    path.write_bytes(content)
+def written(path: Path, content: bytes | str) -> Path:
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
-
-
-def px4_flight(path: Path) -> Path:
-    """Six seconds: gyros at 250 Hz turning at 0.1 rad/s, heading 0.3, motors and ESCs slower."""
-    half = 0.15
-    return ulog(
-        path,
-        {
-            "sensor_combined": (
-                ["gyro_rad[0]", "gyro_rad[1]", "gyro_rad[2]", "accelerometer_m_s2[0]",
-                 "accelerometer_m_s2[1]", "accelerometer_m_s2[2]"],
-                250.0, np.tile([0.0, 0.1, 0.0, 0.0, 0.0, -9.8], (1500, 1)),
-            ),
-            "vehicle_attitude": (
-                ["q[0]", "q[1]", "q[2]", "q[3]"], 50.0,
-                np.tile([np.cos(half), 0.0, 0.0, np.sin(half)], (300, 1)),
-            ),
-            "vehicle_local_position": (
-                ["x", "y", "z", "vx", "vy", "vz"], 20.0,
-                np.tile([1.0, 2.0, -1.5, 0.1, 0.2, 0.0], (120, 1)),
-            ),
-            "esc_status": (["esc[0].esc_rpm", "esc[1].esc_rpm"], 20.0,
-                           np.tile([2000.0, 2140.0], (120, 1))),
-            "actuator_servos": (["control[0]"], 50.0, np.tile([[0.5]], (300, 1))),
-        },
-    )  # fmt: skip
 
 
 def test_a_px4_log_becomes_a_flight_folder(tmp_path):
     pytest.importorskip("pyulog")
-    flight = import_log(px4_flight(tmp_path / "log.ulg"), "lama400d", TAKE)
+    flight = import_log(written(tmp_path / "log.ulg", px4_flight()), "lama400d", TAKE)
     again = read_flight(write_flight(flight, tmp_path / "flight"))
     (run,) = again.runs
     assert run.duration == pytest.approx(6.0, abs=0.05)
@@ -82,7 +38,7 @@ def test_a_px4_log_becomes_a_flight_folder(tmp_path):
 
 def test_runs_are_cut_out_of_a_log(tmp_path):
     pytest.importorskip("pyulog")
-    path = px4_flight(tmp_path / "log.ulg")
+    path = written(tmp_path / "log.ulg", px4_flight())
     flight = import_log(path, "lama400d", TAKE, [(0.5, 3.0), (3.0, 99.0)])
     assert [r.name for r in flight.runs] == ["run_1", "run_2"]
     assert flight.runs[0].duration == pytest.approx(2.5, abs=0.02)
@@ -96,7 +52,7 @@ def test_what_is_missing_is_said_in_one_line(tmp_path):
         "sensor_combined": (["gyro_rad[0]"], 100.0, np.zeros((500, 1))),
         "actuator_outputs": (["output[0]"], 50.0, np.ones((250, 1))),
     }
-    bare = ulog(tmp_path / "bare.ulg", topics)
+    bare = written(tmp_path / "bare.ulg", ulog(topics))
     with pytest.raises(InputError, match=r"speed of the upper rotor.*actuator_outputs.output\[0\]"):
         import_log(bare, "lama400d")
     with pytest.raises(InputError, match=r"no signal 'esc\.rpm'"):
@@ -117,24 +73,8 @@ def test_a_log_of_another_kind_is_refused(tmp_path):
 
 
 def test_an_ardupilot_log_becomes_a_flight(tmp_path):
-    """The text form of a DataFlash log: FMT lines, then messages; angles in degrees."""
     pytest.importorskip("pymavlink")
-    lines = [
-        "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns",
-        "FMT, 129, 40, IMU, QBffffff, TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ",
-        "FMT, 130, 30, ATT, Qfff, TimeUS,Roll,Pitch,Yaw",
-        "FMT, 131, 30, RPM, Qff, TimeUS,rpm1,rpm2",
-        "FMT, 132, 30, RFND, QBf, TimeUS,Instance,Dist",
-    ]
-    for k in range(400):
-        stamp = 1_000_000 + 10_000 * k
-        lines.append(f"IMU, {stamp}, 0, 0.0, 0.2, 0.0, 0.1, 0.0, -9.8")
-        lines.append(f"IMU, {stamp}, 1, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0")
-        if k % 4 == 0:
-            lines += [f"ATT, {stamp}, 1.0, -2.0, 90.0", f"RPM, {stamp}, 1990.0, 2130.0",
-                      f"RFND, {stamp}, 0, 1.25"]  # fmt: skip
-    path = tmp_path / "log.log"
-    path.write_text("\n".join(lines) + "\n")
+    path = written(tmp_path / "log.log", dataflash())
     (run,) = import_log(path, "lama400d").runs
     assert np.nanmean(run.measured["q"]) == pytest.approx(0.2)
     assert np.nanmean(run.measured["psi"]) == pytest.approx(np.pi / 2)

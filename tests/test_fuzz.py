@@ -53,7 +53,7 @@ def test_many_spoilt_files_are_read_or_refused(name, tmp_path, changes):
     try_changes(name, tmp_path, changes)
 
 
-@pytest.mark.parametrize("name", [*FILES, "ulog"])
+@pytest.mark.parametrize("name", fuzz_readers.TARGETS)
 @some(40)
 @given(content=st.binary(max_size=300))
 def test_any_bytes_are_read_or_refused(name, tmp_path, content):
@@ -74,7 +74,20 @@ def hash_of(text: str) -> int:
     return sum(text.encode()[:40])
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", ["ulog", "dataflash"])
+@some(80)
+@given(changes=st.lists(st.tuples(st.integers(0, 8000), st.binary(max_size=4)), max_size=5))
+def test_a_log_with_bytes_changed_is_read_or_refused(name, tmp_path, changes):
+    pytest.importorskip("pyulog" if name == "ulog" else "pymavlink")
+    _, sound = fuzz_readers.TARGETS[name]
+    content = bytearray(sound if isinstance(sound, bytes) else sound.encode())
+    for place, new in changes:
+        place %= len(content)
+        content[place : place + max(1, len(new))] = new  # fewer bytes, as many, or other ones
+    try_bytes(name, tmp_path, bytes(content))
+
+
+@pytest.mark.parametrize("name", fuzz_readers.TARGETS)
 def test_the_sound_files_are_sound(name, tmp_path, monkeypatch):
     """What is spoilt above is accepted as it stands."""
     refused = []
@@ -82,8 +95,10 @@ def test_the_sound_files_are_sound(name, tmp_path, monkeypatch):
     monkeypatch.setattr(
         fuzz_readers, "refused_in_one_line", lambda read: refused.append(keep(read))
     )
-    target, text = fuzz_readers.TARGETS[name]
-    target(tmp_path, text.encode())
+    if name in ("ulog", "dataflash"):
+        pytest.importorskip("pyulog" if name == "ulog" else "pymavlink")
+    target, sound = fuzz_readers.TARGETS[name]
+    target(tmp_path, sound if isinstance(sound, bytes) else sound.encode())
     assert refused == [False]
 
 
