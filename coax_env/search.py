@@ -41,7 +41,7 @@ POLISH = 0.02
 """Nats that the last step of a final fit may promise: a fifth of a standard deviation.
 
 PROMISE would leave two, and always on the side that the search came from."""
-MOST_POLISHES = 3
+MOST_POLISHES = 4
 PART_OF_STD = 0.3
 """Step of a difference of likelihoods, in standard deviations."""
 MOST_STEPS = 4
@@ -369,22 +369,23 @@ class Search:
         passes has it in. Coloured innovations say that the gains are not those of the true noise: then
         that part of the slope is no more than a bias, and is left out.
         """
-        state = self.settle(state, MOST_STEPS, POLISH)
-        free = self.free(state.active)
         own = [f for e in state.active for f in self.by_effect[e]]
-        if not own:
-            return state
-        if not is_white(self.engine.filter(state.values, state.noise), self.model.channels):
-            return state
-        for _ in range(MOST_POLISHES):
+        passes = self.engine.filter(state.values, state.noise)
+        if not own or not is_white(passes, self.model.channels):
+            return self.settle(state, MOST_STEPS, POLISH)
+        free = self.free(state.active)
+        names = [f.name for f in free]
+        # what the slope with the gains held lacks: it hardly changes on the way
+        missing = np.zeros(len(names))
+        for count in range(MOST_POLISHES):
             _, lin = self.engine.linearise(state.values, state.noise, free)
             quadratic = Quadratic.of(lin, free, state.values)
-            names = [f.name for f in free]
-            std = dict(zip(names, np.sqrt(np.diag(quadratic.covariance(names))), strict=True))
-            slope = lin.slope.sum(0).copy()
-            for f in own:
-                slope[names.index(f.name)] = self._slope(state, f, PART_OF_STD * float(std[f.name]))
-            _, move = replace(quadratic, g=slope).best(names)
+            if count == 0:
+                std = np.sqrt(np.diag(quadratic.covariance(names)))
+                for f in own:
+                    k = names.index(f.name)
+                    missing[k] = self._slope(state, f, PART_OF_STD * float(std[k])) - quadratic.g[k]
+            _, move = replace(quadratic, g=quadratic.g + missing).best(names)
             for part in (1.0, 0.4):
                 there = dict(zip(names, (quadratic.at + part * move).tolist(), strict=True))
                 passes = self.engine.filter(state.values | there, state.noise)
