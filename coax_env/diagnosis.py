@@ -288,20 +288,18 @@ def _causes(
     free = search.free_names(state.active)
     std = dict(zip(free, np.sqrt(np.diag(quadratic.covariance(free))), strict=True))
     dt = median_step(search.engine.records)
+    channels = {effect: _channels(search, state, quadratic, effect) for effect in state.active}
+
+    def look_alikes(effect: str) -> dict[str, State]:
+        inflations = (white[c].inflation for c in channels[effect])
+        colour = max([weights[effect].colour, *inflations])
+        return _look_alikes(search, state, quadratic, effect, colour, weights[effect].lost)
+
+    ties = search.for_each(look_alikes, state.active)
     causes: list[dict[str, Any]] = []
-    ties: dict[str, dict[str, State]] = {}
     for effect in state.active:
         entry = effects.CATALOGUE[effect]
         weight = weights[effect]
-        channels = _channels(search, state, quadratic, effect)
-        ties[effect] = _look_alikes(
-            search,
-            state,
-            quadratic,
-            effect,
-            max([weight.colour, *(white[c].inflation for c in channels)]),
-            weight.lost,
-        )
         causes.append(
             {
                 "effect": effect,
@@ -315,7 +313,7 @@ def _causes(
                 },
                 "evidence": weight.evidence,
                 "confusable_with": list(ties[effect]),
-                "channels": channels,
+                "channels": channels[effect],
             }
         )
     causes.sort(key=lambda c: -c["evidence"])

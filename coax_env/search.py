@@ -18,7 +18,9 @@ parameter's prior std (contract.md) and the move is worth EVIDENCE against the f
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -63,6 +65,7 @@ BUFFET_SHARE = 0.2
 MOST_FAILURES = 3
 """Additions in a row that do not hold before the search gives up."""
 Progress = Callable[[str], None]
+T = TypeVar("T")
 
 
 def together(effect: str) -> set[str]:
@@ -518,16 +521,22 @@ class Search:
 
     def weigh(self, state: State, quadratic: Quadratic) -> dict[str, "Weight"]:
         """What each cause is worth: everything refitted without it, noise levels too."""
-        weights = {}
-        for effect in state.active:
+
+        def one(effect: str) -> Weight:
             held = effects.CATALOGUE[effect].replaces
             colour = self.colour(quadratic, state.active, effect)
             without = self.refit_noise(self.without(state, quadratic, effect))
             self.settle(without, steps=1, without=held)
             if without.objective - state.objective < BEYOND_DOUBT * EVIDENCE * colour:
                 without = self.converge(without, held)
-            weights[effect] = Weight(float(without.objective - state.objective), colour)
-        return weights
+            return Weight(float(without.objective - state.objective), colour)
+
+        return self.for_each(one, state.active)
+
+    def for_each(self, work: Callable[[str], T], of: Sequence[str]) -> dict[str, T]:
+        """What is found for each effect, of several at once: no core waits for another's last run."""
+        with ThreadPoolExecutor(self.engine.threads) as pool:
+            return dict(zip(of, pool.map(work, of), strict=True))
 
     def prune(self, state: State) -> tuple[State, Quadratic, dict[str, "Weight"]]:
         """Take out, one at a time, causes whose evidence is gone once the noise may answer too."""
