@@ -53,7 +53,7 @@ def parse() -> Any:
     parser.add_argument("--effects", type=int, default=400, help="flights with effects")
     parser.add_argument(
         "--many", type=int, default=0,
-        help=f"gusty flights with {plan.MANY} effects each, for the intervals",
+        help=f"gusty flights with up to {plan.MANY} effects each, for the intervals",
     )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="24 flights in all")
     parser.add_argument(

@@ -16,7 +16,7 @@ import injector
 import numpy as np
 import pytest
 import study_diagnosis
-from study import baselines, judge, plan, store, table, threshold
+from study import baselines, judge, one_flight, plan, store, table, threshold
 from study.baselines import Gram, by_bic, by_f, sparse, stepwise
 from study.one_flight import catalogue_values, expected_evidence, fly_and_diagnose, hide
 from study.plan import PlannedFlight
@@ -276,6 +276,49 @@ def test_intervals_are_of_true_effects_in_the_same_form() -> None:
         comparable={"swash_offset.lon": 0.03 + 0.0195, "swash_offset.lat": 0.03 - 0.0197},
     )  # fmt: skip
     assert judge.intervals(row) == [("swash_offset.lon", True), ("swash_offset.lat", False)]
+
+
+def test_intervals_beside_what_cannot_be_seen_are_counted_apart() -> None:
+    def row(number: int, expected: float, error: float) -> dict[str, Any]:
+        flight = flight_with("swash_offset", number=number)
+        said = {"value": error, "std": 1.0, "unit": "rad"}
+        cause = {"effect": "swash_offset", "parameters": {"swash_offset.lon": said}}
+        return row_of(
+            flight, [cause], expected={"swash_offset": expected},
+            comparable={"swash_offset.lon": 0.0},
+        )  # fmt: skip
+
+    sure, faint = 2.1 * EVIDENCE, 1.9 * EVIDENCE
+    rows = [row(0, sure, 1.0), row(1, sure, 1.9), row(2, sure, 2.1), row(3, faint, 9.0)]
+    figure = next(f for f in table.all_figures(rows) if "cover, in gusts" in f.name)
+    assert (figure.good, figure.count) == (2, 3)
+    assert figure.apart == (
+        "swash_offset.lon 2/3; 0 of 1 beside an effect that was not expected to show"
+    )
+
+
+def test_effects_that_cannot_show_are_left_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until all that are left can be: what carried another may have gone."""
+    flown: list[list[str]] = []
+
+    def fly(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
+        flown.append(list(planned.effects))
+        return {}
+
+    def expected(planned: PlannedFlight, *_: Any) -> dict[str, float]:
+        carried = 4.0 if "rotor_drag" in planned.effects else 0.0
+        worth = {"wind": carried, "rotor_drag": 2.9, "gyro_bias": 3.1}
+        return {e: EVIDENCE * worth[e] for e in planned.effects}
+
+    monkeypatch.setattr(one_flight, "hide", fly)
+    monkeypatch.setattr(one_flight, "read_flight", lambda folder: None)
+    monkeypatch.setattr(one_flight, "expected_evidence", expected)
+    effects: dict[str, dict[str, float]] = {e: {} for e in ("wind", "rotor_drag", "gyro_bias")}
+    flight = PlannedFlight("many", 0, effects, True, "full", 5, ("hover",))
+    assert list(one_flight.showing(flight, tmp_path).effects) == ["gyro_bias"]
+    assert flown == [["wind", "rotor_drag", "gyro_bias"], ["wind", "gyro_bias"], ["gyro_bias"]]
 
 
 def test_the_gain_is_a_share_of_what_the_truth_removes() -> None:

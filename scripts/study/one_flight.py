@@ -22,7 +22,7 @@ from coax_env.flight import Flight, read_flight
 from coax_env.gain import gain_of
 from coax_env.heli_model import HeliModel, record_of, starting_noise
 from coax_env.prediction import fly_again
-from coax_env.search import Quadratic, Search, State
+from coax_env.search import EVIDENCE, Quadratic, Search, State
 from coax_env.vehicle import load_vehicle
 from study import baselines
 from study.judge import OWN
@@ -31,6 +31,10 @@ from study.store import code_hash
 
 GUSTS = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003, "memory": 0.5}
 """Std of the generator's gusts [N, N m] and their correlation time [s]."""
+
+SURE = 3.0
+"""Thresholds that an effect of a flight of kind "many" must be expected to be worth on all its runs; a
+quarter of them is held out, and two are then left."""
 
 SIZE_IN_CATALOGUE = {
     # Cheeseman-Bennett between z/R 1.2 and 2.4 is 0.22 exp(-1.3 z/R)
@@ -57,6 +61,8 @@ def fly_and_diagnose(flight: PlannedFlight, only_own: bool = False) -> dict[str,
 
 
 def _result(planned: PlannedFlight, folder: Path, only_own: bool) -> dict[str, Any]:
+    if planned.kind == "many":
+        planned = showing(planned, folder.parent)
     truth = hide(planned, folder)
     flight = read_flight(folder)
     start = time.perf_counter()
@@ -111,6 +117,23 @@ def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
         path.unlink()
         return truth
     raise RuntimeError(f"the pilot cannot fly {planned.effects}")
+
+
+def showing(planned: PlannedFlight, place: Path) -> PlannedFlight:
+    """The flight with those of its effects only that can be expected to show on it, all at once."""
+    while planned.effects:
+        folder = place / f"with-{len(planned.effects)}"
+        truth = hide(planned, folder)
+        expected = expected_evidence(planned, read_flight(folder), truth, ())
+        shown = {
+            effect: sizes
+            for effect, sizes in planned.effects.items()
+            if (expected[effect] or 0.0) > SURE * EVIDENCE
+        }
+        if len(shown) == len(planned.effects):
+            break
+        planned = replace(planned, effects=shown)
+    return planned
 
 
 # --- what could have been known ---------------------------------------------------------------------

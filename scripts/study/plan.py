@@ -30,7 +30,11 @@ KINDS = ("still", "gusty", "one", "two", "three", "outside", "hover", "many")
 SHARES = {"one": 0.5, "two": 0.2, "three": 0.1, "outside": 0.1, "hover": 0.1}
 """Of the flights with effects."""
 MANY = 5
-"""Effects of a flight of kind "many", always in gusts: it is flown for the intervals in it."""
+"""Effects that a flight of kind "many" begins with, always in gusts: it is flown for its intervals.
+
+Those that one cannot expect to show are left off before it is diagnosed (one_flight.py): an effect that
+is there and cannot be seen is in other effects' numbers, and no interval knows of it.
+"""
 
 SIZES: dict[str, dict[str, tuple[float, float, bool]]] = {
     "ground_effect": {"gain": (0.7, 1.3, False)},
@@ -111,7 +115,7 @@ def plan(
     Args:
         clean: flights without an effect. effects: flights with one or more.
         runs: of the flights that are not hover-only; None: all that the generator has.
-        many: flights with MANY effects each.
+        many: flights with up to MANY effects each.
     """
     counts = {"still": clean - clean // 2, "gusty": clean // 2}
     for kind, share in SHARES.items():

@@ -136,19 +136,34 @@ def _outside(rows: Sequence[Row]) -> Figure:
 
 
 def _coverage(rows: Sequence[Row]) -> list[Figure]:
-    """95 % intervals that hold the truth, by weather; the parameters that ever miss are named."""
+    """95 % intervals that hold the truth, by weather; the parameters that ever miss are named.
+
+    Where every hidden effect was expected to show: one that is there unseen is in the others' numbers.
+    """
     result = []
+    shown, faint = _split(rows)
     for gusts, bar, words in ((True, "93-97 %", "in gusts"), (False, "", "in still air")):
         by_name: dict[str, list[bool]] = {}
-        for row in rows:
+        for row in shown:
             if row["plan"]["gusts"] == gusts:
                 for name, inside in judge.intervals(row):
                     by_name.setdefault(name, []).append(inside)
+        beside = [
+            inside
+            for row in faint
+            if row["plan"]["gusts"] == gusts
+            for _, inside in judge.intervals(row)
+        ]
         every = [inside for part in by_name.values() for inside in part]
         worst = sorted(by_name.items(), key=lambda item: float(np.mean(item[1])))
         missed = ", ".join(f"{n} {sum(part)}/{len(part)}" for n, part in worst if not all(part))
         name = f"95 % intervals that cover, {words}"
-        result.append(Figure(name, bar, sum(every), len(every), apart=missed))
+        apart = f"{sum(beside)} of {len(beside)} beside an effect that was not expected to show"
+        result.append(
+            Figure(
+                name, bar, sum(every), len(every), apart="; ".join(filter(None, [missed, apart]))
+            )
+        )
     return result
 
 
