@@ -44,6 +44,9 @@ from coax_env.vehicle import Parameter, Vehicle, load_vehicle
 
 HORIZON = 1.0  # s
 CALM = 5.0  # times the floor of a white level under which it is not worth a word
+FAR = 5.0
+"""Standard deviations that an unseen effect must move a number to be worth a word."""
+MOST_WARNINGS = 3
 FEW_RUNS = 4  # with fewer, the last third of each is held out
 Progress = Callable[[str], None]
 
@@ -191,7 +194,12 @@ def diagnose(
         whiteness={"before": white_before, "after": white_after},
         evidence_history=search.history,
         strongest=search.strongest,
-        remarks=tuple(remarks + _shaken(state) + _unusual(search, state)),
+        remarks=tuple(
+            remarks
+            + _shaken(state)
+            + _unusual(search, state)
+            + _rest_on(search, state, quadratic, ties)
+        ),
         noise=sensors,
         design=design,
     )
@@ -450,6 +458,37 @@ def _shaken(state: State) -> list[str]:
         "shaken by white noise beside the gusts, x and y, z:"
         f" force {xy:.2g}, {z:.2g} N s^1/2, moment {moment_xy:.2g}, {moment_z:.2g} N m s^1/2"
     ]
+
+
+def _rest_on(
+    search: Search, state: State, quadratic: Quadratic, ties: Mapping[str, Mapping[str, State]]
+) -> list[str]:
+    """Causes' numbers that an effect which these flights cannot show would change, in words.
+
+    An interval knows of what is in the model. A usual accelerometer scale is worth nothing on flights
+    that never leave 1 g, and is then in the accelerometer's bias.
+    """
+    free = search.free_names(state.active)
+    std = np.sqrt(np.diag(quadratic.covariance(free)))
+    worst: dict[str, tuple[float, str]] = {}
+    for unseen in search.candidates:
+        if unseen in state.active or any(unseen in others for others in ties.values()):
+            continue
+        for f in search.by_effect[unseen]:
+            if f.probe > 0.0:
+                continue
+            information, answers = quadratic.projected([f.name], free)
+            if 0.5 * float(information[0, 0]) * f.std**2 > EVIDENCE:
+                continue
+            for name, answer, own in zip(free, answers[:, 0], std, strict=True):
+                moved = abs(float(answer)) * f.std
+                if name.partition(".")[0] in state.active and moved > FAR * own:
+                    text = (
+                        f"{name} = {state.values[name]:.3g} holds without {unseen}: a usual {f.name}"
+                        f" ({f.std:.2g}) cannot be seen here and would move it by {moved:.2g}"
+                    )
+                    worst[name] = max(worst.get(name, (0.0, "")), (moved / float(own), text))
+    return [text for _, text in sorted(worst.values(), reverse=True)[:MOST_WARNINGS]]
 
 
 def _unusual(search: Search, state: State) -> list[str]:

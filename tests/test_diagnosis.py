@@ -203,6 +203,24 @@ def test_a_hidden_effect_is_found_among_all(tmp_path):
     check_vehicle_flies(result, tmp_path)
 
 
+@pytest.mark.slow
+def test_what_an_unseen_effect_would_change_is_said(tmp_path):
+    """Near 1 g a scale of the accelerometer is a bias: 0.02 of it 0.02 times gravity."""
+    folder = injector.fly(
+        tmp_path / "flight", {"accel_bias": {"x": 0.2, "y": -0.2, "z": 0.15}},
+        runs=("hover", "lon_3211"), seed=3,
+    )  # fmt: skip
+    only = all_but("accel_bias", "accel_scale", "gyro_bias")
+    result = find(folder, exclude=only)
+    assert [cause["effect"] for cause in result.findings["causes"]] == ["accel_bias"]
+    (said,) = [remark for remark in result.remarks if "cannot be seen here" in remark]
+    assert said.startswith("accel_bias.z = ") and "holds without accel_scale" in said
+    moved = float(said.rpartition(" ")[2])
+    assert moved == pytest.approx(0.02 * LAMA["gravity"].value, rel=0.1)
+    beside = find(folder, exclude=[*only, "accel_scale"])
+    assert not any("cannot be seen here" in remark for remark in beside.remarks)
+
+
 HIDDEN: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "nothing": ({}, dict(runs=(*ON_AXES, "heading_turn"), seed=2)),
     "nothing, in gusts": ({}, dict(runs=(*ON_AXES, "heading_turn"), gusts=True, seed=3)),
