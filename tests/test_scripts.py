@@ -301,17 +301,6 @@ def test_diagnose_writes_the_next_flight_of_a_tie(tmp_path):
     assert read_flight(out / "next_flight").run_names == (following["maneuver"],)
 
 
-@pytest.mark.slow
-def test_design_then_evaluate(tmp_path):
-    done = script("design_lqr.py", "--out", "lqr", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    done = script("evaluate.py", "--controller", "lqr/controller.json", "--episodes", "10",
-                  "--seconds", "8", cwd=tmp_path)  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    score = json.loads((tmp_path / "runs/evaluate/score.json").read_text())
-    assert score["episodes"] == 10 and score["success_rate"] > 0.5
-
-
 class Counted:
     """A vector env of three that counts its steps and takes a millisecond for each."""
 

@@ -92,7 +92,14 @@ def coax(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[...,
 
 
 @pytest.mark.slow
-def test_the_verbs_work_from_the_wheel(coax):
+def test_it_works_where_there_is_no_checkout(coax):
+    """One test: apart, two workers would each compile the kernel for an environment of its own."""
+    the_verbs_work(coax)
+    vehicles_flight_and_policy_have_come(coax)
+    the_readmes_lines_run(coax)
+
+
+def the_verbs_work(coax: Callable[..., Done]) -> None:
     said = coax("--help").stdout
     for verb in (
         "simulate",
@@ -113,8 +120,7 @@ def test_the_verbs_work_from_the_wheel(coax):
     coax("identify", "my/flight", "--method", "paper", "--out", "steps")  # reads published.toml
 
 
-@pytest.mark.slow
-def test_vehicles_flight_and_policy_come_with_the_wheel(coax):
+def vehicles_flight_and_policy_have_come(coax: Callable[..., Done]) -> None:
     found = coax(
         text="import json, coax_env; from pathlib import Path\n"
         "from coax_env.vehicle import shipped_vehicles\n"
@@ -129,8 +135,7 @@ def test_vehicles_flight_and_policy_come_with_the_wheel(coax):
     assert (runs, kind) == (12, "ppo") and {"lama400d", "skybotix_coax"} <= set(vehicles)
 
 
-@pytest.mark.slow
-def test_the_readmes_lines_run_from_the_wheel(coax):
+def the_readmes_lines_run(coax: Callable[..., Done]) -> None:
     """From a log to a better hover, as README has it, on a flight of a machine without effects."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     lines = re.search(r"```python\n(.*?)```", readme, re.DOTALL)
