@@ -49,6 +49,7 @@ def test_a_command_that_is_held_has_no_news():
     assert not closed_loop.surprise(known, np.zeros(900)).any()
 
 
+@pytest.mark.slow
 def test_without_gains_news_changes_nothing_and_a_gain_moves_its_state(tmp_path):
     injector.fly(tmp_path, {}, gusts=True, sensors="onboard", seed=5, runs=("hover",))
     search, state = search_on(tmp_path)

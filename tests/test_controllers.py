@@ -115,6 +115,7 @@ def test_margins_on_a_vehicle_without_spread_are_those_of_the_design(onboard):
 # --- filter ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_filters_error_has_the_spread_it_states(onboard):
     n = 40
     env = gymnasium.make_vec("CoaxHeli-v0", num_envs=n, vectorization_mode="vector_entry_point")

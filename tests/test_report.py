@@ -497,6 +497,7 @@ def two_steps():
     return identify(simulate(LAMA, "lon_doublet", sensors="paper"), method="paper")
 
 
+@pytest.mark.slow
 def test_two_step_page(two_steps):
     page = report.two_step_page(two_steps)
     outline = Outline(page)
