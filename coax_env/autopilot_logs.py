@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 
 from coax_env.errors import InputError, require
-from coax_env.flight import SHORTEST_RUN, Flight, Run, hold_last
+from coax_env.flight import LONGEST_RUN, SHORTEST_RUN, Flight, Run, hold_last
 from coax_env.layout import CHANNELS, RPM_PER_RAD_S
 from coax_env.log_units import ROTOR_COMMANDS, SWASH_COMMANDS
 
 ROWS = 100.0  # a second
-LONGEST_LOG = 24.0 * 3600.0  # s
 DEGREE = np.pi / 180.0
 Signal = tuple[np.ndarray, np.ndarray]
 """Times [s] and values, both (n,)."""
@@ -126,7 +125,7 @@ def import_log(
     begin = min(t[0] for t, _ in channels.values())
     channels = {name: (t - begin, values) for name, (t, values) in channels.items()}
     end = max(t[-1] for t, _ in channels.values())
-    if not end < LONGEST_LOG:
+    if not end < LONGEST_RUN:
         raise InputError(f"{path}: its time stamps run over {end:.3g} s, which no flight lasts")
     runs = []
     for k, (start, stop) in enumerate(cuts or [(0.0, end)], 1):

@@ -373,8 +373,9 @@ class Search:
         that part of the slope is no more than a bias, and is left out.
         """
         own = [f for e in state.active for f in self.by_effect[e]]
-        passes = self.engine.filter(state.values, state.noise)
-        if not own or not is_white(passes, self.model.channels):
+        if not own or not is_white(
+            self.engine.filter(state.values, state.noise), self.model.channels
+        ):
             return self.settle(state, MOST_STEPS, POLISH)
         free = self.free(state.active)
         names = [f.name for f in free]

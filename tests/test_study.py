@@ -317,7 +317,8 @@ def test_effects_that_cannot_show_are_left_off(
     monkeypatch.setattr(one_flight, "expected_evidence", expected)
     effects: dict[str, dict[str, float]] = {e: {} for e in ("wind", "rotor_drag", "gyro_bias")}
     flight = PlannedFlight("many", 0, effects, True, "full", 5, ("hover",))
-    assert list(one_flight.showing(flight, tmp_path).effects) == ["gyro_bias"]
+    planned, folder, _ = one_flight.showing(flight, tmp_path)
+    assert list(planned.effects) == ["gyro_bias"] and folder.parent == tmp_path
     assert flown == [["wind", "rotor_drag", "gyro_bias"], ["wind", "gyro_bias"], ["gyro_bias"]]
 
 

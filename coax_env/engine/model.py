@@ -68,7 +68,7 @@ class Model(Protocol):
     state_scale: np.ndarray  # (nx,) size of a small change of each state, for derivatives
     step: Any  # compiled pointer: (x, u, dt, p, work, out)
     measure: Any  # compiled pointer: (x, u, p, work, out)
-    drift_and_readings: Any  # compiled pointer: (x, u, dt, p, work, out), see below
+    drift_and_readings: Any  # compiled pointer: (x, u, dt, p, work, out), see above
     exact: np.ndarray  # (nx,) True where the drift is more than first order in dt
     work_size: int
 

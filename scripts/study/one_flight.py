@@ -62,8 +62,9 @@ def fly_and_diagnose(flight: PlannedFlight, only_own: bool = False) -> dict[str,
 
 def _result(planned: PlannedFlight, folder: Path, only_own: bool) -> dict[str, Any]:
     if planned.kind == "many":
-        planned = showing(planned, folder.parent)
-    truth = hide(planned, folder)
+        planned, folder, truth = showing(planned, folder.parent)
+    else:
+        truth = hide(planned, folder)
     flight = read_flight(folder)
     start = time.perf_counter()
     result = diagnose(flight)
@@ -119,9 +120,12 @@ def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
     raise RuntimeError(f"the pilot cannot fly {planned.effects}")
 
 
-def showing(planned: PlannedFlight, place: Path) -> PlannedFlight:
-    """The flight with those of its effects only that can be expected to show on it, all at once."""
-    while planned.effects:
+def showing(planned: PlannedFlight, place: Path) -> tuple[PlannedFlight, Path, dict[str, Any]]:
+    """The flight with those of its effects only that can be expected to show on it, all at once.
+
+    Returns the plan, the flight's folder and its truth.
+    """
+    while True:
         folder = place / f"with-{len(planned.effects)}"
         truth = hide(planned, folder)
         expected = expected_evidence(planned, read_flight(folder), truth, ())
@@ -131,9 +135,8 @@ def showing(planned: PlannedFlight, place: Path) -> PlannedFlight:
             if (expected[effect] or 0.0) > SURE * EVIDENCE
         }
         if len(shown) == len(planned.effects):
-            break
+            return planned, folder, truth
         planned = replace(planned, effects=shown)
-    return planned
 
 
 # --- what could have been known ---------------------------------------------------------------------
