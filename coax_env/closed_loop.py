@@ -62,7 +62,7 @@ def listen(search: Search, state: State) -> bool:
     gains = _gains(passes, _attach(search.engine, passes))
     search.loosen(gains)
     trial = replace(state, values={**dict.fromkeys(P.COMMAND_GAINS, 0.0), **state.values})
-    trial = search.settle(trial)
+    trial = search.settle(trial, tolerance=0.5 * TIE)
     if state.objective - trial.objective > TIE:
         search.say(f"the commands know of the gusts: {state.objective - trial.objective:.1f} nats")
         state.values, state.objective = trial.values, trial.objective

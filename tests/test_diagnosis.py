@@ -402,6 +402,26 @@ def test_hold_out_as_told(still):
     assert {run.name for run in result.replay_after} == {"lat_3211", "yaw_3211"}
 
 
+def test_the_held_out_runs_are_heard_in_the_end(still):
+    """What the vehicle file gets is what a fit on all runs finds, not that on the others alone."""
+    model = HeliModel(LAMA)
+    records = [record_of(run) for run in still.runs]
+    noise = starting_noise(still, LAMA)
+    search = Search(Engine(model, records[:2]), model, ())
+    few = State([], search.begin(noise).values, noise)
+    search.settle(few, steps=6, tolerance=0.01)
+    _, quadratic = search.linearise(few)
+    values, covariance = diagnosis._with_held_out(search, few, quadratic, records[2:])
+    whole = Engine(model, records).fit(search.free([]), few.values, noise, 6, 0.01)
+    std = np.array(list(whole.std.values()))
+    off = np.array([(values[n] - whole.values[n]) / whole.std[n] for n in whole.names])
+    before = np.array([(few.values[n] - whole.values[n]) / whole.std[n] for n in whole.names])
+    assert np.abs(off).max() < 0.25 < np.abs(before).max()
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std, rtol=0.1)
+    alone = np.sqrt(np.diag(quadratic.covariance(whole.names)))
+    assert (std / alone).min() < 0.9
+
+
 def test_the_choice_of_the_hold_out_does_not_look_at_residuals(still, monkeypatch):
     """With every innovation and slope blotted out, the same runs are chosen."""
 
