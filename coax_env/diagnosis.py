@@ -470,24 +470,28 @@ def _rest_on(
     """
     free = search.free_names(state.active)
     std = np.sqrt(np.diag(quadratic.covariance(free)))
+    named = {*state.active}.union(*ties.values())
+    unseen = [
+        f
+        for effect in search.candidates
+        if effect not in named
+        for f in search.by_effect[effect]
+        if f.probe == 0.0
+    ]
+    information, answers = quadratic.projected([f.name for f in unseen], free)
+    of_cause = np.array([name.partition(".")[0] in state.active for name in free], bool)
     worst: dict[str, tuple[float, str]] = {}
-    for unseen in search.candidates:
-        if unseen in state.active or any(unseen in others for others in ties.values()):
+    for f, known, answer in zip(unseen, np.diag(information), answers.T, strict=True):
+        if 0.5 * known * f.std**2 > EVIDENCE:
             continue
-        for f in search.by_effect[unseen]:
-            if f.probe > 0.0:
-                continue
-            information, answers = quadratic.projected([f.name], free)
-            if 0.5 * float(information[0, 0]) * f.std**2 > EVIDENCE:
-                continue
-            for name, answer, own in zip(free, answers[:, 0], std, strict=True):
-                moved = abs(float(answer)) * f.std
-                if name.partition(".")[0] in state.active and moved > FAR * own:
-                    text = (
-                        f"{name} = {state.values[name]:.3g} holds without {unseen}: a usual {f.name}"
-                        f" ({f.std:.2g}) cannot be seen here and would move it by {moved:.2g}"
-                    )
-                    worst[name] = max(worst.get(name, (0.0, "")), (moved / float(own), text))
+        moved = np.abs(answer) * f.std
+        for k in np.flatnonzero(of_cause & (moved > FAR * std)):
+            name, effect = free[k], f.name.partition(".")[0]
+            text = (
+                f"{name} = {state.values[name]:.3g} holds without {effect}: a usual {f.name}"
+                f" ({f.std:.2g}) cannot be seen here and would move it by {moved[k]:.2g}"
+            )
+            worst[name] = max(worst.get(name, (0.0, "")), (float(moved[k] / std[k]), text))
     return [text for _, text in sorted(worst.values(), reverse=True)[:MOST_WARNINGS]]
 
 

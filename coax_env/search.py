@@ -210,6 +210,15 @@ class Weight:
         return self.lost / self.colour
 
 
+@dataclass(frozen=True)
+class Offer:
+    """An effect that might be added: see Search.score. evidence: what EVIDENCE is compared with."""
+
+    effect: str
+    score: float
+    evidence: float
+
+
 @dataclass
 class Search:
     """The structure search over one set of records.
@@ -571,8 +580,9 @@ class Search:
         for _ in range(4 * MOST_CAUSES):
             passes, quadratic = self.linearise(state)
             promised, _ = quadratic.best(self.free_names(state.active))
-            ranked = self._ranked(state, quadratic, banned)
-            clear = not complete and ranked and ranked[0][0] > -CLEAR * promised
+            offers = self._offers(state, quadratic, banned)
+            strong = [offer for offer in offers if offer.evidence > EVIDENCE]
+            clear = not complete and strong and strong[0].score > -CLEAR * promised
             fitted = -promised <= PROMISE or settled
             if not fitted and not clear:
                 self.advance(state, passes, quadratic)
@@ -590,14 +600,14 @@ class Search:
             elif (
                 not complete
                 and failures < MOST_FAILURES
-                and self._add(state, passes, quadratic, ranked)
+                and self._add(state, passes, quadratic, strong)
             ):
                 if len(state.active) > most + 1:  # the one before held
                     most, failures = len(state.active) - 1, 0
                     banned = {e for e, count in drops.items() if count > 1}
             elif not complete and (
                 self._swap(state, quadratic, tried)
-                or self._add_near(state, quadratic, banned, tried)
+                or self._add_near(state, quadratic, offers, tried)
                 or self.look_for_buffet(state)
             ):
                 pass
@@ -662,10 +672,8 @@ class Search:
             trial = self.settle(State(list(active), state.values | values, state.noise))
             if trial.objective < state.objective - TIE and self.is_large(new, trial.values):
                 gained = state.objective - trial.objective
-                self.history.append((f"{old} -> {new}", gained))
+                self._take(state, trial, f"{old} -> {new}", gained)
                 self.say(f"{new} explains it better than {old}, by {gained:.1f} nats")
-                state.active, state.values = trial.active, trial.values
-                state.objective = trial.objective
                 return True
         return False
 
@@ -673,7 +681,7 @@ class Search:
         self,
         state: State,
         quadratic: Quadratic,
-        banned: Collection[str],
+        offers: Sequence[Offer],
         tried: set[tuple[str, ...]],
     ) -> bool:
         """Put in an effect that the quadratic nearly carries, where a fit says that it is worth it.
@@ -681,62 +689,55 @@ class Search:
         The quadratic at nothing is not that at the effect's size: a damping changes what the filter
         makes of gusts, and may be worth twice what its slope promised.
         """
-        near = []
-        for effect in self._addable(state, banned):
-            active = (*state.active, effect)
-            if active in tried or effects.CATALOGUE[effect].replaces:
-                continue
-            score, evidence, large = self.score(quadratic, state.active, effect)
-            if large and NEAR * EVIDENCE < evidence <= EVIDENCE:
-                near.append((score, effect, active))
-        for _, effect, active in sorted(near, reverse=True)[:3]:
-            tried.add(active)
+        near = [
+            offer.effect
+            for offer in offers
+            if NEAR * EVIDENCE < offer.evidence <= EVIDENCE
+            and not effects.CATALOGUE[offer.effect].replaces
+            and (*state.active, offer.effect) not in tried
+        ]
+        for effect in near[:3]:
+            active = [*state.active, effect]
+            tried.add(tuple(active))
             occam = quadratic.occam(self.candidate_names(effect), self.free_names(state.active))
-            trial = self.settle(self.moved(state, quadratic, list(active), {}))
+            trial = self.settle(self.moved(state, quadratic, active, {}))
             worth = state.objective - trial.objective - occam
             if worth > EVIDENCE and self.is_large(effect, trial.values):
-                self.history.append((f"+ {effect}", worth))
+                self._take(state, trial, f"+ {effect}", worth)
                 self.say(f"added {effect}: {worth:.1f} nats, once fitted")
                 self.strongest = max(self.strongest, (worth, effect))
-                state.active, state.values = trial.active, trial.values
-                state.objective = trial.objective
                 return True
         return False
 
-    def _addable(self, state: State, banned: Collection[str]) -> list[str]:
-        """Effects that are not in, and may be."""
-        return [
-            effect
-            for effect in self.candidates
-            if effect not in state.active
-            and effect not in banned
-            and not together(effect) & set(state.active)
-        ]
+    def _take(self, state: State, trial: State, move: str, gained: float) -> None:
+        """A trial becomes the state."""
+        self.history.append((move, gained))
+        state.active, state.values = trial.active, trial.values
+        state.objective = trial.objective
 
-    def _ranked(
-        self, state: State, quadratic: Quadratic, banned: Collection[str]
-    ) -> list[tuple[float, str]]:
-        """Effects that may be added, with their scores, the best first."""
-        ranked = []
-        for effect in self._addable(state, banned):
+    def _offers(self, state: State, quadratic: Quadratic, banned: Collection[str]) -> list[Offer]:
+        """Effects that are not in, may be, and promise something that matters; the best first."""
+        offers = []
+        for effect in self.candidates:
+            if effect in {*state.active, *banned} or together(effect) & set(state.active):
+                continue
             score, evidence, large = self.score(quadratic, state.active, effect)
             if large and score > 0.0:
                 self.strongest = max(self.strongest, (evidence, effect))
-                if evidence > EVIDENCE:
-                    ranked.append((score, effect))
-        return sorted(ranked, reverse=True)
+                offers.append(Offer(effect, score, evidence))
+        return sorted(offers, key=lambda offer: -offer.score)
 
     def _add(
         self,
         state: State,
         passes: Sequence[RunPass],
         quadratic: Quadratic,
-        ranked: Sequence[tuple[float, str]],
+        offers: Sequence[Offer],
     ) -> bool:
         """Put in the best effect that may be added, if there is one."""
-        if not ranked or len(state.active) >= MOST_CAUSES:
+        if not offers or len(state.active) >= MOST_CAUSES:
             return False
-        score, effect = ranked[0]
+        effect, score = offers[0].effect, offers[0].score
         self.history.append((f"+ {effect}", score))
         self.say(f"added {effect}: {score:.1f} nats")
         state.active = [*state.active, effect]

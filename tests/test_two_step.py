@@ -738,9 +738,9 @@ def clean_runs():
     ).runs  # fmt: skip
 
 
-def columns_of(run, vehicle=LAMA):
+def columns_of(run):
     dt, t, signals = even_grid(run, (*modes.IMU, "rpm_upper", "rpm_lower"))
-    return modes._columns(signals, run.command[: len(t)], dt, vehicle)
+    return modes._columns(signals, run.command[: len(t)], dt, LAMA)
 
 
 def test_columns_of_a_clean_flight_obey_the_model(clean_runs):
@@ -814,13 +814,13 @@ def test_errors_of_a_row_are_what_the_sensors_noise_does(clean_runs):
     (run,) = (run for run in clean_runs if run.name.startswith("lon_3211"))
     rng = np.random.default_rng(20)
     rows = rows_of(run, LAMA, NOISE, 5.0, seed=1)
-    clean = modes._columns(*signals_of(run)[1:])
+    clean = columns_of(run)
     scatter = {name: [] for name in rows.errors}
     for _ in range(12):
         shaken = {
             c: v + NOISE.get(c, 0.0) * rng.standard_normal(v.shape) for c, v in run.measured.items()
         }
-        noisy = modes._columns(*signals_of(replace(run, measured=shaken))[1:])
+        noisy = columns_of(replace(run, measured=shaken))
         for name, values in scatter.items():
             values.append(low_pass(noisy[name] - clean[name], 0.01)[50:-50])
     for name in ("q", "alpha_u", "alpha_l", "T_u", "C_X", "C_Z", "C_m", "driven_y"):
@@ -828,11 +828,6 @@ def test_errors_of_a_row_are_what_the_sensors_noise_does(clean_runs):
         assert ratio == pytest.approx(1.0, abs=0.15), name
         assert rows.errors[name].shape == (len(rows.t), modes.DRAWS)
     assert rows.t[0] == pytest.approx(0.5, abs=0.01) and rows.lengths == (len(rows.t),)
-
-
-def signals_of(run):
-    dt, t, signals = even_grid(run, (*modes.IMU, "rpm_upper", "rpm_lower"))
-    return t, signals, run.command[: len(t)], dt, LAMA
 
 
 def test_a_number_is_joined_with_the_files_own_by_precision():
