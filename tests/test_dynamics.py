@@ -260,6 +260,19 @@ def test_trim_finds_the_tilt_that_offsets_ask_for():
     assert command[0] < hover_trim(LAMA)[1][0]  # the ground carries a part
 
 
+def test_balance_is_found_in_few_looks():
+    """Newton's method doubles the right digits at each step; a kink's solver would look on."""
+    looks = []
+
+    def residual(z):
+        looks.append(z)
+        return np.array([math.exp(z[0]) - z[1], z[0] + z[1] ** 2 - 1.0])
+
+    found = dynamics._balance(residual, np.array([0.3, 1.6]))
+    assert found == pytest.approx([0.0, 1.0], abs=1e-9)
+    assert len(looks) <= 6 * (2 * 2 + 2)
+
+
 def test_a_vehicle_that_cannot_hover_says_so():
     from coax_env import InputError
 
@@ -628,6 +641,26 @@ def test_spin_up_reaction_keeps_the_angular_momentum():
     assert momentum(end) == pytest.approx(momentum(start), rel=1e-9)
 
 
+def test_a_reading_sees_the_rotors_speed_up_each_with_its_own_lag():
+    """Off the axis, the accelerometer reads the yaw that N = g ((J_u + J_f) w_u' - J_l w_l') makes."""
+    arm, lags = 0.2, np.array([0.06, 0.11])
+    vehicle = LAMA.with_effect("motor_lag", upper=lags[0], lower=lags[1])
+    vehicle = vehicle.with_effect("imu_lever_arm", x=arm, y=0.0, z=0.0)
+    x, command = dynamics.full_state(*hover_trim(LAMA), LAMA), hover_trim(LAMA)[1]
+    x[16:18] += -20.0, 15.0
+    ay = []
+    for gain in (0.0, 1.0):
+        out, work = np.zeros(len(CHANNELS)), np.zeros(dynamics.WORK_SIZE)
+        values = vehicle.with_effect("spin_up_reaction", gain=gain).vector
+        dynamics.measure(x, dynamics.kernel_input(command), values, work, out)
+        ay.append(out[list(CHANNELS).index("ay")])
+    v = LAMA.values()
+    speeding = (command[:2] - x[16:18]) / lags
+    moment = (v["rotor_inertia_upper"] + v["flybar_inertia"]) * speeding[0]
+    moment -= v["rotor_inertia_lower"] * speeding[1]
+    assert ay[1] - ay[0] == pytest.approx(arm * moment / v["inertia_zz"], rel=0.02)
+
+
 def test_servo_delay_is_a_shift_of_the_input_not_of_the_kernel():
     state, command = random_state(0)
     late = LAMA.with_effect("servo_delay", time=0.05)
@@ -873,6 +906,25 @@ def test_an_edited_callee_is_compiled_anew(tmp_path):
     second = run()
     assert second[0] != first[0]
     assert second[1] == pytest.approx(-3.0)
+
+
+@pytest.mark.parametrize("lag", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
+def test_no_index_leaves_its_array(lag, tmp_path):
+    """Compiled code does not look; with numba's bounds checks it does."""
+    program = (
+        "import numpy as np, coax_env; from coax_env import dynamics as d;"
+        "v = coax_env.load_vehicle('lama400d');"
+        f"v = v.with_effect('motor_lag', upper={lag}, lower={lag});"
+        "x, u = np.ones(26), d.kernel_input(np.full(4, 200.0));"
+        "work, readings = np.zeros(d.WORK_SIZE), np.zeros(18);"
+        "d.step(x, u, 0.03, v.vector, work, x); d.measure(x, u, v.vector, work, readings);"
+        "print(np.isfinite(x).all() and np.isfinite(readings).all())"
+    )
+    checked = os.environ | {"NUMBA_BOUNDSCHECK": "1", "COAX_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=checked, capture_output=True, text=True
+    )
+    assert done.stdout.strip() == "True", done.stderr
 
 
 def test_paper_states_are_the_first_sixteen():

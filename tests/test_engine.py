@@ -16,7 +16,15 @@ from scipy.signal import lfilter
 from scipy.stats import binom, multivariate_normal
 
 from coax_env.engine import kalman
-from coax_env.engine.fit import REFRESH, Engine, Estimate, RunPass, bounded_solve, newton_step
+from coax_env.engine.fit import (
+    REFRESH,
+    Engine,
+    Estimate,
+    Linearised,
+    RunPass,
+    bounded_solve,
+    newton_step,
+)
 from coax_env.engine.model import FreeParameter, Noise, Record
 from coax_env.engine.whiteness import whiteness
 from coax_env.jit import pointer
@@ -131,13 +139,13 @@ def exact_log_likelihood(record: Record, noise: Noise) -> float:
     """All readings of a record as one Gaussian vector."""
     n = record.t.size
     k, d = TRUTH["stiffness"], TRUTH["damping"]
-    F = np.array([[1.0 - DT * DT * k, DT - DT * DT * d], [-DT * k, 1.0 - DT * d]])
-    G = np.array([DT * DT, DT])
+    dt = np.append(np.diff(record.t), DT)
+    F = [np.array([[1.0 - h * h * k, h - h * h * d], [-h * k, 1.0 - h * d]]) for h in dt]
     H = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
-    Q = np.diag([0.0, noise.process["torque"] ** 2 * DT])
     mean = [Pendulum.start_at]
     for row in range(n - 1):
-        mean.append(F @ mean[-1] + G * record.command[row, 0])
+        pushed = np.array([dt[row] ** 2, dt[row]]) * record.command[row, 0]
+        mean.append(F[row] @ mean[-1] + pushed)
     blocks = np.zeros((n, 2, n, 2))
     P = np.diag(Pendulum.start_std**2)
     for row in range(n):
@@ -145,8 +153,9 @@ def exact_log_likelihood(record: Record, noise: Noise) -> float:
         for later in range(row, n):
             blocks[later, :, row, :] = cross
             blocks[row, :, later, :] = cross.T
-            cross = F @ cross
-        P = F @ P @ F.T + Q
+            cross = F[later] @ cross
+        Q = np.diag([0.0, noise.process["torque"] ** 2 * dt[row]])
+        P = F[row] @ P @ F[row].T + Q
     stacked = np.kron(np.eye(n), H)
     R = np.diag(np.tile([noise.reading[c] ** 2 for c in CHANNELS], n))
     covariance = stacked @ blocks.reshape(2 * n, 2 * n) @ stacked.T + R
@@ -175,12 +184,37 @@ def test_likelihood_is_that_of_the_stacked_gaussian(holes):
     )
 
 
+def test_likelihood_of_uneven_rows():
+    """A clock that jitters, between new Jacobians too: each row's own step, to first order."""
+    record = swing(1, n=70, torque=1.0)
+    jitter = np.random.default_rng(2).uniform(0.7, 1.3, 70)
+    record = replace(record, t=DT * np.cumsum(jitter))
+    engine = Engine(Pendulum(), [record])
+    loud = replace(NOISE, process={"torque": 2.0})
+    assert engine.log_likelihood(TRUTH, loud) == pytest.approx(
+        exact_log_likelihood(record, loud), abs=0.02
+    )
+
+
 def test_records_add_up():
     records = [swing(seed, n=200) for seed in range(3)]
     whole = Engine(Pendulum(), records)
     parts = [Engine(Pendulum(), [r]).log_likelihood(TRUTH, NOISE) for r in records]
     assert whole.log_likelihood(TRUTH, NOISE) == pytest.approx(sum(parts))
     assert whole.log_likelihood(TRUTH, NOISE, which=[2]) == pytest.approx(parts[2])
+
+
+def test_the_clock_may_start_anywhere():
+    """A log that begins in the middle of a flight: same likelihood, slopes and stretches."""
+    record = with_holes(swing(4), 0.2, 6)
+    found = []
+    for start in (0.0, 137.0):
+        engine = Engine(Pendulum(), [replace(record, t=record.t + start)])
+        log_likelihood, by_noise, by_start = engine.noise_score(TRUTH, NOISE)
+        _, lin = engine.linearise(TRUTH, NOISE, [prior("damping", 0.3)])
+        found.append((np.array(log_likelihood), by_noise, by_start, lin.slope, lin.stretches))
+    for first, later in zip(*found, strict=True):
+        np.testing.assert_allclose(first, later, rtol=1e-6, atol=1e-6)
 
 
 def test_innovations_of_the_truth_are_white_with_unit_variance():
@@ -542,6 +576,24 @@ def test_newton_step_promises_what_a_quadratic_gives():
     assert step[0] == pytest.approx(0.1, abs=0.02)
 
 
+def test_newton_step_weighs_the_data_against_the_prior():
+    """Two Gaussians: the optimum is their mean by precision, wherever the step starts."""
+    information, slope, start = 4.0, 3.0, 2.5
+    lin = Linearised(
+        ("bias",), np.full((1, 1, 1), information), np.full((1, 1), slope), np.empty((1, 1, 1)),
+        np.empty((1, 1)),
+    )  # fmt: skip
+    step, promised = newton_step(lin, [prior("bias", 0.4, 1.0)], {"bias": start})
+    data, precision = start - slope / information, 0.4**-2
+    best = (information * data + precision * 1.0) / (information + precision)
+
+    def cost(bias: float) -> float:
+        return 0.5 * information * (bias - data) ** 2 + 0.5 * precision * (bias - 1.0) ** 2
+
+    assert start + step[0] == pytest.approx(best)
+    assert promised == pytest.approx(cost(start) - cost(best))
+
+
 # --- whiteness -----------------------------------------------------------------------------------
 
 
@@ -559,6 +611,14 @@ def test_white_noise_is_white():
         e[::3, 1] = np.nan
         judged = whiteness([a_pass(e)], ("a", "b"))
         assert judged["a"].white and judged["b"].white
+
+
+def test_p_values_of_white_noise_are_uniform():
+    """Also of eighty readings, where Box and Pierce's statistic would be an eighth too small."""
+    draws = np.random.default_rng(5).standard_normal((400, 181, 1))
+    p_values = [whiteness([a_pass(e)], ("a",))["a"].p_value for e in draws]
+    assert np.mean(p_values) == pytest.approx(0.5, abs=0.05)
+    assert np.mean(np.array(p_values) < 0.25) == pytest.approx(0.25, abs=0.07)
 
 
 @pytest.mark.parametrize("pole", [0.4, -0.4, 0.9])

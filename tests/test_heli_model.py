@@ -265,6 +265,6 @@ def test_what_may_be_fitted_lies_within_its_bounds():
         for free, own in zip(MODEL.effect_parameters(name), entry.parameters, strict=True):
             assert own.lower <= free.lower <= own.off <= free.upper <= own.upper
             assert free.reading_only == (entry.stage == effects.SENSOR)
-            reach = max(free.upper - own.off, own.off - free.lower)
-            assert reach <= FARTHEST * own.usual * (1.0 + 1e-12)
-            assert reach == pytest.approx(FARTHEST * own.usual) or math.isfinite(own.upper)
+            farthest = FARTHEST * own.usual
+            assert free.upper - own.off == pytest.approx(min(farthest, own.upper - own.off))
+            assert own.off - free.lower == pytest.approx(min(farthest, own.off - own.lower))

@@ -339,6 +339,24 @@ def test_turbulence_rides_on_the_steady_wind():
     assert abs(up) < 0.2  # rotor drag lies in the rotor's plane
 
 
+def test_eddies_are_as_large_as_the_height_flown_at():
+    """Dryden's lengths grow with height: what changes in a tenth of a second is a smaller part."""
+    changes = []
+    for height in (3.0, 5.7):
+        env = CoaxVectorEnv(400, DRAGGED, turbulence=5.0)
+        env.reset(seed=3)
+        env.fleet.x[:, 15] = -height
+        air = []
+        for _ in range(11):
+            env.step(np.zeros((400, 4)))
+            air.append(env.fleet.air.copy())
+        change = np.mean((air[-1] - air[0])[:, :2] ** 2)
+        changes.append(change / np.mean(np.square(air)[..., :2]))
+    (_, _, low, _), (_, _, high, _) = dryden(3.0, 5.0), dryden(5.7, 5.0)
+    assert changes[0] / changes[1] == pytest.approx(high / low, rel=0.15)
+    assert high / low > 1.4
+
+
 def test_a_downdraught_pushes_a_vehicle_that_has_axial_damping():
     vehicle = LAMA.with_effect("axial_damping", coefficient=0.1)
     values = vehicle.vector.copy()

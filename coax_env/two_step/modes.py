@@ -229,7 +229,7 @@ def rows_of(
     """A run's low-passed columns, and what the sensors' noise does to them."""
     rng = np.random.default_rng(seed)
     dt, t, signals = even_grid(run, (*IMU, "rpm_upper", "rpm_lower"))
-    held = np.clip(np.searchsorted(run.t, t + 1e-9, side="right") - 1, 0, len(run.t) - 1)
+    held = np.searchsorted(run.t, t + 1e-9, side="right") - 1
     command = run.command[held]
     edge = round(EDGE / dt)
     kept = slice(edge, len(t) - edge)
