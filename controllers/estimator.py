@@ -42,6 +42,7 @@ INTEGRAL_TIME = {"height": 1.5, "heading": 1.5, "position": 6.0}
 _WINDUP = 20.0  # integrals stop at so many
 _FREE_OF_NOISE = 1e-4  # std given to exact sensors, of their unit
 _ROWS_SEEN = 500
+_RUNS_ALONG = 0.05  # component of a unit direction from which it runs along a state
 _FIRST_STD = {"m": 1.0, "m/s": 1.0, "rad": 0.1, "rad/s": 0.5, "N": 1.0, "N m": 0.05}
 _PROCESS_STD = {"m": 1e-5, "m/s": 1e-3, "rad": 2e-4, "rad/s": 2e-3, "N": 0.0, "N m": 0.0}
 _PAIRS = (("vn", "ve"), ("pn", "pe"), ("x", "y"))
@@ -462,9 +463,8 @@ def _unobserved(
     within = blind.T @ A_scaled @ blind  # the blind directions map onto themselves
     _, basis, lasts = schur(within, sort=lambda re, im=0.0: math.hypot(re, im) > 0.9995)
     lasting = blind @ basis[:, :lasts]
-    return tuple(
-        name for name, row in zip(_NAMES, lasting, strict=True) if np.abs(row).max(initial=0) > 0.05
-    )
+    shares = np.abs(lasting).max(axis=1, initial=0.0)
+    return tuple(n for n, share in zip(_NAMES, shares, strict=True) if share > _RUNS_ALONG)
 
 
 def _gains(

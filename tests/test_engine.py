@@ -70,6 +70,12 @@ def _drift_and_readings(x, u, dt, p, work, out):
     out[4] = x[RATE]
 
 
+@pointer(types.void(_A, _A, types.float64, _A, _A, _A))
+def _quadruple(x, u, dt, p, work, out):
+    for i in range(x.size):
+        out[i] = 4.0 * x[i]
+
+
 class Pendulum:
     """The model, through the engine's protocol."""
 
@@ -356,6 +362,30 @@ def test_uneven_rows_are_followed():
     # the command inside a longer row is not known, so only the state is compared, loosely
     error = run.states - full.states[rows]
     assert np.sqrt(np.mean(error[50:] ** 2, 0)) == pytest.approx(0.0, abs=0.25)
+
+
+@pytest.mark.parametrize("rate", [0.1, 3.0])
+def test_jacobian_of_a_step_is_the_exponential_of_that_of_the_drift(rate):
+    """To third order; rows that the drift takes exactly are I + A; a stiff row has the step's own."""
+    nx = 3
+    exact = np.array([False, True, False])
+    A = np.zeros((nx, kalman.BLOCK))
+    A[:, :nx] = [[-rate, 0.4, 0.0], [0.0, 0.1, 0.2], [0.3, 0.0, -0.2]]
+    AA, F = np.zeros_like(A), np.zeros_like(A)
+    places, counts = np.zeros((nx, nx), int), np.zeros(nx, int)
+    x = np.array([0.3, -0.2, 0.5])
+    kalman._transition(
+        _quadruple, exact, x, np.zeros(1), 0.1, np.zeros(1), np.zeros(1), np.full(nx, 1e-3), 4.0 * x,
+        np.zeros(nx), A, AA, places, counts, F,
+    )  # fmt: skip
+    a = A[:, :nx]
+    expected = np.eye(nx) + a + a @ a / 2.0 + a @ a @ a / 6.0
+    expected[exact] = (np.eye(nx) + a)[exact]
+    if rate > kalman.MOST_DECAY:
+        expected = 4.0 * np.eye(nx)
+    np.testing.assert_allclose(F[:, :nx], expected, rtol=1e-9, atol=1e-12)
+    for i in range(nx):
+        assert set(places[i, : counts[i]]) == set(np.flatnonzero(F[i]))
 
 
 # --- signatures ----------------------------------------------------------------------------------

@@ -290,3 +290,15 @@ def test_a_heading_that_crosses_the_seam_brings_no_surprise(onboard):
         tracker.acted(-tracker.offset[None] / onboard.action_scale)
         assert -math.pi <= tracker.state[0, at] < math.pi
         assert abs((known - psi + math.pi) % (2.0 * math.pi) - math.pi) < 0.1, k
+
+
+@pytest.mark.parametrize(("share", "named"), [(0.03, False), (0.07, True), (0.6, True)])
+def test_a_blind_direction_is_told_by_the_states_it_runs_along(share, named):
+    """One direction across two states that nothing reads, and that stays: both are unobserved."""
+    n = len(estimator._NAMES)
+    blind = np.zeros(n)
+    blind[3], blind[7] = math.sqrt(1.0 - share**2), share
+    C = np.linalg.svd(blind[None])[2][1:]  # reads all that is across it
+    found = estimator._unobserved(np.eye(n), C, np.ones(n), np.ones(n - 1))
+    assert found == tuple(estimator._NAMES[i] for i in ((3, 7) if named else (3,)))
+    assert not estimator._unobserved(0.9 * np.eye(n), C, np.ones(n), np.ones(n - 1))  # it heals

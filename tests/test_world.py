@@ -299,6 +299,19 @@ def test_a_servos_delay_splits_the_period_where_it_must(delay):
 
 
 @pytest.mark.parametrize("count", [3, 19], ids=["one by one", "in lanes"])
+def test_what_is_under_way_in_a_late_servo_at_reset_is_the_trim(count):
+    """A machine rigged askew hovers with its plate tilted: nothing moves before a command does."""
+    rigged = LAMA.with_effect("swash_offset", lon=0.03, lat=-0.02)
+    env = CoaxVectorEnv(count, rigged.with_effect("servo_delay", time=0.03), nominal=rigged)
+    trim, command = dynamics.hover_trim(rigged)
+    assert np.abs(command[2:]).min() > 0.01
+    env.reset(seed=0, options={"state": np.tile(trim, (count, 1))})
+    for _ in range(6):
+        state = env.step(np.zeros((count, 4)))[4]["state"]
+    np.testing.assert_allclose(state[:, :16], np.tile(trim, (count, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [3, 19], ids=["one by one", "in lanes"])
 @pytest.mark.parametrize("gusts", [(0.2, 0.0), (0.0, 0.01)])
 def test_gusts_of_force_or_of_moment_alone_blow(gusts, count):
     env = CoaxVectorEnv(count, gusts=gusts)

@@ -537,7 +537,7 @@ def signature_pass(
             measure(predicted[row], u_sets[u_of[k], row], moved[k], work, h_here)
             for i in range(m):
                 dv[i, k] = (h_base[i] - h_here[i]) * per_step[k]
-            if not reading_only[k] and row < n - 1:
+            if not reading_only[k]:
                 both(states[row], u_sets[u_of[k], row], dt[row], moved[k], work, here)
                 for i in range(nx):
                     b[i, k] = (here[i] - base[i]) * per_step[k]
