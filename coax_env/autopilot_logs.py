@@ -11,6 +11,7 @@ named by the caller, ``rpm_upper_cmd = actuator_outputs.output[0] * 2.1 - 1800``
 motor controllers report are found without.
 """
 
+import io
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,6 +28,7 @@ from coax_env.layout import CHANNELS, RPM_PER_RAD_S
 from coax_env.log_units import ROTOR_COMMANDS, SWASH_COMMANDS
 
 ROWS = 100.0  # a second
+MOST_READ = 20  # times that a reader may read each byte of a log
 DEGREE = np.pi / 180.0
 Signal = tuple[np.ndarray, np.ndarray]
 """Times [s] and values, both (n,)."""
@@ -195,7 +197,11 @@ def _run(name: str, channels: Mapping[str, Signal], start: float, stop: float, p
         if source is None:
             continue
         place = np.clip(np.searchsorted(source[0], t, side="right") - 1, 0, len(source[0]) - 1)
-        command[:, k] = hold_last(source[1][place])
+        values = source[1][place]
+        given = np.isfinite(values)
+        if not given.any():
+            raise InputError(f"{path}: no number among the values of {name_of} in run {name!r}")
+        command[:, k] = hold_last(np.where(given, values, np.nan))
     command[:, :2] /= RPM_PER_RAD_S
     return Run(name, t - t[0], command, measured, "imported", f"from {path.name}")
 
@@ -214,7 +220,7 @@ def _binned(signal: Signal, t: np.ndarray, step: float, last: bool) -> np.ndarra
     count = np.bincount(row, minlength=len(t))
     total = np.bincount(row, values, minlength=len(t))
     column[count > 0] = total[count > 0] / count[count > 0]
-    return column
+    return np.where(np.isfinite(column), column, np.nan)  # a sum of huge numbers is none
 
 
 @contextmanager
@@ -236,6 +242,22 @@ def _silence() -> Iterator[None]:
 # --- readers ------------------------------------------------------------------------------------------
 
 
+class _Bounded(io.BufferedReader):
+    """A file that can be read MOST_READ times over: at some broken ends pyulog goes round for ever."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._left = MOST_READ * path.stat().st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As a file's."""
+        data = super().read(size)
+        self._left -= len(data)
+        if self._left < 0:
+            raise RuntimeError("its end is broken")
+        return data
+
+
 def px4_signals(path: Path) -> dict[str, Signal]:
     """Every numeric field of a ULog as ``topic.field``; also phi theta psi and height.
 
@@ -243,7 +265,8 @@ def px4_signals(path: Path) -> dict[str, Signal]:
     """
     ulog = require("pyulog", "logs")
     try:
-        log = ulog.ULog(str(path))
+        with _Bounded(path) as file:
+            log = ulog.ULog(file)
     except Exception as error:  # pyulog raises whatever it stumbles over
         raise InputError(f"{path}: not a ULog that pyulog can read ({error})") from None
     signals: dict[str, Signal] = {}

@@ -1,5 +1,6 @@
 """Autopilot logs (autopilot_files.py) through the importers."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,34 @@ def test_what_is_missing_is_said_in_one_line(tmp_path):
     (tmp_path / "junk.ulg").write_bytes(b"not a log at all")
     with pytest.raises(InputError, match="not a ULog"):
         import_log(tmp_path / "junk.ulg", "lama400d")
+
+
+def test_an_end_that_leads_back_into_the_log_is_an_end(tmp_path):
+    """A last message that says to be longer than the file: pyulog steps back, and comes there again."""
+    pytest.importorskip("pyulog")
+    text = b"esc_status:uint64_t timestamp;"
+    said, left = 3 + len(text) + 1 + 5, 5
+    log = ulog({}) + struct.pack("<Hc", len(text), b"F") + text + struct.pack("<HB", said, 0)
+    with pytest.raises(InputError, match="its end is broken"):
+        import_log(written(tmp_path / "log.ulg", log + bytes(left)), "lama400d")
+
+
+def test_a_speed_that_is_no_number_is_the_one_before(tmp_path):
+    """Infinite, or too large for a number; a rotor without any number is refused."""
+    pytest.importorskip("pymavlink")
+    sound = dataflash()
+    lines = sound.splitlines()
+    speeds = [k for k, line in enumerate(lines) if line.startswith("RPM,")]
+    for k in speeds[10:15]:
+        lines[k] = lines[k].replace(", 2130.0", ", 1e999")
+    assert "\n".join(lines).count("1e999") == 5
+    (run,) = import_log(written(tmp_path / "log.log", "\n".join(lines)), "lama400d").runs
+    assert run.command[:, 1] * RPM_PER_RAD_S == pytest.approx(2130.0)
+    assert np.isfinite(run.measured["rpm_lower"]).mean() > 0.05
+    assert not np.isinf(run.measured["rpm_lower"]).any()
+    none = sound.replace(", 2130.0", ", nan")
+    with pytest.raises(InputError, match="no number among the values of rpm_lower_cmd"):
+        import_log(written(tmp_path / "none.log", none), "lama400d")
 
 
 def test_a_log_of_another_kind_is_refused(tmp_path):
