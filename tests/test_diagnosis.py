@@ -532,6 +532,7 @@ def test_a_very_wrong_model_does_not_crash(still):
 # --- identification --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_moved_parameters_return(still, tmp_path):
     names = ["thrust_coefficient_upper", "torque_coefficient_lower", "swash_to_flap"]
     moved = LAMA.with_values({name: 1.03 * LAMA[name].value for name in names})

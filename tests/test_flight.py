@@ -214,6 +214,7 @@ def test_real_motion_stays() -> None:
     assert not find_outliers("psi", heading, 0.0087).any()
 
 
+@pytest.mark.slow
 @pytest.mark.needs_shared_flights
 def test_open_flights_lose_nothing_genuine() -> None:
     for name in ("open_none", "open_near_ground", "open_rigging", "open_outside"):

@@ -116,6 +116,7 @@ def test_a_frozen_and_a_saturated_sensor_are_told():
 # --- what can be learned --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_is_not_excited_stays_hidden():
     """At one height nothing tells ground effect from a constant; a descent to the ground does."""
     hover = {e.effect: e for e in checked("hover").effects}

@@ -63,6 +63,7 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
                                                    + np.cross(a[1:], b[1:]))])  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.needs_shared_flights
 def test_a_flight_of_it_looks_like_open_none(tmp_path: Path) -> None:
     """Same noise reading to reading, and the same order of motion."""

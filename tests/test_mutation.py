@@ -60,6 +60,7 @@ def test_axes_are_swapped_by_name():
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_every_mutation_of_the_code_is_another_program_with_a_name_of_its_own():
     found = draw.all_sites(ROOT)
     assert len({m.name for m in found}) == len(found) > 2000
@@ -141,6 +142,7 @@ def toy(tmp_path, monkeypatch):
     return root, call
 
 
+@pytest.mark.slow
 def test_what_the_tests_ask_for_is_caught_and_the_rest_is_not(toy):
     root, call = toy
     result = call()

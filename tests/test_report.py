@@ -330,11 +330,13 @@ def seen(made):
     return browser.visit(made / "report.html", look)
 
 
+@pytest.mark.slow
 @browser.needed
 def test_the_console_is_silent(seen):
     assert seen["faults"] == []
 
 
+@pytest.mark.slow
 @browser.needed
 def test_every_figure_is_drawn(seen):
     for screen in ("desk", "phone", "dark", "paper"):
@@ -344,6 +346,7 @@ def test_every_figure_is_drawn(seen):
     assert len(seen["choices"]) > 6 and all(traces for _, traces in seen["choices"])
 
 
+@pytest.mark.slow
 @browser.needed
 def test_every_number_shown_is_that_of_findings_json(seen, made):
     findings = json.loads((made / "findings.json").read_text())
@@ -369,6 +372,7 @@ def test_every_number_shown_is_that_of_findings_json(seen, made):
     assert {f"gain/{key}" for key in whole} <= shown
 
 
+@pytest.mark.slow
 @browser.needed
 def test_the_page_fits_a_phone(seen):
     for screen in ("phone", "dark"):
@@ -378,6 +382,7 @@ def test_the_page_fits_a_phone(seen):
     assert all(seen[screen]["smallest"] >= 13.9 for screen in ("desk", "phone", "dark"))
 
 
+@pytest.mark.slow
 @browser.needed
 def test_the_reader_chooses_light_or_dark(seen):
     grounds, inks = [], []
@@ -389,6 +394,7 @@ def test_the_reader_chooses_light_or_dark(seen):
     assert inks[1] == {figures.template(True)["layout"]["font"]["color"]}
 
 
+@pytest.mark.slow
 @browser.needed
 def test_the_page_prints(seen):
     """Figures fit the sheet, the tables are open, nothing is left to click; all as before after."""
@@ -399,6 +405,7 @@ def test_the_page_prints(seen):
     assert seen["pdf"].startswith(b"%PDF") and len(seen["pdf"]) > 50_000
 
 
+@pytest.mark.slow
 @browser.needed
 def test_the_flight_is_replayed(seen):
     played = seen["played"]
@@ -412,6 +419,7 @@ def test_the_flight_is_replayed(seen):
         assert re.fullmatch(r"bare [\d.]+ m off, extended [\d.]+ m off", text)
 
 
+@pytest.mark.slow
 @browser.needed
 def test_a_finger_turns_the_flight(seen):
     assert len(set(seen["touched"])) == 3

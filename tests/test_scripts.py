@@ -213,7 +213,16 @@ def test_a_bad_request_is_refused(what, sound_text, here, tmp_path):
     check_refused(here(name, *words), tmp_path, *said)
 
 
-@pytest.mark.parametrize("what", ["no flight", "no such controller", "no such option"])
+@pytest.mark.parametrize(
+    "what",
+    [
+        "no flight",
+        *(
+            pytest.param(w, marks=pytest.mark.slow)
+            for w in ("no such controller", "no such option")
+        ),
+    ],
+)
 def test_it_is_refused_in_a_process_of_its_own(what, tmp_path):
     (name, *words), said = REQUESTS[what]
     check_refused(script(name, *words, cwd=tmp_path), tmp_path, *said)
@@ -322,7 +331,9 @@ def test_a_rate_counts_every_env_and_no_warm_up():
     assert env.steps % timing.BATCHES == 0 and env.steps > timing.BATCHES
 
 
-@pytest.mark.parametrize("mode", ["one", "many", "kernel", "start"])
+@pytest.mark.parametrize(
+    "mode", ["one", *(pytest.param(m, marks=pytest.mark.slow) for m in ("many", "kernel", "start"))]
+)
 def test_our_program_flies_in_every_mode(mode):
     import benchmark
 

@@ -401,6 +401,7 @@ def test_without_excitation_it_is_not_trusted():
     assert total(*noisy_rows(0, 1000, False)).trusted
 
 
+@pytest.mark.slow
 def test_with_draws_the_std_is_the_scatter_in_gusts_too():
     """A gust in y remembers twenty rows: what the errors alone make is then far too small a std."""
     errors = np.diag([0.1, 0.1]) ** 2
