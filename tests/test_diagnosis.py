@@ -165,6 +165,7 @@ def test_a_polished_fit_is_at_the_top_of_the_likelihood(tmp_path):
         assert abs(slope) < 0.35, name
 
 
+@pytest.mark.slow
 def test_what_the_quadratic_nearly_carries_is_fitted_to_see(tmp_path, monkeypatch):
     """A damping in gusts is worth more than its slope at nothing promised: found all the same."""
     folder = injector.fly(
@@ -500,6 +501,7 @@ def test_the_true_model_predicts_as_well_as_the_sensors_see(still):
         assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.35, (channel, ratios)
 
 
+@pytest.mark.slow
 def test_the_horizon_is_the_callers(still):
     """A wrong model is worse the further it looks."""
     wrong = LAMA.with_values({"thrust_coefficient_upper": 0.95 * 0.00718})

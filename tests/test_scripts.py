@@ -213,16 +213,8 @@ def test_a_bad_request_is_refused(what, sound_text, here, tmp_path):
     check_refused(here(name, *words), tmp_path, *said)
 
 
-@pytest.mark.parametrize(
-    "what",
-    [
-        "no flight",
-        *(
-            pytest.param(w, marks=pytest.mark.slow)
-            for w in ("no such controller", "no such option")
-        ),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["no flight", "no such controller", "no such option"])
 def test_it_is_refused_in_a_process_of_its_own(what, tmp_path):
     (name, *words), said = REQUESTS[what]
     check_refused(script(name, *words, cwd=tmp_path), tmp_path, *said)

@@ -689,6 +689,7 @@ def fits_of(flight, vehicle=LAMA):
     return {fit.mode.name: fit for fit in fits if fit is not None}
 
 
+@pytest.mark.slow
 def test_coefficients_of_the_doublet_are_those_of_the_physics():
     """Paper's tables, Table V noise: forces within 3 std; the moment only with the missing p term."""
     beyond = misses = 0
