@@ -401,7 +401,6 @@ def test_without_excitation_it_is_not_trusted():
     assert total(*noisy_rows(0, 1000, False)).trusted
 
 
-@pytest.mark.slow
 def test_with_draws_the_std_is_the_scatter_in_gusts_too():
     """A gust in y remembers twenty rows: what the errors alone make is then far too small a std."""
     errors = np.diag([0.1, 0.1]) ** 2
@@ -689,7 +688,6 @@ def fits_of(flight, vehicle=LAMA):
     return {fit.mode.name: fit for fit in fits if fit is not None}
 
 
-@pytest.mark.slow
 def test_coefficients_of_the_doublet_are_those_of_the_physics():
     """Paper's tables, Table V noise: forces within 3 std; the moment only with the missing p term."""
     beyond = misses = 0
