@@ -198,10 +198,9 @@ def _run(name: str, channels: Mapping[str, Signal], start: float, stop: float, p
             continue
         place = np.clip(np.searchsorted(source[0], t, side="right") - 1, 0, len(source[0]) - 1)
         values = source[1][place]
-        given = np.isfinite(values)
-        if not given.any():
+        if not np.isfinite(values).any():
             raise InputError(f"{path}: no number among the values of {name_of} in run {name!r}")
-        command[:, k] = hold_last(np.where(given, values, np.nan))
+        command[:, k] = hold_last(values)
     command[:, :2] /= RPM_PER_RAD_S
     return Run(name, t - t[0], command, measured, "imported", f"from {path.name}")
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from coax_env import closed_loop, effects, next_maneuver, unlisted, vibration
 from coax_env.calibration import false_alarm_rate
-from coax_env.engine.fit import Engine, RunPass, bounded_solve, objective, part
+from coax_env.engine.fit import Engine, RunPass, objective, part
 from coax_env.engine.model import FreeParameter, Noise, Record
 from coax_env.engine.whiteness import Whiteness, whiteness
 from coax_env.errors import InputError
@@ -600,25 +600,26 @@ def _with_held_out(
     loose = search.free(state.active)
     names = [f.name for f in loose]
     values = {name: state.values[name] for name in names}
-    covariance = quadratic.covariance(names)
     if not held:
-        return values, covariance
+        return values, quadratic.covariance(names)
     engine = Engine(search.model, held)
     if any(record.news is not None for record in search.engine.records):
         closed_loop.attach_news(engine, state)
     passes, lin = engine.linearise(state.values, state.noise, loose)
-    fitted = np.array(list(values.values()))
-    lower, upper = (np.array([getattr(f, end) for f in loose]) for end in ("lower", "upper"))
-    precision = np.linalg.inv(covariance) + lin.information.sum(0)
-    step = bounded_solve(precision, -lin.slope.sum(0), lower - fitted, upper - fitted)
+    heard = Quadratic.of(lin, loose, state.values)
+    known = quadratic.index(names)
+    # where they are fitted, the other runs and the priors pull nowhere
+    both = replace(heard, G=heard.G + quadratic.G[np.ix_(known, known)], mean=heard.at)
+    _, move = both.best(names)
     before = state.objective - sum(p.log_likelihood for p in passes)
     for part_of_it in (1.0, 0.5, 0.25):
-        there = state.values | dict(zip(names, (fitted + part_of_it * step).tolist(), strict=True))
+        moved = dict(zip(names, (both.at + part_of_it * move).tolist(), strict=True))
+        there = state.values | moved
         after = objective(search.engine.filter(there, state.noise), loose, there)
         if after - engine.log_likelihood(there, state.noise) < before:
-            values = {name: there[name] for name in names}
+            values = moved
             break
-    return values, np.linalg.inv(precision)
+    return values, both.covariance(names)
 
 
 def _diagnosed(flight: Flight) -> str:

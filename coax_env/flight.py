@@ -517,8 +517,8 @@ def beside_stalls(t: np.ndarray) -> np.ndarray:
 
 
 def hold_last(values: np.ndarray) -> np.ndarray:
-    """(n,) without NaN: each hole takes the value before it, leading holes the first one given."""
-    given = ~np.isnan(values)
+    """(n,) of finite numbers: each hole takes the one before it, leading holes the first one given."""
+    given = np.isfinite(values)
     first = int(np.argmax(given))
     index = np.maximum.accumulate(np.where(given, np.arange(len(values)), first))
     return values[index]

@@ -719,7 +719,7 @@ class Search:
         """Effects that are not in, may be, and promise something that matters; the best first."""
         offers = []
         for effect in self.candidates:
-            if effect in {*state.active, *banned} or together(effect) & set(state.active):
+            if effect in banned or ({effect} | together(effect)) & set(state.active):
                 continue
             score, evidence, large = self.score(quadratic, state.active, effect)
             if large and score > 0.0:
