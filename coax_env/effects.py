@@ -39,7 +39,7 @@ from coax_env import flow as F
 from coax_env import generic_terms
 from coax_env import parameters as P
 from coax_env.errors import InputError
-from coax_env.jit import name_apart
+from coax_env.jit import BORROWING, name_apart
 from coax_env.layout import CHANNELS
 
 STAGES = ("PROPERTY", "AIR", "SWASH", "ROTOR", "LOAD", "UNLISTED", "SENSOR")
@@ -133,7 +133,8 @@ def effect(
         for channel in channels.split():
             if channel not in CHANNELS:
                 raise InputError(f"effect {own!r}: no channel {channel!r}")
-        function_compiled = njit(error_model="numpy")(name_apart(function))
+        users = not function.__module__.startswith("coax_env.")  # which may make arrays
+        function_compiled = njit(**{**BORROWING, "_nrt": users})(name_apart(function))
         entry = Effect(
             name=own,
             stage=stage,
@@ -773,4 +774,4 @@ def stage_function(stage: int) -> Callable:
     names = {"__name__": __name__, **{e.name: e.function for e in entries}}
     exec("\n".join(["def run(x, f, p):", *calls, "    pass"]), names)
     names["run"].__qualname__ = f"stage_{stage}"
-    return njit(error_model="numpy")(names["run"])
+    return njit(**BORROWING)(names["run"])

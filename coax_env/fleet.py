@@ -123,7 +123,7 @@ def _stir(x, p, stream, eddies, breeze, wind, air):
     p[P.AIR_DOWN] = air[2]
 
 
-@compiled()
+@compiled(makes_arrays=True)
 def _disturb_rows(first, last, active, params, gust, turbulence, x, streams, eddies, breeze):
     """Gusts and turbulence of the coming period for the active rows first..last-1. See Fleet."""
     air = np.empty(3)
@@ -137,7 +137,7 @@ def _disturb_rows(first, last, active, params, gust, turbulence, x, streams, edd
                 _stir(x[i], p, streams[i], eddies[i], breeze[i], turbulence, air)
 
 
-@compiled()
+@compiled(makes_arrays=True)
 def _fly_rows(
     first, last, active, actions, trim, scale, params, kinds, sensors, limits, flags, weights, scales,
     x, u, rows, azimuth, streams, swash, asked, bias, past, targets, held,
@@ -198,7 +198,7 @@ def _point_rows(first, last, which, places, height_sign, targets, held, observat
                 observations[i, k] = held[i, k]
 
 
-@compiled()
+@compiled(makes_arrays=True)
 def _restart_rows(
     first, last, which, keep_state, trim, params, kinds, sensors, limits, flags,
     wind_speed, turbulence, course, box,

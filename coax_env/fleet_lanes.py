@@ -44,7 +44,7 @@ def _next_group(i, last, active, which):
     return n, i
 
 
-@compiled()
+@compiled(makes_arrays=True)
 def _by_phase(first, last, active, rows, order):
     """The active rows first..last-1 into `order`, those together whose sensors are due together; how
     many they are. What no row of a group has due, none of them draws noise for.
@@ -129,7 +129,7 @@ def _step_of(own):
                 over[row] = row_block[_OVER, j] != 0.0
             n, after = _next_group(after, last, active, which)
 
-    return compiled()(step_rows)
+    return compiled(makes_arrays=True)(step_rows)
 
 
 def _sense_of(own):
@@ -180,7 +180,7 @@ def _sense_of(own):
             scatter(held_block, which, n, observations)
             scatter(stream_block, which, n, streams)
 
-    return compiled()(sense_rows)
+    return compiled(makes_arrays=True)(sense_rows)
 
 
 _step_shared, _step_own = _step_of(False), _step_of(True)
@@ -227,14 +227,14 @@ def _fly_of(own):
                     observations,
                 )  # fmt: skip
 
-    return compiled()(fly)
+    return compiled(makes_arrays=True)(fly)
 
 
 fly_shared = _fly_of(False)
 fly_own = _fly_of(True)
 
 
-@compiled()
+@compiled(makes_arrays=True)
 def _dynamics_rows(first, last, x, u, p):
     which, active = np.empty(WIDTH, np.int64), np.ones(len(x), np.bool_)
     x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))

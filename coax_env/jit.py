@@ -96,10 +96,24 @@ def name_apart(function: Callable, *values: Any) -> Callable:
     return function
 
 
-def compiled(signature: Any = None, **options: Any) -> Callable[[Callable], Any]:
-    """``numba.njit`` that caches under CACHE_DIR and releases the GIL."""
+BORROWING = {"error_model": "numpy", "_nrt": False}
+"""Options of what works on its callers' arrays, makes none and returns none.
+
+References to arrays are then not counted, at every call of every function: two thirds of the kernel's
+time. numba refuses to compile what makes an array all the same; what returns one it does not notice.
+"""
+
+
+def compiled(
+    signature: Any = None, makes_arrays: bool = False, **options: Any
+) -> Callable[[Callable], Any]:
+    """``numba.njit`` that caches under CACHE_DIR and releases the GIL.
+
+    makes_arrays: the function makes arrays or returns them, see BORROWING.
+    """
     settings = {
-        "cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options,
+        "cache": True, "nogil": True, "no_cfunc_wrapper": True,
+        **BORROWING, "_nrt": makes_arrays, **options,
     }  # fmt: skip
 
     def decorate(function: Callable) -> Any:
@@ -117,7 +131,7 @@ def pointer(signature: Any) -> Callable[[Callable], Any]:
 
     def decorate(function: Callable) -> Any:
         with _own_cache():
-            settings = {"cache": True, "nopython": True, "error_model": "numpy"}
+            settings = {"cache": True, "nopython": True, **BORROWING}
             return numba.cfunc(signature, **settings)(function)
 
     return decorate

@@ -89,7 +89,7 @@ def _differences(flow, x, u, dt, p, work, scale, base, x_probe, moved, out):
             out[i, j] = (moved[i] - base[i]) / scale[j]
 
 
-@compiled(**REORDER)
+@compiled(makes_arrays=True, **REORDER)
 def _transition(step, exact, x, u, dt, p, work, scale, x_next, x_probe, A, AA, places, counts, F):
     """Jacobian F of a step: the exponential of that of the drift, A, to third order; its non-zeros.
 
@@ -130,6 +130,7 @@ def _transition(step, exact, x, u, dt, p, work, scale, x_next, x_probe, A, AA, p
         float64, int64, boolean, _M, _M, float32[:, ::1], _A, float32[:, :, ::1], _N,
         float64[:, :, ::1], float32[:, :, ::1], _N, _M,
     ),
+    makes_arrays=True,
     **REORDER,
 )  # fmt: skip
 def filter_pass(
@@ -329,6 +330,7 @@ def _unpack(stored, slot, A, places, counts):
     types.void(
         _A, _M, float32[:, ::1], _A, float32[:, :, ::1], float32[:, :, ::1], _N, int64, _N, _M, _A,
     ),
+    makes_arrays=True,
     **REORDER,
 )  # fmt: skip
 def score_pass(
@@ -426,6 +428,7 @@ def score_pass(
         STEP, MEASURE, _A, _M, _M, boolean[::1], _A, _A, int64,
         float32[:, ::1], _A, float32[:, :, ::1], int64, _M,
     ),
+    makes_arrays=True,
     **REORDER,
 )  # fmt: skip
 def mean_pass(
@@ -478,6 +481,7 @@ def mean_pass(
         STEP, MEASURE, _A, float64[:, :, ::1], _N, _M, _M, _M, _A, _M, _A, boolean[::1], boolean[::1],
         int64, float32[:, ::1], _A, float32[:, :, ::1], float32[:, :, ::1], _N, int64, _N, _M,
     ),
+    makes_arrays=True,
     **REORDER,
 )  # fmt: skip
 def signature_pass(
@@ -577,7 +581,7 @@ def signature_pass(
                     s[i, k] += weight * source[j, k]
 
 
-@compiled(boolean(STEP, MEASURE, _A, _M, _A, _A, int64, int64, int64[::1], _A))
+@compiled(boolean(STEP, MEASURE, _A, _M, _A, _A, int64, int64, int64[::1], _A), makes_arrays=True)
 def fly_open_loop(step, measure, dt, u, x, p, work_size, first, targets, out):
     """Fly from row `first` with the recorded inputs; read each channel at its own row.
 

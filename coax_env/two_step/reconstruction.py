@@ -65,7 +65,7 @@ def longitudinal(
     )
 
 
-@compiled()
+@compiled(makes_arrays=True)
 def _filter(
     q: np.ndarray, ax: np.ndarray, az: np.ndarray, sonar: np.ndarray, dt: float, g: float,
     shake: np.ndarray, echo: float, start: np.ndarray, spread: np.ndarray,
@@ -118,7 +118,7 @@ def _rates(x: np.ndarray, q: float, ax: float, az: float, g: float, out: np.ndar
     out[BIAS] = 0.0
 
 
-@compiled()
+@compiled(makes_arrays=True)
 def _smooth(
     predicted: np.ndarray, P_predicted: np.ndarray, filtered: np.ndarray,
     P_filtered: np.ndarray, transition: np.ndarray,
