@@ -302,7 +302,10 @@ def _sine_and_cosine_of(x):
     def of_lanes(x):
         return _wound(x) if anywhere(abs(x) > _EIGHTH) else _within_an_eighth(x)
 
-    return of_lanes if x == LANES else lambda x: (math.sin(x), math.cos(x))
+    def of_numbers(x):
+        return _within_an_eighth(x) if abs(x) <= _EIGHTH else (math.sin(x), math.cos(x))
+
+    return of_lanes if x == LANES else of_numbers
 
 
 @_by_kind(sines_and_cosines)

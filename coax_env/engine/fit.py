@@ -254,11 +254,12 @@ class Engine:
                 there = np.isfinite(run.innovations)
                 e = run.innovations[there]
                 J = room.array("J", (e.size, len(free)))
+                by_channel = np.zeros((len(free), there.shape[1]))
                 near = np.flatnonzero(~far)
                 if np.isfinite(run.log_likelihood):
                     self._signatures(
                         i, run, along, p, [moved[k] for k in near], steps[near],
-                        reading_only[near], near, J,
+                        reading_only[near], near, J, by_channel,
                     )  # fmt: skip
                 else:
                     J[:] = 0.0
@@ -266,23 +267,22 @@ class Engine:
                 for k in np.flatnonzero(far):
                     J[:, k] = 0.0
                     if self._frozen(i, run, moved[k], probed):
-                        change = probed[there] - e
+                        change = np.where(there, probed - run.innovations, 0.0)
                         if np.abs(change).max(initial=0.0) < HUGE:
-                            J[:, k] = change / steps[k]
+                            J[:, k] = change[there] / steps[k]
+                            by_channel[k] = np.square(change / steps[k]).sum(0)
                 information = J.T @ J
                 wild = ~np.isfinite(np.diag(information))
                 if wild.any():
                     J[:, wild] = 0.0
                     information[wild] = information[:, wild] = 0.0
-                row, channel = np.nonzero(there)
+                    by_channel[wild] = 0.0
+                row = np.nonzero(there)[0]
                 t = run.record.t
                 edges = np.searchsorted(t, np.arange(t[0] + STRETCH, t[-1], STRETCH))
                 parts = np.split(np.arange(e.size), np.searchsorted(row, edges))
                 stretches = np.array([e[part] @ J[part] for part in parts])
-                by_channel = np.array(
-                    [np.square(J[channel == c]).sum(0) for c in range(there.shape[1])]
-                )
-            return run, information, stretches.sum(0), by_channel.T, stretches
+            return run, information, stretches.sum(0), by_channel, stretches
 
         passes, *parts, stretches = zip(*self._each(one), strict=True)
         information, slope, by_channel = (np.array(part) for part in parts)
@@ -301,8 +301,12 @@ class Engine:
         reading_only: np.ndarray,
         columns: np.ndarray,
         J: np.ndarray,
+        by_channel: np.ndarray,
     ) -> None:
-        """Derivatives of a run's whitened innovations in the parameters moved, into columns of J."""
+        """Derivatives of a run's whitened innovations in the parameters moved, into columns of J.
+
+        And their squares, summed by channel, into rows of `by_channel`.
+        """
         if not moved:
             return
         sets, which = [run.inputs], np.zeros(len(moved), np.int64)
@@ -315,7 +319,7 @@ class Engine:
             self.model.drift_and_readings, self.model.measure, self.intervals[i], np.array(sets), which,
             along.predicted, run.states, run.innovations, p, np.array(moved), steps, reading_only,
             self.model.exact, self.model.work_size, run.gains, run.per_sigma, run.H, along.F,
-            along.F_of, REFRESH, columns, J,
+            along.F_of, REFRESH, columns, J, by_channel,
         )  # fmt: skip
 
     def descend(

@@ -479,7 +479,7 @@ def mean_pass(
 @compiled(
     types.void(
         STEP, MEASURE, _A, float64[:, :, ::1], _N, _M, _M, _M, _A, _M, _A, boolean[::1], boolean[::1],
-        int64, float32[:, ::1], _A, float32[:, :, ::1], float32[:, :, ::1], _N, int64, _N, _M,
+        int64, float32[:, ::1], _A, float32[:, :, ::1], float32[:, :, ::1], _N, int64, _N, _M, _M,
     ),
     makes_arrays=True,
     **REORDER,
@@ -487,6 +487,7 @@ def mean_pass(
 def signature_pass(
     both, measure, dt, u_sets, u_of, predicted, states, e, p, moved, steps, reading_only, exact,
     work_size, K_all, per_sigma_all, H_all, F_all, F_of, refresh, columns, J,
+    by_channel,
 ):  # fmt: skip
     """Derivatives of the whitened innovations in many parameters at once, gains frozen.
 
@@ -506,8 +507,9 @@ def signature_pass(
         predicted, states, e: of the filter pass. p: parameters; moved: (k, np) those with one moved,
             steps: (k,) by how much. reading_only: (k,) those that add nothing to the state.
         K_all, per_sigma_all, H_all, F_all, F_of, refresh: of the filter pass.
-        columns: (k,) where in J a parameter stands. J: derivatives, out, one row for each reading that
-            there is, in the order of e.
+        columns: (k,) where in J and by_channel a parameter stands. J: derivatives, out, one row for
+            each reading that there is, in the order of e. by_channel: (k or more, m) their squares
+            summed, out.
     """
     n, m = e.shape
     k_all = steps.size
@@ -522,6 +524,7 @@ def signature_pass(
     width = _whole_blocks(k_all)
     b = np.zeros((nx, width))
     dv = np.zeros((m, width))
+    power = np.zeros((m, width))
     s = np.zeros((nx, width))
     half = np.zeros((nx, width))
     before = np.zeros((nx, width))
@@ -557,8 +560,11 @@ def signature_pass(
                 gain = float64(K_all[there, j])
                 for k in range(width):
                     s[j, k] += gain * dv[i, k]
+            for k in range(width):
+                dv[i, k] *= per_sigma_all[there]
+                power[i, k] += dv[i, k] * dv[i, k]
             for k in range(k_all):
-                J[there, columns[k]] = dv[i, k] * per_sigma_all[there]
+                J[there, columns[k]] = dv[i, k]
             there += 1
         if row == n - 1:
             break
@@ -579,6 +585,9 @@ def signature_pass(
                 weight = F[i, j]
                 for k in range(width):
                     s[i, k] += weight * source[j, k]
+    for k in range(k_all):
+        for i in range(m):
+            by_channel[columns[k], i] = power[i, k]
 
 
 @compiled(boolean(STEP, MEASURE, _A, _M, _A, _A, int64, int64, int64[::1], _A), makes_arrays=True)
