@@ -1,9 +1,10 @@
 """Ratios measured in one run: speed of the env against others, its start, and what effects cost.
 
-Without --peers in under two minutes. With it, other simulators are installed, each into a venv of its
-own (a gigabyte each, once), and flown in turns with ours: ours, peer, ours, peer; the best of all
-rounds counts. Everyone flies random actions in their own vector env with their own settings, which
-the table states. Absolute times depend on the machine and its neighbours; compare ratios only.
+Without --peers in under two minutes; --diagnosis takes two more. With --peers other simulators are
+installed, each into a venv of its own (a gigabyte each, once), and flown in turns with ours: ours,
+peer, ours, peer; the best of all rounds counts. Everyone flies random actions in their own vector env
+with their own settings, which the table states. Absolute times depend on the machine and its
+neighbours; compare ratios only.
 """
 
 import json
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import command_line
-from speed import peers
+from speed import diagnosis_times, peers
 
 from coax_env.errors import InputError
 from coax_env.files import write_json
@@ -91,6 +92,8 @@ def main() -> None:
     parser.add_argument(
         "--peers", action="store_true", help="install other simulators, fly them too"
     )
+    parser.add_argument("--diagnosis", action="store_true",
+                        help="time diagnoses of 12 runs in gusts too")  # fmt: skip
     parser.add_argument("--only", nargs="+", metavar="PEER", help="only these (with --peers)")
     parser.add_argument("--venvs", type=Path, default=Path("runs/peers"), metavar="DIR",
                         help="where the peers' venvs are kept (default: %(default)s)")  # fmt: skip
@@ -114,9 +117,11 @@ def main() -> None:
         kernel = in_turns([ours], Row("kernel", "kernel"), options, say)[OURS]
         cold = cold_start()
         steps = effects_off()
+        diagnoses = diagnosis_times.measure(say) if options.diagnosis else []
     result = {
         "load_average": load, "processors": os.cpu_count(), "envs": options.envs, "rows": rows,
-        "kernel": kernel, "cold_start_s": cold, "absent": absent, **steps,
+        "kernel": kernel, "cold_start_s": cold, "absent": absent,
+        "diagnoses": diagnoses, **steps,
     }  # fmt: skip
     write_json(options.out / "benchmark.json", result)
     command_line.print_columns(table(result))
@@ -206,6 +211,12 @@ def table(result: dict[str, Any]) -> list[list[str]]:
     lines.append(["import to first step, cold", OURS, figure(cold, "s"), *[""] * 5])
     off = 100.0 * (result["effects_off_ratio"] - 1.0)
     lines.append(["effects off, against cut out", OURS, f"{off:+.1f} %", *[""] * 5])
+    for row in result["diagnoses"]:
+        lines.append([
+            f"diagnosis, {len(row['hidden'])} hidden, {len(row['named'])} named", OURS,
+            figure(row["seconds"], "s"), "", "", "", "",
+            f"{row['flown_s'] / row['seconds']:.0f} x the time flown",
+        ])  # fmt: skip
     return lines
 
 

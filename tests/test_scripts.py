@@ -370,6 +370,7 @@ def test_the_benchmarks_table():
             for row in benchmark.ROWS
         },
         "kernel": found(1000.0), "cold_start_s": 12.0, "effects_off_ratio": 1.02,
+        "diagnoses": [{"hidden": ["a", "b"], "named": ["a"], "seconds": 11.0, "flown_s": 220.0}],
     }  # fmt: skip
     lines = benchmark.table(result)
     assert all(len(line) == len(lines[0]) for line in lines)
@@ -378,7 +379,8 @@ def test_the_benchmarks_table():
     assert sum("late|3 s|1.5 x quicker" in line for line in text) == 1
     assert sum("lame|-|" in line and "no wheel" in line for line in text) == 2
     assert any("0.60 of it in the env" in line for line in text)
-    assert text[-1].startswith("effects off, against cut out|coax|+2.0 %")
+    assert text[-2].startswith("effects off, against cut out|coax|+2.0 %")
+    assert text[-1] == "diagnosis, 2 hidden, 1 named|coax|11 s|||||20 x the time flown"
 
 
 def test_the_better_of_two_rounds_counts(monkeypatch):

@@ -16,6 +16,7 @@ filter error method).
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import boolean, float32, float64, int64, types
@@ -28,7 +29,7 @@ _I = int64[:, ::1]
 _N = int64[::1]
 STEP = types.FunctionType(types.void(_A, _A, float64, _A, _A, _A))
 MEASURE = types.FunctionType(types.void(_A, _A, _A, _A, _A))
-REORDER = {"fastmath": {"reassoc", "contract"}}
+REORDER: dict[str, Any] = {"fastmath": {"reassoc", "contract"}}
 """Sums may be taken in the order that is fastest."""
 MOST_DECAY = 0.5
 """Share of a state that may decay in a row for the series of the exponential to be used."""
