@@ -79,7 +79,8 @@ class Effect:
 
     ``replaces`` names base parameters that are the same column. ``input_shift``: acts on the input,
     not in the kernel. ``line``: found by its line in the spectrum (vibration.py), not by a signature.
-    ``generic``: unlisted terms, of which a vehicle file holds those that are not zero.
+    ``generic``: unlisted terms, of which a vehicle file holds those that are not zero. ``damps``: its
+    one parameter damps the motion, and so changes what a filter makes of gusts.
     """
 
     name: str
@@ -93,6 +94,7 @@ class Effect:
     input_shift: bool = False
     line: bool = False
     generic: bool = False
+    damps: bool = False
     index: int = -1
 
     def names(self) -> tuple[str, ...]:
@@ -116,6 +118,7 @@ def effect(
     input_shift: bool = False,
     line: bool = False,
     generic: bool = False,
+    damps: bool = False,
     name: str = "",
 ) -> Callable[[Callable], Callable]:
     """Enter a function into the catalogue under its own (or this) name; its docstring says what it is.
@@ -147,6 +150,7 @@ def effect(
             input_shift=input_shift,
             line=line,
             generic=generic,
+            damps=damps,
             index=n_parameters(),
         )
         GROUPS[own] = entry
@@ -396,6 +400,7 @@ def ground_effect(x, f, p, e):
     EffectParameter("coefficient", "s/m", usual=0.1, smallest=0.015, lower=0.0),
     channels="az h vd",
     source="blade-element theory, climb inflow; Leishman 2006, ch. 3",
+    damps=True,
 )
 def axial_damping(x, f, p, e):
     """Thrust times (1 + k w_air): a climb loses thrust, a descent gains it."""
@@ -456,6 +461,7 @@ def airframe_drag(x, f, p, e):
     EffectParameter("coefficient", "N s/m per rad/s", usual=4e-4, smallest=5e-5, lower=0.0),
     channels="ax ay vn ve",
     source="rotor H-force and induced drag; Martin and Salaun, ICRA 2010",
+    damps=True,
 )
 def rotor_drag(x, f, p, e):
     """Drag in the rotor plane, -k (omega_u + omega_l) V_perp."""
@@ -469,6 +475,7 @@ def rotor_drag(x, f, p, e):
     EffectParameter("gain", "rad per m/s", usual=0.0075, smallest=0.001, lower=0.0),
     channels="p q",
     source="longitudinal flapping with speed; Prouty 1986, ch. 3",
+    damps=True,
 )
 def flap_blowback(x, f, p, e):
     """The lower disc tilts back from the airflow: alpha_l' + k u/tau, beta_l' - k v/tau."""
@@ -481,6 +488,7 @@ def flap_blowback(x, f, p, e):
     EffectParameter("coefficient", "N m s", usual=0.004, smallest=0.0005, lower=0.0),
     channels="r psi",
     source="aerodynamic yaw damping, to first order",
+    damps=True,
 )
 def yaw_damping(x, f, p, e):
     """Yaw moment -k r."""
@@ -492,6 +500,7 @@ def yaw_damping(x, f, p, e):
     EffectParameter("coefficient", "N m s", usual=0.004, smallest=0.0008, lower=0.0),
     channels="p q",
     source="aerodynamic rate damping, to first order",
+    damps=True,
 )
 def rate_damping(x, f, p, e):
     """Roll and pitch moments -k p and -k q."""

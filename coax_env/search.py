@@ -58,6 +58,8 @@ CLEAR = 10.0
 """An effect worth so many times what another step promises is added before the fit has settled."""
 NEAR = 0.5
 """Share of EVIDENCE from which an effect that the quadratic does not carry is fitted to see."""
+A_LITTLE_WAY = 4.0
+"""Standard deviations, as the signatures have them, at which a damping is asked for its likelihood."""
 TOGETHER = (frozenset({"servo_lag", "servo_delay"}),)
 """Effects of which one at most is named: a real servo is a mixture of both (design/effects.md)."""
 BUFFET_SHARE = 0.2
@@ -242,6 +244,7 @@ class Search:
         self.base = self.model.base_parameters()
         self.by_effect = {e: self.model.effect_parameters(e) for e in self.candidates}
         self.all = self.base + [f for group in self.by_effect.values() for f in group]
+        self.dampings = tuple(e for e in self.candidates if effects.CATALOGUE[e].damps)
 
     def say(self, text: str) -> None:
         """Tell whoever watches."""
@@ -474,6 +477,28 @@ class Search:
             self.is_large(entry.name, reached),
         )
 
+    def promise(
+        self, state: State, quadratic: Quadratic, damping: str
+    ) -> tuple[float, dict[str, float]]:
+        """What a damping that is not in promises [nats, Occam factor deducted], and its value there.
+
+        By the slope of the likelihood itself, from one filter pass a little way towards it. Signatures
+        hold the gains still, so that their slope lacks what the damping does to the gains.
+        """
+        (f,) = (f for f in self.by_effect[damping] if f.name in self.candidate_names(damping))
+        rest = self.free_names(state.active)
+        information = float(quadratic.projected([f.name], rest)[0][0, 0])
+        if information <= 0.0:
+            return -math.inf, {}
+        step = min(f.std, A_LITTLE_WAY / math.sqrt(information))
+        there = self.moved(state, quadratic, state.active, {f.name: f.value + step})
+        passes = self.engine.filter(there.values, there.noise)
+        gained = state.objective - objective(passes, self.free(state.active), there.values)
+        gained += quadratic.best(rest)[0]  # what the others would gain without it
+        slope = gained / step + 0.5 * information * step
+        size = min(max(slope / (information + 1.0 / f.std**2), 0.0), f.upper - f.value)
+        return 0.5 * slope * size - quadratic.occam([f.name], rest), {f.name: f.value + size}
+
     def is_large(self, effect: str, values: dict[str, float]) -> bool:
         """Whether an effect at these values matters in prediction."""
         entry = effects.CATALOGUE[effect]
@@ -607,7 +632,7 @@ class Search:
                     banned = {e for e, count in drops.items() if count > 1}
             elif not complete and (
                 self._swap(state, quadratic, tried)
-                or self._add_near(state, quadratic, offers, tried)
+                or self._add_near(state, quadratic, offers, banned, tried)
                 or self.look_for_buffet(state)
             ):
                 pass
@@ -682,25 +707,34 @@ class Search:
         state: State,
         quadratic: Quadratic,
         offers: Sequence[Offer],
+        banned: Collection[str],
         tried: set[tuple[str, ...]],
     ) -> bool:
         """Put in an effect that the quadratic nearly carries, where a fit says that it is worth it.
 
         The quadratic at nothing is not that at the effect's size: a damping changes what the filter
-        makes of gusts, and may be worth twice what its slope promised.
+        makes of gusts, and may be worth ten times what its slope promised. So dampings and drags, of
+        one parameter each, are asked by the likelihood itself.
         """
-        near = [
-            offer.effect
+        near: list[tuple[str, dict[str, float]]] = [
+            (offer.effect, {})
             for offer in offers
             if NEAR * EVIDENCE < offer.evidence <= EVIDENCE
             and not effects.CATALOGUE[offer.effect].replaces
-            and (*state.active, offer.effect) not in tried
-        ]
-        for effect in near[:3]:
+        ][:3]
+        unheard = {*self.dampings} - {*state.active, *banned, *(effect for effect, _ in near)}
+        unheard = {e for e in unheard if (*state.active, e) not in tried}
+        promises = self.for_each(
+            lambda effect: self.promise(state, quadratic, effect), sorted(unheard)
+        )
+        near += [(e, at) for e, (nats, at) in promises.items() if nats > NEAR * EVIDENCE]
+        near = [(e, at) for e, at in near if (*state.active, e) not in tried]
+        tried |= {(*state.active, e) for e in unheard}
+        for effect, start in near:
             active = [*state.active, effect]
             tried.add(tuple(active))
             occam = quadratic.occam(self.candidate_names(effect), self.free_names(state.active))
-            trial = self.settle(self.moved(state, quadratic, active, {}))
+            trial = self.settle(self.moved(state, quadratic, active, start))
             worth = state.objective - trial.objective - occam
             if worth > EVIDENCE and self.is_large(effect, trial.values):
                 self._take(state, trial, f"+ {effect}", worth)

@@ -192,6 +192,32 @@ def test_what_the_quadratic_nearly_carries_is_fitted_to_see(tmp_path, monkeypatc
     assert found(1.05 * worth) == []
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("hidden", [0.1, 0.0])
+def test_a_damping_promises_what_the_likelihood_says(tmp_path, hidden):
+    """Nearer to what the fit finds than the quadratic, which holds the gains still; never more."""
+    folder = injector.fly(
+        tmp_path / "flight", {"axial_damping": hidden} if hidden else {}, gusts=True,
+        runs=("heave_3211", "climb_descend"), seed=3,
+    )  # fmt: skip
+    flight = read_flight(folder)
+    model = HeliModel(LAMA)
+    search = Search(Engine(model, [record_of(r) for r in flight.runs]), model, ("axial_damping",))
+    bare = search.begin(starting_noise(flight, LAMA))
+    bare = search.settle(search.refit_noise(search.settle(bare)), 4, 0.1)
+    _, quadratic = search.linearise(bare)
+    held = search.score(quadratic, [], "axial_damping")[0]
+    promised, at = search.promise(bare, quadratic, "axial_damping")
+    full = search.settle(search.moved(bare, quadratic, ["axial_damping"], at), 10, 0.02)
+    occam = quadratic.occam(["axial_damping.coefficient"], search.free_names([]))
+    worth = bare.objective - full.objective - occam
+    if hidden:
+        assert held < promised < worth + 0.5
+        assert worth - promised < 0.7 * (worth - held)
+    else:
+        assert promised < 0.0 and worth < 0.0
+
+
 # --- hidden effects ------------------------------------------------------------------------------
 
 
@@ -243,6 +269,11 @@ HIDDEN: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     ),
     "servo and yaw": (
         {"servo_lag": {}, "yaw_damping": {}}, dict(runs=(*ON_AXES, "heading_turn"), seed=8)
+    ),
+    "a damping that its slope at nothing hides, in gusts": (
+        {"axial_damping": {"coefficient": 0.1}},
+        dict(runs=(*ON_AXES, "forward_run", "side_run", "low_hover", "heading_turn"), gusts=True,
+             seed=500),
     ),
     "wind, thin sensors": (
         {"wind": {}, "rotor_drag": {}},
