@@ -314,7 +314,11 @@ def _causes(
                 "parameters": {
                     f.name: {
                         "value": float(state.values[f.name]),
-                        "std": with_timing(f, std[f.name] * math.sqrt(weight.colour), dt),
+                        "std": with_timing(
+                            f,
+                            std[f.name] * math.sqrt(weight.colour) * state.wider.get(f.name, 1.0),
+                            dt,
+                        ),
                         "unit": p.unit,
                     }
                     for f, p in zip(search.by_effect[effect], entry.parameters, strict=True)
@@ -576,7 +580,8 @@ def _extended(
 
     def std(f: FreeParameter) -> float:
         colour = colours.get(f.name.partition(".")[0], 1.0)
-        return with_timing(f, float(spread[loose.index(f)]) * math.sqrt(colour), dt)
+        wider = math.sqrt(colour) * state.wider.get(f.name, 1.0)
+        return with_timing(f, float(spread[loose.index(f)]) * wider, dt)
 
     return fitted_vehicle(
         vehicle,

@@ -580,16 +580,18 @@ def imu_lever_arm(x, f, p, e):
     EffectParameter("x", "rad", usual=0.02, smallest=0.003),
     EffectParameter("y", "rad", usual=0.02, smallest=0.003),
     channels="ax ay",
-    source="small rotation of the sensor's axes against the body's",
+    source="rotation of the sensor's axes against the body's; Rodrigues' formula",
 )
 def imu_tilt(x, f, p, e):
-    """IMU turned about x and y: readings are those of the turned axes, f - tilt x f."""
+    """IMU turned by the rotation vector t = (x, y, 0): f - t x f (1 - t^2/6) + t x (t x f) / 2."""
     tx, ty = p[e], p[e + 1]
+    once = 1.0 - (tx * tx + ty * ty) / 6.0
     for first in (_GYRO, _ACCEL):
         a, b, c = f[first], f[first + 1], f[first + 2]
-        f[first] = a - ty * c
-        f[first + 1] = b + tx * c
-        f[first + 2] = c - tx * b + ty * a
+        turn = tx * b - ty * a  # z of t x f; x and y are ty c, -tx c
+        f[first] = a - once * ty * c + 0.5 * ty * turn
+        f[first + 1] = b + once * tx * c - 0.5 * tx * turn
+        f[first + 2] = c - once * turn - 0.5 * (tx * tx + ty * ty) * c
 
 
 @effect(

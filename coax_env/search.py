@@ -17,7 +17,7 @@ parameter's prior std (contract.md) and the move is worth EVIDENCE against the f
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -46,6 +46,8 @@ PROMISE would leave two, and always on the side that the search came from."""
 MOST_POLISHES = 4
 PART_OF_STD = 0.3
 """Step of a difference of likelihoods, in standard deviations."""
+WIDER = (0.5, 2.0)
+"""Bounds of what the likelihood's own curvature may do to a standard deviation."""
 MOST_STEPS = 4
 MOST_TURNS = 6
 GLANCE = 60.0
@@ -191,12 +193,17 @@ class Quadratic:
 
 @dataclass
 class State:
-    """Where the search stands: effects in, values of all parameters, noise levels."""
+    """Where the search stands: effects in, values of all parameters, noise levels.
+
+    wider: standard deviation of an effect's parameter by the likelihood's own curvature, over that by
+    the signatures; 1 where it is not known.
+    """
 
     active: list[str]
     values: dict[str, float]
     noise: Noise
     objective: float = np.inf
+    wider: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -381,9 +388,11 @@ class Search:
 
         Signatures hold the gains still. What an effect does to the gains is small, and zero on average,
         but on a gusty flight it can be a standard deviation. The slope by differences of whole filter
-        passes has it in. Coloured innovations say that the gains are not those of the true noise: then
-        that part of the slope is no more than a bias, and is left out.
+        passes has it in, and so has the curvature, which `state.wider` is taken from. Coloured
+        innovations say that the gains are not those of the true noise: then that part of the slope is
+        no more than a bias, and is left out.
         """
+        state.wider = {}
         own = [f for e in state.active for f in self.by_effect[e]]
         if not own or not is_white(
             self.engine.filter(state.values, state.noise), self.model.channels
@@ -394,13 +403,11 @@ class Search:
         # what the slope with the gains held lacks: it hardly changes on the way
         missing = np.zeros(len(names))
         for count in range(MOST_POLISHES):
-            _, lin = self.engine.linearise(state.values, state.noise, free)
+            passes, lin = self.engine.linearise(state.values, state.noise, free)
             quadratic = Quadratic.of(lin, free, state.values)
             if count == 0:
-                std = np.sqrt(np.diag(quadratic.covariance(names)))
-                for f in own:
-                    k = names.index(f.name)
-                    missing[k] = self._slope(state, f, PART_OF_STD * float(std[k])) - quadratic.g[k]
+                state.objective = objective(passes, free, state.values)
+                missing, state.wider = self._likelihoods_own(state, quadratic, free, own)
             _, move = replace(quadratic, g=quadratic.g + missing).best(names)
             for part in (1.0, 0.4):
                 there = dict(zip(names, (quadratic.at + part * move).tolist(), strict=True))
@@ -413,17 +420,40 @@ class Search:
                 break
         return state
 
-    def _slope(self, state: State, f: FreeParameter, step: float) -> float:
-        """Slope of minus the log-likelihood in a parameter, by differences inside its bounds."""
-        now = state.values[f.name]
-        up, down = min(now + step, f.upper), max(now - step, f.lower)
-        if up <= down:
-            return 0.0
-        ahead, behind = (
-            self.engine.log_likelihood({**state.values, f.name: value}, state.noise)
-            for value in (up, down)
-        )
-        return (behind - ahead) / (up - down)
+    def _likelihoods_own(
+        self,
+        state: State,
+        quadratic: Quadratic,
+        free: Sequence[FreeParameter],
+        own: Sequence[FreeParameter],
+    ) -> tuple[np.ndarray, dict[str, float]]:
+        """What the likelihood's slope has beyond the quadratic's, and `State.wider`.
+
+        By differences inside the bounds, along the way of each of `own` on which all others answer: the
+        curvature there is one over its variance.
+        """
+        covariance = quadratic.covariance(quadratic.names)
+        ways = covariance / np.diag(covariance)  # a column each
+        mine = quadratic.index([f.name for f in own])
+        beyond, wider = np.zeros(len(own)), {}
+        for j, (k, f) in enumerate(zip(mine, own, strict=True)):
+            step = PART_OF_STD * math.sqrt(covariance[k, k])
+            ends = min(step, f.upper - quadratic.at[k]), max(-step, f.lower - quadratic.at[k])
+            if ends[0] <= ends[1]:
+                continue
+            costs = []
+            for end in ends:
+                moved = np.clip(quadratic.at + end * ways[:, k], quadratic.lower, quadratic.upper)
+                there = state.values | dict(zip(quadratic.names, moved.tolist(), strict=True))
+                costs.append(objective(self.engine.filter(there, state.noise), free, there))
+            pull = quadratic.g + quadratic.precision * (quadratic.at - quadratic.mean)
+            beyond[j] = (costs[0] - costs[1]) / (ends[0] - ends[1]) - pull @ ways[:, k]
+            bend = costs[0] + costs[1] - 2.0 * state.objective
+            if ends == (step, -step) and bend > 0.0:
+                wider[f.name] = float(np.clip(PART_OF_STD / math.sqrt(bend), *WIDER))
+        missing = np.zeros(len(free))
+        missing[mine] = np.linalg.lstsq(ways[np.ix_(mine, mine)].T, beyond, rcond=None)[0]
+        return missing, wider
 
     def look_for_buffet(self, state: State) -> bool:
         """Let white force and moment in, where that is worth more than TIE; True where it now is."""
@@ -716,21 +746,24 @@ class Search:
         makes of gusts, and may be worth ten times what its slope promised. So dampings and drags, of
         one parameter each, are asked by the likelihood itself.
         """
-        near: list[tuple[str, dict[str, float]]] = [
-            (offer.effect, {})
-            for offer in offers
-            if NEAR * EVIDENCE < offer.evidence <= EVIDENCE
-            and not effects.CATALOGUE[offer.effect].replaces
-        ][:3]
-        unheard = {*self.dampings} - {*state.active, *banned, *(effect for effect, _ in near)}
-        unheard = {e for e in unheard if (*state.active, e) not in tried}
-        promises = self.for_each(
-            lambda effect: self.promise(state, quadratic, effect), sorted(unheard)
-        )
-        near += [(e, at) for e, (nats, at) in promises.items() if nats > NEAR * EVIDENCE]
-        near = [(e, at) for e, at in near if (*state.active, e) not in tried]
-        tried |= {(*state.active, e) for e in unheard}
-        for effect, start in near:
+
+        def untried(names: Iterable[str]) -> list[str]:
+            return [e for e in names if (*state.active, e) not in tried]
+
+        near: dict[str, dict[str, float]] = {  # and where to begin
+            effect: {}
+            for effect in untried(
+                offer.effect
+                for offer in offers
+                if NEAR * EVIDENCE < offer.evidence <= EVIDENCE
+                and not effects.CATALOGUE[offer.effect].replaces
+            )[:3]
+        }
+        asked = untried(e for e in self.dampings if e not in {*state.active, *banned, *near})
+        promises = self.for_each(lambda e: self.promise(state, quadratic, e), asked)
+        near |= {e: at for e, (nats, at) in promises.items() if nats > NEAR * EVIDENCE}
+        tried |= {(*state.active, e) for e in asked}
+        for effect, start in near.items():
             active = [*state.active, effect]
             tried.add(tuple(active))
             occam = quadratic.occam(self.candidate_names(effect), self.free_names(state.active))

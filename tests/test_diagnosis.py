@@ -164,6 +164,16 @@ def test_a_polished_fit_is_at_the_top_of_the_likelihood(tmp_path):
         slope = (cost(name, 0.5) - cost(name, -0.5)) / 1.0  # nats per standard deviation
         assert abs(slope) < 0.35, name
 
+    def profile(name: str, change: float) -> float:
+        there = {name: state.values[name] + change}
+        moved = search.moved(state, quadratic, state.active, there).values
+        return objective(engine.filter(moved, state.noise), free, moved)
+
+    for name in search.candidate_names("imu_lever_arm"):
+        own = state.wider[name] * std[name]
+        risen = profile(name, own) + profile(name, -own) - 2.0 * profile(name, 0.0)
+        assert risen == pytest.approx(1.0, rel=0.05), name  # half a nat either way
+
 
 @pytest.mark.slow
 def test_what_the_quadratic_nearly_carries_is_fitted_to_see(tmp_path, monkeypatch):
