@@ -346,7 +346,7 @@ def _add_product(transposed, vector, total):
             total[j] += transposed[k, j] * vector[k]
 
 
-@compiled(fastmath={"contract"})
+@compiled(makes_arrays=True, fastmath={"contract"})
 def _correct(
     which, observations, rows, command, places, flags, pairs, heading,
     trim, C_by_state, D_by_command, first_gain, gains, state, readings,
@@ -392,7 +392,7 @@ def _correct(
                 x[j] += gain[k, j] * innovation
 
 
-@compiled(fastmath={"contract"})
+@compiled(makes_arrays=True, fastmath={"contract"})
 def _predict(command, A_by_state, B_by_command, turn, state):
     """Move states (count, n) on by one control period, in place: x = A x + B du.
 
