@@ -96,7 +96,7 @@ def fly(
     plan = maneuver(plan)
     piloted = plan.closed_loop if closed_loop is None else closed_loop
     rng = np.random.default_rng(seed)
-    pilot = Pilot(vehicle, plan.height, tremor) if piloted else None
+    pilot = Pilot(vehicle, plan.height, dt, tremor) if piloted else None
     start, trim = dynamics.hover_trim(vehicle, plan.height)
 
     t = np.arange(round(plan.duration / dt) + 1) * dt
