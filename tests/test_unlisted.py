@@ -182,6 +182,7 @@ def test_a_listed_effect_comes_before_unlisted_terms(tmp_path):
 
 HEADING_MOMENT = '''
 import math
+import numpy as np
 from coax_env import flow as F
 from coax_env.effects import LOAD, EffectParameter, effect
 
@@ -189,7 +190,8 @@ from coax_env.effects import LOAD, EffectParameter, effect
         channels="q theta", source="seen on the bench")
 def heading_moment(x, f, p, e):
     """A pitching moment that follows the heading, k sin(3 psi)."""
-    f[F.MOMENT_Y] += p[e] * math.sin(3.0 * x[12])
+    along = np.array([math.sin(3.0 * x[12])])  # a user may make arrays
+    f[F.MOMENT_Y] += p[e] * along[0]
 '''
 
 
