@@ -133,6 +133,8 @@ def effect(
             raise InputError(f"effect {own!r}: @effect(stage, EffectParameter(...), ...) is wanted")
         if own in GROUPS:
             raise InputError(f"the catalogue of effects has {own!r} already")
+        if damps and sum(not p.shape for p in parameters) != 1:
+            raise InputError(f"effect {own!r}: damps=True is for an effect of one parameter")
         for channel in channels.split():
             if channel not in CHANNELS:
                 raise InputError(f"effect {own!r}: no channel {channel!r}")

@@ -236,6 +236,9 @@ BAD_EFFECTS = {
     "no channel": HEADING_MOMENT.replace("q theta", "q speed"),
     "NameError": HEADING_MOMENT.replace("import LOAD, EffectParameter", "import EffectParameter"),
     "is wanted": HEADING_MOMENT.replace("@effect(LOAD, ", "@effect("),
+    "one parameter": HEADING_MOMENT.replace(
+        "smallest=0.002),", 'smallest=0.002), EffectParameter("l", "N m", 0.02, 0.002), damps=True,'
+    ),
     "does not compile": HEADING_MOMENT.replace("math.sin(", "math.sine("),
 }
 
