@@ -314,11 +314,7 @@ def _causes(
                 "parameters": {
                     f.name: {
                         "value": float(state.values[f.name]),
-                        "std": with_timing(
-                            f,
-                            std[f.name] * math.sqrt(weight.colour) * state.wider.get(f.name, 1.0),
-                            dt,
-                        ),
+                        "std": _believed(state, f, std[f.name], weight.colour, dt),
                         "unit": p.unit,
                     }
                     for f, p in zip(search.by_effect[effect], entry.parameters, strict=True)
@@ -354,6 +350,11 @@ def _taken_out(line: vibration.Line) -> str:
 def median_step(records: Sequence[Record]) -> float:
     """Usual time between rows [s]."""
     return float(np.median(np.concatenate([np.diff(r.t) for r in records])))
+
+
+def _believed(state: State, f: FreeParameter, std: float, colour: float, dt: float) -> float:
+    """Std of a number: the signatures', with colour, the likelihood's own curvature and timing."""
+    return with_timing(f, std * math.sqrt(colour) * state.wider.get(f.name, 1.0), dt)
 
 
 def with_timing(parameter: FreeParameter, std: float, dt: float) -> float:
@@ -580,8 +581,7 @@ def _extended(
 
     def std(f: FreeParameter) -> float:
         colour = colours.get(f.name.partition(".")[0], 1.0)
-        wider = math.sqrt(colour) * state.wider.get(f.name, 1.0)
-        return with_timing(f, float(spread[loose.index(f)]) * wider, dt)
+        return _believed(state, f, float(spread[loose.index(f)]), colour, dt)
 
     return fitted_vehicle(
         vehicle,

@@ -251,7 +251,6 @@ class Search:
         self.base = self.model.base_parameters()
         self.by_effect = {e: self.model.effect_parameters(e) for e in self.candidates}
         self.all = self.base + [f for group in self.by_effect.values() for f in group]
-        self.dampings = tuple(e for e in self.candidates if effects.CATALOGUE[e].damps)
 
     def say(self, text: str) -> None:
         """Tell whoever watches."""
@@ -759,7 +758,8 @@ class Search:
                 and not effects.CATALOGUE[offer.effect].replaces
             )[:3]
         }
-        asked = untried(e for e in self.dampings if e not in {*state.active, *banned, *near})
+        dampings = (e for e in self.candidates if effects.CATALOGUE[e].damps)
+        asked = untried(e for e in dampings if e not in {*state.active, *banned, *near})
         promises = self.for_each(lambda e: self.promise(state, quadratic, e), asked)
         near |= {e: at for e, (nats, at) in promises.items() if nats > NEAR * EVIDENCE}
         tried |= {(*state.active, e) for e in asked}

@@ -135,6 +135,14 @@ def test_signatures_are_what_moving_the_parameter_does(tmp_path, also):
     assert shown > 30
 
 
+def search_of(folder: Path, effect: str) -> tuple[Search, State]:
+    """A search for one effect on all runs of a flight, and where it begins."""
+    flight = read_flight(folder)
+    model = HeliModel(LAMA)
+    search = Search(Engine(model, [record_of(run) for run in flight.runs]), model, (effect,))
+    return search, search.begin(starting_noise(flight, LAMA))
+
+
 @pytest.mark.slow
 def test_a_polished_fit_is_at_the_top_of_the_likelihood(tmp_path):
     """Also in gusts, where holding the gains still leaves a slope in the lever arm."""
@@ -145,11 +153,8 @@ def test_a_polished_fit_is_at_the_top_of_the_likelihood(tmp_path):
         runs=("lon_3211", "yaw_3211"),
         seed=7,
     )
-    flight = read_flight(folder)
-    model = HeliModel(LAMA)
-    engine = Engine(model, [record_of(run) for run in flight.runs])
-    search = Search(engine, model, ("imu_lever_arm",))
-    state = search.begin(starting_noise(flight, LAMA))
+    search, state = search_of(folder, "imu_lever_arm")
+    engine = search.engine
     state = search.polish(search.converge(State(["imu_lever_arm"], state.values, state.noise)))
     free = search.free(state.active)
     _, quadratic = search.linearise(state)
@@ -182,10 +187,7 @@ def test_what_the_quadratic_nearly_carries_is_fitted_to_see(tmp_path, monkeypatc
         tmp_path / "flight", {"axial_damping": 0.055}, gusts=True, sensors="onboard",
         runs=("heave_3211", "climb_descend"), seed=1,
     )  # fmt: skip
-    flight = read_flight(folder)
-    model = HeliModel(LAMA)
-    search = Search(Engine(model, [record_of(r) for r in flight.runs]), model, ("axial_damping",))
-    bare = search.begin(starting_noise(flight, LAMA))
+    search, bare = search_of(folder, "axial_damping")
     bare = search.settle(search.refit_noise(search.settle(bare)))
     _, quadratic = search.linearise(bare)
     promised = search.score(quadratic, [], "axial_damping")[0]
@@ -210,10 +212,7 @@ def test_a_damping_promises_what_the_likelihood_says(tmp_path, hidden):
         tmp_path / "flight", {"axial_damping": hidden} if hidden else {}, gusts=True,
         runs=("heave_3211", "climb_descend"), seed=3,
     )  # fmt: skip
-    flight = read_flight(folder)
-    model = HeliModel(LAMA)
-    search = Search(Engine(model, [record_of(r) for r in flight.runs]), model, ("axial_damping",))
-    bare = search.begin(starting_noise(flight, LAMA))
+    search, bare = search_of(folder, "axial_damping")
     bare = search.settle(search.refit_noise(search.settle(bare)), 4, 0.1)
     _, quadratic = search.linearise(bare)
     held = search.score(quadratic, [], "axial_damping")[0]

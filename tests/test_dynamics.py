@@ -915,7 +915,7 @@ def test_no_index_leaves_its_array(lag, tmp_path):
     """
     program = (
         "import gc, numpy as np, coax_env; from coax_env import dynamics as d;"
-        "from numba.core.dispatcher import Dispatcher; from numba import types;"
+        "from numba.core.dispatcher import Dispatcher;"
         "v = coax_env.load_vehicle('lama400d');"
         f"v = v.with_effect('motor_lag', upper={lag}, lower={lag});"
         "x, u = np.ones(26), d.kernel_input(np.full(4, 200.0));"

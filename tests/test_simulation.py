@@ -125,9 +125,13 @@ def test_pilot_brings_every_maneuver_home(vehicle, name):
     assert np.abs(np.stack([track["phi"], track["theta"]])).max() < math.radians(12)
     asked = plan.asked_for(track.t)
     height = -track["z"]
-    assert np.abs(height - asked[:, 0]).max() < (0.8 if name == "climb_descend" else 0.5)
+    slow = 0.8 if vehicle is LAGGING else 0.7
+    assert np.abs(height - asked[:, 0]).max() < (slow if name == "climb_descend" else 0.5)
     assert height.min() > 0.1
-    assert abs(math.remainder(track["psi"][-1] - asked[-1, 3], 2.0 * math.pi)) < 0.15
+    turn = track["psi"][-1] - asked[-1, 3]
+    if vehicle is REACTING:  # thrown round by differential rotor speed
+        turn = math.remainder(turn, 2.0 * math.pi)
+    assert abs(turn) < 0.15
     jumps = np.diff(track.command[:, :2], axis=0)
     assert np.sum(jumps[1:] * jumps[:-1]) > -0.5 * np.sum(jumps**2), "no swing from row to row"
 
