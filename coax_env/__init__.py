@@ -16,31 +16,31 @@ from typing import TYPE_CHECKING, Any
 from coax_env.errors import InputError
 
 if TYPE_CHECKING:
-    from coax_env.diagnosis import diagnose
-    from coax_env.dynamics import derivative, hover_trim
-    from coax_env.flight import read_flight, write_flight
-    from coax_env.identification import identify
-    from coax_env.linear import linearize
-    from coax_env.prediction import replay
-    from coax_env.simulation import simulate
-    from coax_env.user_effects import load_effect
-    from coax_env.vehicle import Vehicle, load_vehicle
+    from coax_env.diagnosis.diagnose import diagnose
+    from coax_env.estimation.prediction import replay
+    from coax_env.identification.identify import identify
+    from coax_env.logs.flight import read_flight, write_flight
+    from coax_env.model.dynamics import derivative, hover_trim
+    from coax_env.model.linear import linearize
+    from coax_env.model.user_effects import load_effect
+    from coax_env.model.vehicle import Vehicle, load_vehicle
+    from coax_env.simulation.simulate import simulate
 
 __version__ = "0.1.0"
 
 _HOME = {
-    "Vehicle": "vehicle",
-    "load_vehicle": "vehicle",
-    "load_effect": "user_effects",
-    "derivative": "dynamics",
-    "hover_trim": "dynamics",
-    "linearize": "linear",
-    "read_flight": "flight",
-    "write_flight": "flight",
-    "simulate": "simulation",
-    "replay": "prediction",
-    "identify": "identification",
-    "diagnose": "diagnosis",
+    "Vehicle": "model.vehicle",
+    "load_vehicle": "model.vehicle",
+    "load_effect": "model.user_effects",
+    "derivative": "model.dynamics",
+    "hover_trim": "model.dynamics",
+    "linearize": "model.linear",
+    "read_flight": "logs.flight",
+    "write_flight": "logs.flight",
+    "simulate": "simulation.simulate",
+    "replay": "estimation.prediction",
+    "identify": "identification.identify",
+    "diagnose": "diagnosis.diagnose",
 }
 
 __all__ = [
@@ -72,8 +72,8 @@ def _register() -> None:
     if "CoaxHeli-v0" not in registry:
         register(
             id="CoaxHeli-v0",
-            entry_point="coax_env.env:CoaxEnv",
-            vector_entry_point="coax_env.env:CoaxVectorEnv",
+            entry_point="coax_env.env.gym_env:CoaxEnv",
+            vector_entry_point="coax_env.env.gym_env:CoaxVectorEnv",
             max_episode_steps=2000,
         )
 

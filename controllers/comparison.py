@@ -4,10 +4,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from coax_env import figures
-from coax_env.fleet import Nominal
+from coax_env.env.fleet import Nominal
+from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.report import figures
 from coax_env.report.page import Section, command, figure, page, prose, table
-from coax_env.vehicle import Vehicle, load_vehicle
 from controllers import lqr, pid, policy, state_feedback
 from controllers.evaluation import evaluate, evaluate_spread
 from controllers.loading import Controller

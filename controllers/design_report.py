@@ -5,11 +5,12 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from coax_env import figures, hover
-from coax_env.env import CoaxVectorEnv
-from coax_env.layout import ATTITUDE, N_STATES, STATES
+from coax_env.env import hover
+from coax_env.env.gym_env import CoaxVectorEnv
+from coax_env.model.layout import ATTITUDE, N_STATES, STATES
+from coax_env.model.vehicle import Vehicle
+from coax_env.report import figures
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
-from coax_env.vehicle import Vehicle
 from controllers.loading import Controller
 from controllers.lqr import LQG, Margins, frequency_responses
 

@@ -19,14 +19,14 @@ from typing import Any
 import numpy as np
 from scipy.linalg import schur
 
-from coax_env import hover
+from coax_env.env import hover
+from coax_env.env.fleet import DT, Nominal, action_map
 from coax_env.errors import InputError
-from coax_env.fleet import DT, Nominal, action_map
-from coax_env.jit import compiled
-from coax_env.layout import CHANNELS, FULL_STATES, N_COMMANDS
-from coax_env.linear import sampled
-from coax_env.sensors import BASE_RATE, Sensor, is_new, slow_instruments, suite
-from coax_env.vehicle import Vehicle
+from coax_env.kernel.compilation import compiled
+from coax_env.model.layout import CHANNELS, FULL_STATES, N_COMMANDS
+from coax_env.model.linear import sampled
+from coax_env.model.sensors import BASE_RATE, Sensor, is_new, slow_instruments, suite
+from coax_env.model.vehicle import Vehicle
 from controllers.feedback import Feedback
 from controllers.target import TargetView, turned
 
@@ -410,7 +410,7 @@ def _predict(command, A_by_state, B_by_command, turn, state):
 
 
 def _trim_readings(vehicle: Vehicle, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    from coax_env.dynamics import readings
+    from coax_env.model.dynamics import readings
 
     found = readings(x, u, vehicle)
     return np.array([found[name] for name in CHANNELS])

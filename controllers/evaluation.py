@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from coax_env import hover, tasks
-from coax_env.env import CoaxVectorEnv
+from coax_env.env import hover, tasks
+from coax_env.env.gym_env import CoaxVectorEnv
 from coax_env.errors import InputError
-from coax_env.layout import PLACE
-from coax_env.vehicle import Vehicle, load_vehicle
+from coax_env.model.layout import PLACE
+from coax_env.model.vehicle import Vehicle, load_vehicle
 from coax_env.workers import each
 from controllers.loading import Controller
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import hover
-from coax_env.fleet import DT, Nominal
-from coax_env.vehicle import Vehicle, load_vehicle
+from coax_env.env import hover
+from coax_env.env.fleet import DT, Nominal
+from coax_env.model.vehicle import Vehicle, load_vehicle
 from controllers.estimator import (
     INTEGRAL_TIME,
     Estimating,

@@ -10,14 +10,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from coax_env import figures
-from coax_env.diagnosis import Diagnosis, diagnose
+from coax_env.diagnosis.diagnose import Diagnosis, diagnose
 from coax_env.errors import InputError
-from coax_env.flight import Flight, read_flight
+from coax_env.logs.flight import Flight, read_flight
+from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.report import figures
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from coax_env.report.worth import FlownControllers
-from coax_env.simulation import simulate
-from coax_env.vehicle import Vehicle, load_vehicle
+from coax_env.simulation.simulate import simulate
 from controllers import lqr, ppo
 from controllers.comparison import HEADER, ratio, score_words
 from controllers.design_report import step_response

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import hover
+from coax_env.env import hover
+from coax_env.env.fleet import DT, Nominal, action_map
 from coax_env.errors import InputError
-from coax_env.fleet import DT, Nominal, action_map
-from coax_env.sensors import suite
-from coax_env.vehicle import Vehicle, load_vehicle
+from coax_env.model.sensors import suite
+from coax_env.model.vehicle import Vehicle, load_vehicle
 from controllers.feedback import Designed, Feedback
 from controllers.target import TargetView, turned
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import hover
-from coax_env.fleet import DT, Nominal
-from coax_env.layout import ACTUATOR_STATES, STATES
-from coax_env.vehicle import Vehicle, load_vehicle
+from coax_env.env import hover
+from coax_env.env.fleet import DT, Nominal
+from coax_env.model.layout import ACTUATOR_STATES, STATES
+from coax_env.model.vehicle import Vehicle, load_vehicle
 from controllers.estimator import design_estimator, integrated_readings
 from controllers.feedback import Designed, Feedback
 from controllers.lqr import regulator_problem

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from coax_env import hover, tasks
-from coax_env.sensors import slow_instruments, suite
+from coax_env.env import hover, tasks
+from coax_env.model.sensors import slow_instruments, suite
 
 REACH = {"place": 0.5, "height": 0.15, "heading": math.radians(10.0)}
 """Farthest point asked for at once [m, m, rad]."""

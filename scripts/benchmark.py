@@ -32,8 +32,8 @@ LIMIT = 300.0  # [s] for one program
 TIMER = """
 import json, time
 import numba, numpy as np
-from coax_env import dynamics
-from coax_env.vehicle import load_vehicle
+from coax_env.model import dynamics
+from coax_env.model.vehicle import load_vehicle
 
 def many_of(step):
     @numba.njit

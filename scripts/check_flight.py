@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import command_line
 
 from coax_env.files import write_json
-from coax_env.foreign_columns import draft_card
-from coax_env.vehicle import load_vehicle
+from coax_env.logs.columns import draft_card
+from coax_env.model.vehicle import load_vehicle
 
 if TYPE_CHECKING:
-    from coax_env.flight_check import FlightCheck
+    from coax_env.inspection.flight_check import FlightCheck
 
 
 def main() -> None:
@@ -26,7 +26,7 @@ def main() -> None:
     if options.draft:
         draft(options.flight, options.vehicle or "lama400d")
         return
-    from coax_env.flight_check import check_flight  # compiles the kernel
+    from coax_env.inspection.flight_check import check_flight  # compiles the kernel
 
     with command_line.progress("check") as say:
         found = check_flight(options.flight, options.vehicle, say)

@@ -14,11 +14,11 @@ import diagnose as diagnose_script
 
 import coax_env
 from coax_env import plain_words
-from coax_env.diagnosis import Diagnosis, diagnose
+from coax_env.diagnosis.diagnose import Diagnosis, diagnose
 from coax_env.files import write_json
-from coax_env.flight import read_flight
+from coax_env.logs.flight import read_flight
+from coax_env.model.vehicle import Vehicle, load_vehicle
 from coax_env.report import FlownControllers
-from coax_env.vehicle import Vehicle, load_vehicle
 from controllers import mended
 
 PACKAGE = Path(coax_env.__file__).resolve().parent

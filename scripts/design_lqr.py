@@ -6,8 +6,8 @@ import sys
 import command_line
 
 from coax_env.files import make_folder, write_text
-from coax_env.sensors import SUITES
-from coax_env.vehicle import load_vehicle
+from coax_env.model.sensors import SUITES
+from coax_env.model.vehicle import load_vehicle
 from controllers import lqr
 from controllers.design_report import (
     MARGIN_HEADER,

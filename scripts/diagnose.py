@@ -12,7 +12,7 @@ from coax_env import load_effect
 from coax_env.files import staged_folder, write_json, write_text
 
 if TYPE_CHECKING:
-    from coax_env.diagnosis import Diagnosis
+    from coax_env.diagnosis.diagnose import Diagnosis
     from coax_env.report import FlownControllers
 
 
@@ -42,7 +42,8 @@ def main() -> None:
     options = parser.parse_args()
     for file in options.effect:
         load_effect(file)
-    from coax_env.diagnosis import diagnose  # compiles the kernel, with the catalogue as it is now
+    # compiles the kernel, with the catalogue as it is now
+    from coax_env.diagnosis.diagnose import diagnose
 
     held = None
     if options.hold_out is not None:
@@ -78,8 +79,8 @@ def save(
 ) -> None:
     """findings.json, vehicle.toml and report.html, all or none; then the next flight's card."""
     from coax_env import report
-    from coax_env.next_maneuver import write_flight_card
-    from coax_env.vehicle import vehicle_toml
+    from coax_env.design.next_maneuver import write_flight_card
+    from coax_env.model.vehicle import vehicle_toml
 
     page = report.diagnosis_page(result, command, flown)
     with staged_folder(out) as folder:

@@ -17,12 +17,12 @@ import numpy as np
 from tqdm import tqdm
 
 from coax_env import load_vehicle
-from coax_env.effects import CATALOGUE
-from coax_env.env import CoaxVectorEnv
+from coax_env.env.gym_env import CoaxVectorEnv
 from coax_env.errors import InputError
 from coax_env.files import write_json
-from coax_env.layout import FULL_STATES
-from coax_env.vehicle import Vehicle
+from coax_env.model.effects import CATALOGUE
+from coax_env.model.layout import FULL_STATES
+from coax_env.model.vehicle import Vehicle
 from controllers import lqr
 
 LONGEST = 2000  # steps of a flight

@@ -8,10 +8,10 @@ from typing import Any
 import command_line
 from tqdm import tqdm
 
+from coax_env.env.hover import CONTROL_PERIOD
+from coax_env.env.tasks import TASKS
 from coax_env.files import make_folder, write_json, write_text
-from coax_env.hover import CONTROL_PERIOD
-from coax_env.tasks import TASKS
-from coax_env.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle, load_vehicle
 from controllers import comparison, load_controller
 from controllers.evaluation import evaluate, evaluate_spread
 from controllers.loading import KINDS, Controller, make_controller

@@ -4,10 +4,10 @@ from dataclasses import fields
 
 import command_line
 
-from coax_env.flight_plan import plan_flight, write_plan
-from coax_env.next_maneuver import Envelope
-from coax_env.sensors import SUITES
-from coax_env.simulation import Gusts
+from coax_env.design.flight_plan import plan_flight, write_plan
+from coax_env.design.next_maneuver import Envelope
+from coax_env.model.sensors import SUITES
+from coax_env.simulation.simulate import Gusts
 
 LIMITS = {
     "lowest": ("least height [m]", 1.0),

@@ -8,8 +8,8 @@ import command_line
 
 from coax_env import report
 from coax_env.errors import InputError
+from coax_env.estimation.prediction import replay
 from coax_env.files import staged_folder, write_json, write_text
-from coax_env.prediction import replay
 
 
 def main() -> None:

@@ -9,11 +9,11 @@ import command_line
 
 from coax_env import report
 from coax_env.files import make_folder, write_text
-from coax_env.flight import write_flight
-from coax_env.maneuvers import MANEUVERS
-from coax_env.sensors import SUITES, log_suite
-from coax_env.simulation import Gusts, doublet_remarks, doublet_table, fly_all, log_flight
-from coax_env.vehicle import load_vehicle, shipped_vehicles
+from coax_env.logs.flight import write_flight
+from coax_env.model.sensors import SUITES, log_suite
+from coax_env.model.vehicle import load_vehicle, shipped_vehicles
+from coax_env.simulation.maneuvers import MANEUVERS
+from coax_env.simulation.simulate import Gusts, doublet_remarks, doublet_table, fly_all, log_flight
 
 
 def main() -> None:

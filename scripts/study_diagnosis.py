@@ -14,7 +14,8 @@ from study.one_flight import fly_and_diagnose
 from study.plan import PlannedFlight
 from tqdm import tqdm
 
-from coax_env import calibration, workers
+from coax_env import workers
+from coax_env.diagnosis import calibration
 from coax_env.errors import InputError
 from coax_env.files import make_folder, write_json, write_text
 from coax_env.report.page import Section, figure, page

@@ -22,22 +22,22 @@ if __name__ == "__main__" and sys.argv[1:2] == [
     import atheris
 
     with atheris.instrument_imports(
-        include=["coax_env.flight", "coax_env.vehicle", "coax_env.log_units", "coax_env.outliers",
-                 "coax_env.foreign_columns", "coax_env.autopilot_logs", "pyulog.core",
-                 "pymavlink.DFReader"],
+        include=["coax_env.logs.flight", "coax_env.model.vehicle", "coax_env.logs.units",
+                 "coax_env.logs.outliers", "coax_env.logs.columns", "coax_env.logs.autopilot_logs",
+                 "pyulog.core", "pymavlink.DFReader"],
     ):  # fmt: skip
         import pyulog.core  # noqa: F401
 
-        import coax_env.autopilot_logs
-        import coax_env.vehicle  # noqa: F401
+        import coax_env.logs.autopilot_logs
+        import coax_env.model.vehicle  # noqa: F401
 
 import numpy as np
 from autopilot_files import dataflash, px4_flight
 
-from coax_env.autopilot_logs import import_log
 from coax_env.errors import InputError
-from coax_env.flight import read_flight
-from coax_env.vehicle import SHIPPED, load_vehicle, vehicle_toml
+from coax_env.logs.autopilot_logs import import_log
+from coax_env.logs.flight import read_flight
+from coax_env.model.vehicle import SHIPPED, load_vehicle, vehicle_toml
 
 CARD = """[vehicle]
 name = "lama400d"

@@ -6,12 +6,13 @@ import injector
 import numpy as np
 import pytest
 
-from coax_env import closed_loop, read_flight
-from coax_env import parameters as P
-from coax_env.engine.fit import Engine
-from coax_env.heli_model import HeliModel, record_of, starting_noise
-from coax_env.search import Search, State
-from coax_env.vehicle import load_vehicle
+from coax_env import read_flight
+from coax_env.diagnosis import closed_loop
+from coax_env.diagnosis.search import Search, State
+from coax_env.estimation.fit import Engine
+from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.model import parameters as P
+from coax_env.model.vehicle import load_vehicle
 
 LAMA = load_vehicle("lama400d")
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import coax_env
-from coax_env import hover, tasks
-from coax_env.dynamics import WORK_SIZE, kernel_input, step
+from coax_env.env import hover, tasks
+from coax_env.env.fleet import DT
 from coax_env.errors import InputError
-from coax_env.fleet import DT
-from coax_env.linear import sampled
+from coax_env.model.dynamics import WORK_SIZE, kernel_input, step
+from coax_env.model.linear import sampled
 from controllers import comparison, load_controller, lqr, mended, pid, policy, state_feedback
 from controllers.estimator import Tracker, design_estimator, integrated_readings
 from controllers.evaluation import evaluate, evaluate_spread
@@ -50,7 +50,7 @@ def exact():
 def test_the_riccati_solution_is_the_simulated_cost(exact):
     """x'Px is the sum of all costs to come, flown with the kernel itself near trim."""
     design = exact.estimator
-    assert design.states[:20] == tuple(n for n, _ in coax_env.layout.FULL_STATES[:20])
+    assert design.states[:20] == tuple(n for n, _ in coax_env.model.layout.FULL_STATES[:20])
     *_, trim, command = sampled(LAMA, DT)
     _, _, Q, R = lqr.regulator_problem(design)
     places = [design.readings.index(name) for name in integrated_readings(design)]
@@ -137,7 +137,7 @@ def test_the_filters_error_has_the_spread_it_states(onboard):
 
 
 def _deviation(truth, trim, design):
-    names = [n for n, _ in coax_env.layout.FULL_STATES]
+    names = [n for n, _ in coax_env.model.layout.FULL_STATES]
     found = truth - trim
     return np.stack([found[:, names.index(s)] for s in design.states[:16]], axis=1)
 
@@ -161,7 +161,7 @@ def test_rows_of_a_batch_are_tracked_alone(onboard):
     """Resetting one row leaves the others, and each is as if it flew alone."""
     design = onboard.estimator
     rng = np.random.default_rng(0)
-    width = len(coax_env.sensors.SUITES["onboard"]) + 3
+    width = len(coax_env.model.sensors.SUITES["onboard"]) + 3
     rows = rng.uniform(0.0, 1.0, (50, 3, width))
     actions = rng.uniform(-0.1, 0.1, (50, 3, 4))
     batch, alone = Tracker(design, 3), Tracker(design, 1)

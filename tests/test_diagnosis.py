@@ -18,17 +18,19 @@ import pytest
 from shared_flights import shared_flight
 
 import coax_env
-from coax_env import diagnose, diagnosis, effects, identify, load_vehicle, read_flight, replay
-from coax_env.diagnosis import Diagnosis
-from coax_env.engine.fit import Engine, objective
+from coax_env import diagnose, identify, load_vehicle, read_flight, replay
+from coax_env.design.next_maneuver import candidates
+from coax_env.diagnosis import diagnose as diagnosis
+from coax_env.diagnosis.diagnose import Diagnosis
+from coax_env.diagnosis.search import Search, State
 from coax_env.errors import InputError
+from coax_env.estimation.fit import Engine, objective
+from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
 from coax_env.files import write_text
-from coax_env.flight import Flight
-from coax_env.heli_model import HeliModel, record_of, starting_noise
-from coax_env.layout import CHANNELS
-from coax_env.next_maneuver import candidates
-from coax_env.search import Search, State
-from coax_env.vehicle import vehicle_toml
+from coax_env.logs.flight import Flight
+from coax_env.model import effects
+from coax_env.model.layout import CHANNELS
+from coax_env.model.vehicle import vehicle_toml
 
 ON_AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
 LAMA = load_vehicle("lama400d")
@@ -197,7 +199,7 @@ def test_what_the_quadratic_nearly_carries_is_fitted_to_see(tmp_path, monkeypatc
     assert worth > promised + 0.5
 
     def found(threshold: float) -> list[str]:
-        monkeypatch.setattr("coax_env.search.EVIDENCE", threshold)
+        monkeypatch.setattr("coax_env.diagnosis.search.EVIDENCE", threshold)
         return search.run(replace(bare, active=[]))[0].active
 
     assert found(0.5 * (promised + worth)) == ["axial_damping"]

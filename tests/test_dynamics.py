@@ -16,9 +16,11 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 from scipy.spatial.transform import Rotation
 
-from coax_env import derivative, dynamics, effects, hover_trim, jit, load_vehicle
-from coax_env import parameters as P
-from coax_env.layout import CHANNELS, N_CHANNELS, N_FULL, N_STATES, STATES
+from coax_env import derivative, hover_trim, load_vehicle
+from coax_env.kernel import compilation
+from coax_env.model import dynamics, effects
+from coax_env.model import parameters as P
+from coax_env.model.layout import CHANNELS, N_CHANNELS, N_FULL, N_STATES, STATES
 
 LAMA = load_vehicle("lama400d")
 COUPLED = LAMA.with_values({"flap_coupling_lon": 0.2, "flap_coupling_lat": -0.3})
@@ -837,11 +839,12 @@ LATE_PROGRAM = """
 import sys
 import numpy as np
 import coax_env
-from coax_env import dynamics, late
+from coax_env.model import dynamics
+from coax_env.kernel import lazy
 
 compiled = []
-make = late.pointer
-late.pointer = lambda kind: lambda f: (compiled.append(f.__name__), make(kind)(f))[1]
+make = lazy.pointer
+lazy.pointer = lambda kind: lambda f: (compiled.append(f.__name__), make(kind)(f))[1]
 x, work = np.zeros(26), np.zeros(dynamics.WORK_SIZE)
 bare = coax_env.load_vehicle("lama400d")
 
@@ -852,13 +855,13 @@ fly(bare)
 print(*compiled, end=";")
 def interrupt(kind):
     raise KeyboardInterrupt
-counting, late.pointer = late.pointer, interrupt
+counting, lazy.pointer = lazy.pointer, interrupt
 loaded = bare.with_effect("added_mass", mass=0.1)
 try:
     fly(loaded)
 except KeyboardInterrupt:
     print("interrupted", end=";")
-late.pointer = counting
+lazy.pointer = counting
 for _ in range(2):
     fly(loaded)
 print(*compiled)
@@ -876,10 +879,10 @@ def test_effects_are_compiled_when_first_flown():
 @pytest.mark.slow
 def test_an_edited_callee_is_compiled_anew(tmp_path):
     """numba alone would still run the old machine code (numerics.md, traps)."""
-    package = Path(jit.__file__).parent
+    package = Path(compilation.__file__).parents[1]
     shutil.copytree(package, tmp_path / "coax_env", ignore=shutil.ignore_patterns("__pycache__"))
     program = (
-        "import numpy as np, coax_env, coax_env.jit as j;"
+        "import numpy as np, coax_env, coax_env.kernel.compilation as j;"
         "v = coax_env.load_vehicle('lama400d').with_effect('yaw_damping', coefficient=0.0025);"
         "x = np.zeros(16); x[5] = 1.0;"
         "print(j.source_hash(), coax_env.derivative(x, np.zeros(4), v)[5])"
@@ -911,10 +914,10 @@ def test_an_edited_callee_is_compiled_anew(tmp_path):
 def test_no_index_leaves_its_array(lag, tmp_path):
     """Compiled code does not look; with numba's bounds checks it does.
 
-    Nor does numba notice an array that is returned by what only borrows its arrays (jit.BORROWING).
+    Nor does numba notice an array that is returned by what only borrows its arrays (BORROWING).
     """
     program = (
-        "import gc, numpy as np, coax_env; from coax_env import dynamics as d;"
+        "import gc, numpy as np, coax_env; from coax_env.model import dynamics as d;"
         "from numba.core.dispatcher import Dispatcher;"
         "v = coax_env.load_vehicle('lama400d');"
         f"v = v.with_effect('motor_lag', upper={lag}, lower={lag});"

@@ -12,14 +12,14 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import coax_env
-from coax_env import hover
-from coax_env.dynamics import WORK_SIZE, kernel_input, step
-from coax_env.env import CoaxVectorEnv
+from coax_env.env import hover
+from coax_env.env.fleet import DT, action_map, nominal_for
+from coax_env.env.gym_env import CoaxVectorEnv
+from coax_env.env.spaces import action_table, observation_table, observed
 from coax_env.errors import InputError
-from coax_env.fleet import DT, action_map, nominal_for
-from coax_env.random_streams import stream_key, two_normals, uniform
-from coax_env.sensors import SUITES, is_new, log_readings, log_suite
-from coax_env.spaces import action_table, observation_table, observed
+from coax_env.kernel.random_streams import stream_key, two_normals, uniform
+from coax_env.model.dynamics import WORK_SIZE, kernel_input, step
+from coax_env.model.sensors import SUITES, is_new, log_readings, log_suite
 
 LAMA = coax_env.load_vehicle("lama400d")
 DELAYED = LAMA.with_effect("servo_delay", time=0.027).with_effect("rotor_drag", coefficient=4e-4)
@@ -40,11 +40,11 @@ def test_check_env_passes_without_a_warning(sensors):
 
 
 def test_the_docstring_has_the_spaces_tables():
-    env = coax_env.env.CoaxEnv()
-    doc = [line.strip() for line in coax_env.env.CoaxEnv.__doc__.splitlines()]
+    env = coax_env.env.gym_env.CoaxEnv()
+    doc = [line.strip() for line in coax_env.env.gym_env.CoaxEnv.__doc__.splitlines()]
     assert set(action_table()) <= set(doc)
     assert set(observation_table(observed(env.fleet))) <= set(doc)
-    aimed = coax_env.env.CoaxEnv(sensors="mocap", task="position")
+    aimed = coax_env.env.gym_env.CoaxEnv(sensors="mocap", task="position")
     assert set(observation_table(observed(aimed.fleet))[-4:]) <= set(doc)
     assert len(env.observation_units) == len(env.observation_names) == 18
     assert env.observation_units[0] == "rev/min" and env.observation_units[-1] == "1"
@@ -81,7 +81,7 @@ def test_import_is_light():
 )  # fmt: skip
 def test_a_wrong_argument_is_named_in_one_line(wrong):
     with pytest.raises(InputError) as error:
-        coax_env.env.CoaxEnv(**wrong)
+        coax_env.env.gym_env.CoaxEnv(**wrong)
     assert "\n" not in str(error.value)
 
 
@@ -236,7 +236,7 @@ def test_rates_are_met_from_the_first_row(rate):
     ],
 )
 def test_flights_end_where_they_must(state, over):
-    names = [name for name, _ in coax_env.layout.STATES]
+    names = [name for name, _ in coax_env.model.layout.STATES]
     start = np.zeros(16)
     start[15] = -1.5
     for name, value in state.items():
@@ -357,7 +357,7 @@ def test_a_drawn_vehicle_is_told_and_flown():
 def test_a_log_has_the_suites_channels_rates_and_noise():
     time = np.arange(0.0, 20.0, 0.01)
     truth = np.zeros((len(time), 18))
-    truth[:, coax_env.layout.CHANNELS.index("h")] = 1.5
+    truth[:, coax_env.model.layout.CHANNELS.index("h")] = 1.5
     log = log_readings(truth, time, log_suite("onboard"), np.random.default_rng(0))
     assert set(log) == {s.name for s in SUITES["onboard"]}
     for sensor in log_suite("onboard"):

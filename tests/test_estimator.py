@@ -9,12 +9,13 @@ import math
 import numpy as np
 import pytest
 
-from coax_env import hover, hover_trim, load_vehicle
-from coax_env.dynamics import derivative
-from coax_env.fleet import DT
-from coax_env.layout import CHANNELS, FULL_STATES
-from coax_env.random_streams import stream_key
-from coax_env.sensors import is_new, suite
+from coax_env import hover_trim, load_vehicle
+from coax_env.env import hover
+from coax_env.env.fleet import DT
+from coax_env.kernel.random_streams import stream_key
+from coax_env.model.dynamics import derivative
+from coax_env.model.layout import CHANNELS, FULL_STATES
+from coax_env.model.sensors import is_new, suite
 from controllers import estimator
 from controllers.estimator import BIAS_STD, Tracker, delay_as_lag, design_estimator
 

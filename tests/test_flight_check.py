@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coax_env.engine.model import Noise
+from coax_env.diagnosis.search import Search, State
 from coax_env.errors import InputError
-from coax_env.flight import Flight, read_flight, write_flight
-from coax_env.flight_check import (
+from coax_env.estimation.state_space import Noise
+from coax_env.inspection.flight_check import (
     FlightCheck,
     _channels,
     _next_step,
@@ -21,11 +21,11 @@ from coax_env.flight_check import (
     _suspicions,
     check_flight,
 )
-from coax_env.foreign_columns import draft_card, guesses
-from coax_env.search import Search, State
-from coax_env.sensors import log_suite
-from coax_env.simulation import fly_all, log_flight
-from coax_env.vehicle import load_vehicle
+from coax_env.logs.columns import draft_card, guesses
+from coax_env.logs.flight import Flight, read_flight, write_flight
+from coax_env.model.sensors import log_suite
+from coax_env.model.vehicle import load_vehicle
+from coax_env.simulation.simulate import fly_all, log_flight
 
 LAMA = load_vehicle("lama400d")
 

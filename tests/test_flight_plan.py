@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from coax_env import identify, load_vehicle, read_flight, simulate
+from coax_env.design.flight_plan import plan_flight, stirring, write_plan
+from coax_env.design.next_maneuver import Envelope
 from coax_env.errors import InputError
-from coax_env.flight_plan import plan_flight, stirring, write_plan
-from coax_env.multisine import UPDATE, harmonics, multisines, relative_peak_factor
-from coax_env.next_maneuver import Envelope
-from coax_env.simulation import fly
+from coax_env.simulation.multisine import UPDATE, harmonics, multisines, relative_peak_factor
+from coax_env.simulation.simulate import fly
 
 LAMA = load_vehicle("lama400d")
 

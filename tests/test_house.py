@@ -12,33 +12,24 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("coax_env", "controllers")
 
-GROUND = "errors files layout log_units workers"
-MODEL = "parameters flow effects dynamics generic_terms jit late random_streams"
-RECORDS = "flight foreign_columns outliers autopilot_logs"
-MACHINE = "vehicle maneuvers multisine sensors"
-ENVIRONMENT = "env fleet hover"
-FITTING = (
-    "heli_model prediction gain search diagnosis next_maneuver unlisted vibration identification "
-    "flight_plan flight_check two_step closed_loop calibration trajectories"
+FLOORS = (
+    "errors plain_words",
+    "files workers",
+    "kernel",
+    "model",
+    "env logs",
+    "simulation",
+    "estimation",
+    "design",
+    "identification diagnosis",
+    "inspection",
+    "report",
 )
-SHOWN = "figures report"
-WORDS = "plain_words consequences"
+"""Rooms of coax_env from the ground up: a room may import from the floors below it, and from itself.
 
-# what may not be reached from what, over any number of imports, those inside functions too
-ARROWS: tuple[tuple[str, str, str], ...] = (
-    ("the ground knows nothing above it",
-     GROUND, f"{MODEL} {RECORDS} {MACHINE} {ENVIRONMENT} {FITTING} {SHOWN} {WORDS} engine"),
-    ("the model knows no flight, no task, no fit",
-     MODEL, f"{RECORDS} {ENVIRONMENT} {FITTING} {SHOWN} {WORDS} engine simulation pilot"),
-    ("flights are read without the model",
-     "flight foreign_columns outliers log_units", f"{MODEL} {FITTING} {ENVIRONMENT} vehicle engine"),
-    ("a vehicle is a file, not a flight", "vehicle", f"{ENVIRONMENT} {FITTING} {SHOWN} engine"),
-    ("the environment does not know how it was identified",
-     ENVIRONMENT, f"{FITTING} {SHOWN} {WORDS} engine flight"),
-    ("fits do not fly the environment", FITTING, "env fleet"),
-    ("numbers do not know how they are shown",
-     f"{FITTING} {ENVIRONMENT} engine simulation linear pilot", SHOWN),
-)  # fmt: skip
+Rooms on one floor are siblings: neither imports the other.
+"""
+FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms.split()}
 
 
 def module_name(path: Path) -> str:
@@ -50,32 +41,23 @@ def modules() -> dict[str, Path]:
     return {module_name(p): p for package in PACKAGES for p in (ROOT / package).rglob("*.py")}
 
 
-def imported(path: Path, also_later: bool = True) -> set[str]:
-    """Names that a file imports; `also_later`: inside functions too. Not those for type checkers."""
+def imported(path: Path) -> set[str]:
+    """Names that a file imports: also inside functions, and for type checkers only."""
     found: set[str] = set()
-
-    def visit(node: ast.AST) -> None:
-        for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
-                continue
-            if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) and not also_later:
-                continue
-            if isinstance(child, ast.Import):
-                found.update(a.name for a in child.names)
-            elif isinstance(child, ast.ImportFrom) and child.module:
-                assert child.level == 0, f"{path}: import by full names"
-                found.update(f"{child.module}.{a.name}" for a in child.names)
-            visit(child)
-
-    visit(ast.parse(path.read_text(encoding="utf-8")))
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found.update(a.name for a in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{path}: import by full names"
+            found.update(f"{node.module}.{a.name}" for a in node.names)
     return found
 
 
 @cache
-def direct(name: str, also_later: bool = True) -> frozenset[str]:
+def direct(name: str) -> frozenset[str]:
     """Modules of the project that one imports."""
     result = set()
-    for target in imported(modules()[name], also_later):
+    for target in imported(modules()[name]):
         while target and target not in modules():
             target = target.rpartition(".")[0]
         if target and target not in (name, "coax_env"):  # the front door imports on demand
@@ -96,30 +78,38 @@ def reached(name: str) -> dict[str, str]:
     return found
 
 
-def within(name: str, group: str) -> bool:
-    own = name.removeprefix("coax_env.").split(".")[0]
-    return name.startswith("coax_env.") and own in group.split()
+def room(name: str) -> str:
+    """The room of a module of coax_env; the front door and the controllers are none."""
+    parts = name.split(".")
+    return parts[1] if parts[0] == "coax_env" and len(parts) > 1 else ""
 
 
-def test_the_groups_name_what_there_is():
-    top = {name.split(".")[1] for name in modules() if name.startswith("coax_env.")}
-    for _, lower, upper in ARROWS:
-        assert set(f"{lower} {upper}".split()) <= top, set(f"{lower} {upper}".split()) - top
+def test_every_room_is_on_a_floor():
+    assert {room(name) for name in modules()} - {""} == set(FLOOR)
 
 
-@pytest.mark.parametrize(("rule", "lower", "upper"), ARROWS, ids=[a[0] for a in ARROWS])
-def test_imports_point_one_way(rule, lower, upper):
+def test_imports_point_down():
     for name in modules():
-        if within(name, lower):
-            for target, by in reached(name).items():
-                assert not within(target, upper), f"{name} reaches {target} by {by}: {rule}"
+        for target in direct(name):
+            here, there = room(name), room(target)
+            if here and there and here != there:
+                assert FLOOR[there] < FLOOR[here], f"{name} imports {target}"
 
 
-def test_the_engine_knows_no_helicopter():
+def test_flights_are_read_without_a_model():
+    """Names and units of the channels are all that the reader knows of the helicopter."""
     for name in modules():
-        if within(name, "engine"):
+        if room(name) == "logs":
             for target in reached(name):
-                assert within(target, "engine jit"), f"{name} reaches {target}"
+                assert room(target) != "model" or target == "coax_env.model.layout", (
+                    f"{name} reaches {target}"
+                )
+
+
+@pytest.mark.parametrize("name", ["fit", "kalman", "quadratic", "state_space", "whiteness"])
+def test_the_engine_knows_no_helicopter(name):
+    for target in reached(f"coax_env.estimation.{name}"):
+        assert room(target) in ("estimation", "kernel"), f"{name} reaches {target}"
 
 
 def test_the_package_knows_neither_controllers_nor_scripts_nor_tests():
@@ -131,13 +121,13 @@ def test_the_package_knows_neither_controllers_nor_scripts_nor_tests():
 
 
 def test_no_circle():
-    """Of imports at the top of files; those inside functions may look back."""
+    """Of any imports, inside functions and in annotations too."""
     done: set[str] = set()
 
     def follow(name: str, path: tuple[str, ...]) -> None:
         assert name not in path, " -> ".join([*path[path.index(name) :], name])
         if name not in done:
-            for target in direct(name, False):
+            for target in direct(name):
                 follow(target, (*path, name))
             done.add(name)
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from coax_env import hover, tasks
-from coax_env.layout import STATES
-from coax_env.random_streams import stream_key
-from coax_env.sensors import suite
+from coax_env.env import hover, tasks
+from coax_env.kernel.random_streams import stream_key
+from coax_env.model.layout import STATES
+from coax_env.model.sensors import suite
 
 X = {name: i for i, (name, _) in enumerate(STATES)}
 DEGREE = math.pi / 180.0

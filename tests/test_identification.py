@@ -8,8 +8,8 @@ from scipy.stats import chi2
 
 from coax_env import identify, load_vehicle, simulate
 from coax_env.errors import InputError
-from coax_env.heli_model import HeliModel
-from coax_env.prediction import fly_again, pooled_rms
+from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.prediction import fly_again, pooled_rms
 
 LAMA = load_vehicle("lama400d")
 AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
@@ -54,8 +54,8 @@ def test_from_a_file_with_every_number_a_fifth_off(flight, factors):
 
 
 def _engine(flight):
-    from coax_env.engine.fit import Engine
-    from coax_env.heli_model import record_of
+    from coax_env.estimation.fit import Engine
+    from coax_env.estimation.helicopter import record_of
 
     return Engine(HeliModel(LAMA), [record_of(run) for run in flight.runs])
 

@@ -11,7 +11,7 @@ import pytest
 from shared_flights import shared_flight
 
 import coax_env
-from coax_env.flight import read_flight
+from coax_env.logs.flight import read_flight
 
 
 def test_it_shares_no_code_with_the_package() -> None:

@@ -19,7 +19,7 @@ from test_study import row_of
 
 from coax_env import load_vehicle, read_flight
 from coax_env.files import staged_folder, write_json, write_text
-from coax_env.flight import write_flight
+from coax_env.logs.flight import write_flight
 
 pytestmark = [
     pytest.mark.slow,
@@ -160,8 +160,8 @@ def short_flight(folder: Path) -> Path:
     """Three seconds of a simulated doublet."""
     from dataclasses import replace
 
-    from coax_env.sensors import log_suite
-    from coax_env.simulation import fly_all, log_flight
+    from coax_env.model.sensors import log_suite
+    from coax_env.simulation.simulate import fly_all, log_flight
 
     flight = log_flight(LAMA, fly_all(LAMA, ["lon_doublet"], seed=1), log_suite("onboard"), seed=1)
     run = flight.runs[0]

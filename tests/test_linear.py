@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import coax_env
-from coax_env.dynamics import WORK_SIZE, full_state, kernel_input, step
-from coax_env.layout import CHANNELS, COMMANDS, STATES
-from coax_env.linear import FASTEST_LAG, sampled, with_lags
+from coax_env.model.dynamics import WORK_SIZE, full_state, kernel_input, step
+from coax_env.model.layout import CHANNELS, COMMANDS, STATES
+from coax_env.model.linear import FASTEST_LAG, sampled, with_lags
 
 LAMA = coax_env.load_vehicle("lama400d")
 LAGGING = (

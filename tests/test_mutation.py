@@ -78,7 +78,7 @@ def test_a_draw_takes_every_part_in_turn_and_does_not_depend_on_other_code():
         assert sum(m.file in files for m in drawn) == 15
     assert draw.draw(found, 20, seed=3) == drawn[:20]
     assert draw.draw(found, 60, seed=4) != drawn
-    without = [m for m in found if m.file != "coax_env/sensors.py"]
+    without = [m for m in found if m.file != "coax_env/model/sensors.py"]
     kept = [m for m in drawn if m.file in draw.PARTS["model"]]
     again = [m for m in draw.draw(without, 60, seed=3) if m.file in draw.PARTS["model"]]
     assert again == kept

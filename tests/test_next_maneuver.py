@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 
 from coax_env import load_vehicle, read_flight
-from coax_env.engine.fit import Engine
-from coax_env.engine.model import Noise
-from coax_env.heli_model import HeliModel, record_of, starting_noise
-from coax_env.layout import CHANNELS
-from coax_env.maneuvers import AXES, Maneuver, maneuver, steps_3211
-from coax_env.next_maneuver import (
+from coax_env.design.next_maneuver import (
     ROW,
     Alternative,
     Envelope,
@@ -22,8 +17,13 @@ from coax_env.next_maneuver import (
     distance,
     write_flight_card,
 )
-from coax_env.search import Search, State
-from coax_env.simulation import Gusts, fly, simulate
+from coax_env.diagnosis.search import Search, State
+from coax_env.estimation.fit import Engine
+from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.state_space import Noise
+from coax_env.model.layout import CHANNELS
+from coax_env.simulation.maneuvers import AXES, Maneuver, maneuver, steps_3211
+from coax_env.simulation.simulate import Gusts, fly, simulate
 
 LAMA = load_vehicle("lama400d")
 MODEL = HeliModel(LAMA)

@@ -9,12 +9,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import coax_env
-from coax_env import scene
-from coax_env.env import CoaxEnv, CoaxVectorEnv
+from coax_env.env import scene
+from coax_env.env.gym_env import CoaxEnv, CoaxVectorEnv
 from coax_env.errors import InputError
 
 pygame = pytest.importorskip("pygame")
-rendering = pytest.importorskip("coax_env.rendering")
+rendering = pytest.importorskip("coax_env.env.rendering")
 
 LAMA = coax_env.load_vehicle("lama400d")
 TRIM = coax_env.hover_trim(LAMA)[0]
@@ -26,7 +26,7 @@ def no_screen(monkeypatch):
 
 
 def picture(**state: float) -> np.ndarray:
-    names = [name for name, _ in coax_env.layout.STATES]
+    names = [name for name, _ in coax_env.model.layout.STATES]
     start = np.array(TRIM)
     for name, value in state.items():
         start[names.index(name)] = value

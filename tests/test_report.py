@@ -11,28 +11,19 @@ import diagnose as diagnose_script
 import numpy as np
 import pytest
 
-from coax_env import (
-    consequences,
-    derivative,
-    effects,
-    figures,
-    hover_trim,
-    identify,
-    load_vehicle,
-    plain_words,
-    report,
-    simulate,
-)
-from coax_env import simulation as sim
-from coax_env.diagnosis import Diagnosis
-from coax_env.engine.whiteness import Whiteness
-from coax_env.identification import RunEstimate
-from coax_env.layout import STATES
-from coax_env.prediction import ChannelReplay, RunReplay
+from coax_env import derivative, hover_trim, identify, load_vehicle, plain_words, report, simulate
+from coax_env.diagnosis.diagnose import Diagnosis
+from coax_env.estimation.prediction import ChannelReplay, RunReplay
+from coax_env.estimation.trajectories import RESTART, trajectories
+from coax_env.estimation.whiteness import Whiteness
+from coax_env.identification.identify import RunEstimate
+from coax_env.model import effects
+from coax_env.model.layout import STATES
+from coax_env.model.vehicle import Parameter
+from coax_env.report import consequences, figures
 from coax_env.report.flight_view import flight_view
 from coax_env.report.page import figure, inline, table
-from coax_env.trajectories import RESTART, trajectories
-from coax_env.vehicle import Parameter
+from coax_env.simulation import simulate as sim
 
 LAMA = load_vehicle("lama400d")
 CHANNELS = ("h", "phi", "az")
@@ -666,7 +657,7 @@ def test_the_measured_path_is_the_flight_s(pushed):
 
 def test_a_long_flight_has_fewer_frames(pushed, monkeypatch):
     flight, machine, paths = pushed
-    monkeypatch.setattr("coax_env.trajectories.MOST_FRAMES", 200)
+    monkeypatch.setattr("coax_env.estimation.trajectories.MOST_FRAMES", 200)
     thin = trajectories(flight, machine, {"bare": LAMA})
     assert sum(len(p.t) for p in thin) <= 200 < sum(len(p.t) for p in paths)
 

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coax_env import load_vehicle, period
-from coax_env.actuators import limit, limits
-from coax_env.fleet import action_map
-from coax_env.layout import CHANNELS
-from coax_env.parameters import GUST_MEMORY
-from coax_env.random_streams import stream_key
-from coax_env.sensors import is_new, log_readings, shake, suite
+from coax_env import load_vehicle
+from coax_env.env import period
+from coax_env.env.fleet import action_map
+from coax_env.kernel.random_streams import stream_key
+from coax_env.model.actuators import limit, limits
+from coax_env.model.layout import CHANNELS
+from coax_env.model.parameters import GUST_MEMORY
+from coax_env.model.sensors import is_new, log_readings, shake, suite
 
 LAMA = load_vehicle("lama400d")
 TIME = np.arange(0.0, 20.0, 0.01)
@@ -177,7 +178,7 @@ def test_gusts_are_stationary_with_their_memory():
 
 
 def table_of(*sensors, flags=()) -> np.ndarray:
-    from coax_env.fleet import _sensor_table
+    from coax_env.env.fleet import _sensor_table
 
     return _sensor_table(sensors, flags)
 

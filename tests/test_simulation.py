@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from coax_env import InputError, dynamics, load_vehicle, read_flight, simulate, write_flight
-from coax_env import simulation as sim
-from coax_env.layout import CHANNELS
-from coax_env.maneuvers import MANEUVERS, Maneuver, maneuver
-from coax_env.sensors import SUITES
+from coax_env import InputError, load_vehicle, read_flight, simulate, write_flight
+from coax_env.model import dynamics
+from coax_env.model.layout import CHANNELS
+from coax_env.model.sensors import SUITES
+from coax_env.simulation import simulate as sim
+from coax_env.simulation.maneuvers import MANEUVERS, Maneuver, maneuver
 
 LAMA = load_vehicle("lama400d")
 

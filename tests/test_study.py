@@ -21,12 +21,13 @@ from study.baselines import Gram, by_bic, by_f, sparse, stepwise
 from study.one_flight import catalogue_values, expected_evidence, fly_and_diagnose, hide
 from study.plan import PlannedFlight
 
-from coax_env import calibration, load_vehicle, read_flight
-from coax_env.effects import CATALOGUE
-from coax_env.engine.fit import Engine
+from coax_env import load_vehicle, read_flight
+from coax_env.diagnosis import calibration
+from coax_env.diagnosis.search import EVIDENCE
 from coax_env.errors import InputError
-from coax_env.heli_model import HeliModel, record_of, starting_noise
-from coax_env.search import EVIDENCE
+from coax_env.estimation.fit import Engine
+from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.model.effects import CATALOGUE
 
 # --- the plan ---------------------------------------------------------------------------------------
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.signal import welch
 
+from coax_env.env.fleet import DT
+from coax_env.env.turbulence import FOOT, SEVERITIES, dryden, settle, spectrum, stir, wind_at_6m
 from coax_env.errors import InputError
-from coax_env.fleet import DT
-from coax_env.random_streams import stream_key
-from coax_env.turbulence import FOOT, SEVERITIES, dryden, settle, spectrum, stir, wind_at_6m
+from coax_env.kernel.random_streams import stream_key
 
 
 def eddies_of(seed: int, rows: int, height: float, wind: float) -> np.ndarray:

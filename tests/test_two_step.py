@@ -18,22 +18,32 @@ from scipy.stats import binom
 from scipy.stats import t as student
 
 import coax_env
-from coax_env import dynamics, identify, load_vehicle, simulate
+from coax_env import identify, load_vehicle, simulate
 from coax_env.errors import InputError
 from coax_env.files import write_text
-from coax_env.flight import Run
-from coax_env.simulation import Gusts, fly_all
-from coax_env.two_step import method, modes
-from coax_env.two_step.modes import MODES, PHYSICS, fit_mode, fit_physics, joined, rows_of
-from coax_env.two_step.processing import (
+from coax_env.identification.two_step import method, modes
+from coax_env.identification.two_step.modes import (
+    MODES,
+    PHYSICS,
+    fit_mode,
+    fit_physics,
+    joined,
+    rows_of,
+)
+from coax_env.identification.two_step.processing import (
     even_grid,
     integrated,
     lagrange_derivative,
     low_pass,
     spectral_amplitude_filter,
 )
-from coax_env.two_step.published import direction, lift_artefact, predicted, table_viii
-from coax_env.two_step.reconstruction import (
+from coax_env.identification.two_step.published import (
+    direction,
+    lift_artefact,
+    predicted,
+    table_viii,
+)
+from coax_env.identification.two_step.reconstruction import (
     BIAS,
     THETA,
     H,
@@ -43,7 +53,7 @@ from coax_env.two_step.reconstruction import (
     flapping,
     longitudinal,
 )
-from coax_env.two_step.regression import (
+from coax_env.identification.two_step.regression import (
     Regression,
     _autocovariance,
     _from_draws,
@@ -55,7 +65,10 @@ from coax_env.two_step.regression import (
     least_squares,
     total_least_squares,
 )
-from coax_env.vehicle import vehicle_toml
+from coax_env.logs.flight import Run
+from coax_env.model import dynamics
+from coax_env.model.vehicle import vehicle_toml
+from coax_env.simulation.simulate import Gusts, fly_all
 
 LAMA = load_vehicle("lama400d")
 DEGREE = np.pi / 180.0

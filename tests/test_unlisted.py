@@ -15,12 +15,14 @@ import injector
 import numpy as np
 import pytest
 
-from coax_env import InputError, derivative, diagnose, effects, load_vehicle, read_flight, vibration
-from coax_env.dynamics import hover_trim
-from coax_env.generic_terms import AXES, TERMS, hover_speeds
-from coax_env.layout import N_STATES, STATES
-from coax_env.simulation import Gusts, simulate
-from coax_env.vehicle import Vehicle, vehicle_toml
+from coax_env import InputError, derivative, diagnose, load_vehicle, read_flight
+from coax_env.diagnosis import vibration
+from coax_env.model import effects
+from coax_env.model.dynamics import hover_trim
+from coax_env.model.generic_terms import AXES, TERMS, hover_speeds
+from coax_env.model.layout import N_STATES, STATES
+from coax_env.model.vehicle import Vehicle, vehicle_toml
+from coax_env.simulation.simulate import Gusts, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 LAMA = load_vehicle("lama400d")
@@ -183,8 +185,8 @@ def test_a_listed_effect_comes_before_unlisted_terms(tmp_path):
 HEADING_MOMENT = '''
 import math
 import numpy as np
-from coax_env import flow as F
-from coax_env.effects import LOAD, EffectParameter, effect
+from coax_env.model import workspace as F
+from coax_env.model.effects import LOAD, EffectParameter, effect
 
 @effect(LOAD, EffectParameter("k", "N m", usual=0.02, smallest=0.002),
         channels="q theta", source="seen on the bench")
@@ -324,7 +326,7 @@ def test_our_own_vibration_is_found_and_taken_out(sensors):
 
 
 def test_vibration_is_reading_noise_to_the_filter():
-    from coax_env.heli_model import starting_noise
+    from coax_env.estimation.helicopter import starting_noise
 
     flight = simulate(LAMA, "hover", seed=1)
     shaking = LAMA.with_effect("vibration", amplitude=0.4)

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coax_env import InputError, effects, load_vehicle, parameters
-from coax_env.vehicle import Parameter, shipped_vehicles, vehicle_toml
+from coax_env import InputError, load_vehicle
+from coax_env.model import effects, parameters
+from coax_env.model.vehicle import Parameter, shipped_vehicles, vehicle_toml
 
 LAMA = load_vehicle("lama400d")
 

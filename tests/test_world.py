@@ -10,16 +10,17 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import coax_env
-from coax_env import dynamics, effects, hover, tasks
-from coax_env.actuators import limit, limits
-from coax_env.env import CoaxEnv, CoaxVectorEnv
+from coax_env.env import hover, tasks
+from coax_env.env.fleet import DT
+from coax_env.env.gym_env import CoaxEnv, CoaxVectorEnv
+from coax_env.env.turbulence import dryden
 from coax_env.errors import InputError
-from coax_env.fleet import DT
-from coax_env.layout import CHANNELS
-from coax_env.sensors import SUITES, log_suite, suite
-from coax_env.simulation import _SwashDelay, fly
-from coax_env.turbulence import dryden
-from coax_env.vehicle import load_vehicle, vehicle_toml
+from coax_env.model import dynamics, effects
+from coax_env.model.actuators import limit, limits
+from coax_env.model.layout import CHANNELS
+from coax_env.model.sensors import SUITES, log_suite, suite
+from coax_env.model.vehicle import load_vehicle, vehicle_toml
+from coax_env.simulation.simulate import _SwashDelay, fly
 
 LAMA = load_vehicle("lama400d")
 DRAGGED = LAMA.with_effect("rotor_drag", coefficient=4e-4)

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from coax_env import effects
-from coax_env.consequences import NORMAL_95, outside_usual, sigmas, told
+from coax_env.model import effects
+from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import (
     and_list,
     capital,
@@ -14,8 +14,8 @@ from coax_env.plain_words import (
     title,
     unit_name,
 )
+from coax_env.report.consequences import NORMAL_95, outside_usual, sigmas, told
 from coax_env.report.page import Markup, bullets, callout, card, cards, datum, numbers_table, prose
-from coax_env.vehicle import Vehicle
 
 Findings = Mapping[str, Any]
 

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coax_env import effects, figures
-from coax_env.engine.whiteness import SHARE
+from coax_env.estimation.prediction import RunReplay, rms
+from coax_env.estimation.trajectories import RESTART, trajectories
+from coax_env.estimation.whiteness import SHARE
+from coax_env.model import effects
+from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import (
     and_list,
     capital,
@@ -23,7 +26,7 @@ from coax_env.plain_words import (
     whole_percent,
     with_std,
 )
-from coax_env.prediction import RunReplay, rms
+from coax_env.report import figures
 from coax_env.report.causes import cause_blocks, look_alike_blocks
 from coax_env.report.flight_view import flight_view
 from coax_env.report.flown import data_blocks, ordered, points_each, prediction_figure
@@ -41,11 +44,9 @@ from coax_env.report.page import (
     table,
 )
 from coax_env.report.worth import FlownControllers, controller_blocks, gain_blocks, gain_tiles
-from coax_env.trajectories import RESTART, trajectories
-from coax_env.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from coax_env.diagnosis import Diagnosis
+    from coax_env.diagnosis.diagnose import Diagnosis
 
 Findings = Mapping[str, Any]
 MOST_INNOVATION_FIGURES = 60

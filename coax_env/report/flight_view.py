@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.figures import MEASURED, numbers
+from coax_env.estimation.trajectories import Trajectory
+from coax_env.report.figures import MEASURED, numbers
 from coax_env.report.page import data_script, inline
-from coax_env.trajectories import Trajectory
 
 LEAST_ROOM = 1.8  # m from the camera to the machine
 SPEEDS = ("0.25", "0.5", "1", "2", "4")

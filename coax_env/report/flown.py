@@ -4,11 +4,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from coax_env import figures
-from coax_env.flight import Flight, Run
-from coax_env.layout import ANGLES, CHANNEL_UNITS, CHANNELS
+from coax_env.estimation.prediction import RunReplay
+from coax_env.logs.flight import Flight, Run
+from coax_env.model.layout import ANGLES, CHANNEL_UNITS, CHANNELS
 from coax_env.plain_words import channel_name, number, unit_name
-from coax_env.prediction import RunReplay
+from coax_env.report import figures
 from coax_env.report.page import bullets, details, prose, table
 
 POINTS_PER_PAGE = 30_000

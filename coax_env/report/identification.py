@@ -4,11 +4,12 @@ from collections.abc import Sequence
 
 from scipy.stats import chi2
 
-from coax_env import figures
-from coax_env.flight import Flight
-from coax_env.identification import RunEstimate
+from coax_env.estimation.prediction import RunReplay
+from coax_env.identification.identify import RunEstimate
+from coax_env.logs.flight import Flight
+from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import and_list, capital, channel_name, number, plain, with_std
-from coax_env.prediction import RunReplay
+from coax_env.report import figures
 from coax_env.report.flown import data_blocks, ordered, points_each, prediction_figure
 from coax_env.report.page import (
     Section,
@@ -21,7 +22,6 @@ from coax_env.report.page import (
     prose,
     table,
 )
-from coax_env.vehicle import Vehicle
 
 DOUBT = 0.001
 """Chance below which a run disagrees with the others."""

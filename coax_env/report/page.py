@@ -17,7 +17,7 @@ from importlib import resources
 from typing import Any
 
 from coax_env.errors import require
-from coax_env.figures import Figure, template
+from coax_env.report.figures import Figure, template
 
 
 @dataclass(frozen=True)

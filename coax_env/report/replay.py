@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import figures
+from coax_env.estimation.prediction import Replay
 from coax_env.plain_words import and_list, capital, channel_name, number, seconds, unit_name
-from coax_env.prediction import Replay
+from coax_env.report import figures
 from coax_env.report.flown import data_blocks, ordered, points_each, prediction_figure
 from coax_env.report.page import Section, chooser, command, details, figure, page, table
 

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coax_env import figures
-from coax_env.layout import RPM_PER_RAD_S
+from coax_env.model.layout import RPM_PER_RAD_S
+from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import and_list, capital, number, plain
+from coax_env.report import figures
 from coax_env.report.page import (
     Section,
     bullets,
@@ -18,8 +19,7 @@ from coax_env.report.page import (
     side_by_side,
     table,
 )
-from coax_env.simulation import REDUCED_K_B, DoubletRow, Remark, Track
-from coax_env.vehicle import Vehicle
+from coax_env.simulation.simulate import REDUCED_K_B, DoubletRow, Remark, Track
 
 POINTS = 3600
 """Per curve, all maneuvers of a page together: it is to stay under 6 MB."""

@@ -4,8 +4,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coax_env import figures
+from coax_env.identification.two_step.method import PhysicalFit, Reconstructed, TwoStep
+from coax_env.identification.two_step.modes import ModeFit
+from coax_env.identification.two_step.processing import CUTOFF, ORDER, SEGMENT
+from coax_env.identification.two_step.published import (
+    direction,
+    lift_artefact,
+    predicted,
+    table_viii,
+)
+from coax_env.identification.two_step.reconstruction import BIAS, THETA, H, U, W
+from coax_env.identification.two_step.regression import MOST_INFLATION, Regression
 from coax_env.plain_words import and_list, capital, number, plain, with_std
+from coax_env.report import figures
 from coax_env.report.page import (
     Section,
     bullets,
@@ -17,12 +28,6 @@ from coax_env.report.page import (
     prose,
     table,
 )
-from coax_env.two_step.method import PhysicalFit, Reconstructed, TwoStep
-from coax_env.two_step.modes import ModeFit
-from coax_env.two_step.processing import CUTOFF, ORDER, SEGMENT
-from coax_env.two_step.published import direction, lift_artefact, predicted, table_viii
-from coax_env.two_step.reconstruction import BIAS, THETA, H, U, W
-from coax_env.two_step.regression import MOST_INFLATION, Regression
 
 POINTS = 500
 DEGREES = 180.0 / np.pi

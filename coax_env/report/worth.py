@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from coax_env import figures
-from coax_env.generic_terms import AXES, TERMS
+from coax_env.model.generic_terms import AXES, TERMS
 from coax_env.plain_words import and_list, channel_name, number, seconds, unit_name, whole_percent
+from coax_env.report import figures
 from coax_env.report.flown import ordered
 from coax_env.report.page import Markup, datum, figure, numbers_table, prose, table, tiles
 

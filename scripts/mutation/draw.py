@@ -10,17 +10,21 @@ from mutation.sites import Mutation, sites
 
 EQUIVALENT = Path(__file__).with_name("equivalent.toml")
 
+_MODEL = "coax_env/model/"
+_ENV = "coax_env/env/"
+_ESTIMATION = "coax_env/estimation/"
+_TWO_STEP = "coax_env/identification/two_step/"
+_DIAGNOSIS = "coax_env/diagnosis/"
 PARTS: dict[str, tuple[str, ...]] = {
-    "model": ("coax_env/dynamics.py", "coax_env/effects.py", "coax_env/turbulence.py",
-              "coax_env/linear.py", "coax_env/vehicle.py"),
-    "sensors": ("coax_env/sensors.py", "coax_env/actuators.py", "coax_env/period.py",
-                "coax_env/fleet.py", "coax_env/hover.py", "coax_env/tasks.py"),
-    "estimator": ("coax_env/engine/kalman.py", "coax_env/heli_model.py",
+    "model": (f"{_MODEL}dynamics.py", f"{_MODEL}effects.py", f"{_ENV}turbulence.py",
+              f"{_MODEL}linear.py", f"{_MODEL}vehicle.py"),
+    "sensors": (f"{_MODEL}sensors.py", f"{_MODEL}actuators.py", f"{_ENV}period.py",
+                f"{_ENV}fleet.py", f"{_ENV}hover.py", f"{_ENV}tasks.py"),
+    "estimator": (f"{_ESTIMATION}kalman.py", f"{_ESTIMATION}helicopter.py",
                   "controllers/estimator.py"),
-    "regression": ("coax_env/engine/fit.py", "coax_env/engine/whiteness.py",
-                   "coax_env/two_step/method.py", "coax_env/two_step/modes.py",
-                   "coax_env/two_step/processing.py", "coax_env/two_step/reconstruction.py",
-                   "coax_env/two_step/regression.py"),
+    "regression": (f"{_ESTIMATION}fit.py", f"{_ESTIMATION}whiteness.py", f"{_TWO_STEP}method.py",
+                   f"{_TWO_STEP}modes.py", f"{_TWO_STEP}processing.py",
+                   f"{_TWO_STEP}reconstruction.py", f"{_TWO_STEP}regression.py"),
 }  # fmt: skip
 """Part -> its files; ``sensors`` has all that lies between the state and what a policy sees."""
 

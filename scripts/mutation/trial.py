@@ -1,7 +1,7 @@
 """One mutation at a time: a copy of the tree, the change, the tests.
 
 The copy lies at one place for all trials of a job, so that numba's machine code of what is not broken
-is found again. A change of the kernel (`coax_env.jit.KERNEL_SOURCES`) has machine code of its own, in
+is found again. A change of the kernel (`compilation.kernel_sources`) has machine code of its own, in
 a folder that is removed afterwards.
 """
 
@@ -27,31 +27,35 @@ LIMIT = 900.0  # [s] for the tests of one mutation; who needs longer is caught i
 
 _ENV = ("tests/test_sensors.py", "tests/test_hover.py", "tests/test_world.py", "tests/test_env.py")
 OWN: dict[str, tuple[str, ...]] = {
-    "coax_env/dynamics.py": ("tests/test_dynamics.py", "tests/test_linear.py", "tests/test_env.py"),
-    "coax_env/effects.py": ("tests/test_dynamics.py", "tests/test_vehicle.py", "tests/test_world.py"),
-    "coax_env/turbulence.py": ("tests/test_turbulence.py", "tests/test_world.py"),
-    "coax_env/linear.py": ("tests/test_linear.py", "tests/test_controllers.py"),
-    "coax_env/vehicle.py": ("tests/test_vehicle.py", "tests/test_world.py"),
-    "coax_env/sensors.py": _ENV,
-    "coax_env/actuators.py": _ENV,
-    "coax_env/period.py": _ENV,
-    "coax_env/fleet.py": (*_ENV, "tests/test_lanes.py"),
-    "coax_env/hover.py": _ENV,
-    "coax_env/tasks.py": _ENV,
-    "coax_env/engine/kalman.py": ("tests/test_engine.py",),
-    "coax_env/heli_model.py": (
-        "tests/test_heli_model.py", "tests/test_closed_loop.py",
+    "coax_env/model/dynamics.py": (
+        "tests/test_dynamics.py", "tests/test_linear.py", "tests/test_env.py",
+    ),
+    "coax_env/model/effects.py": (
+        "tests/test_dynamics.py", "tests/test_vehicle.py", "tests/test_world.py",
+    ),
+    "coax_env/env/turbulence.py": ("tests/test_turbulence.py", "tests/test_world.py"),
+    "coax_env/model/linear.py": ("tests/test_linear.py", "tests/test_controllers.py"),
+    "coax_env/model/vehicle.py": ("tests/test_vehicle.py", "tests/test_world.py"),
+    "coax_env/model/sensors.py": _ENV,
+    "coax_env/model/actuators.py": _ENV,
+    "coax_env/env/period.py": _ENV,
+    "coax_env/env/fleet.py": (*_ENV, "tests/test_simd.py"),
+    "coax_env/env/hover.py": _ENV,
+    "coax_env/env/tasks.py": _ENV,
+    "coax_env/estimation/kalman.py": ("tests/test_estimation.py",),
+    "coax_env/estimation/helicopter.py": (
+        "tests/test_helicopter.py", "tests/test_closed_loop.py",
     ),
     "controllers/estimator.py": (
         "tests/test_estimator.py", "tests/test_faulty_sensors.py", "tests/test_controllers.py",
     ),
-    "coax_env/engine/fit.py": ("tests/test_engine.py",),
-    "coax_env/engine/whiteness.py": ("tests/test_engine.py",),
-    "coax_env/two_step/method.py": ("tests/test_two_step.py",),
-    "coax_env/two_step/modes.py": ("tests/test_two_step.py",),
-    "coax_env/two_step/processing.py": ("tests/test_two_step.py",),
-    "coax_env/two_step/reconstruction.py": ("tests/test_two_step.py",),
-    "coax_env/two_step/regression.py": ("tests/test_two_step.py",),
+    "coax_env/estimation/fit.py": ("tests/test_estimation.py",),
+    "coax_env/estimation/whiteness.py": ("tests/test_estimation.py",),
+    "coax_env/identification/two_step/method.py": ("tests/test_two_step.py",),
+    "coax_env/identification/two_step/modes.py": ("tests/test_two_step.py",),
+    "coax_env/identification/two_step/processing.py": ("tests/test_two_step.py",),
+    "coax_env/identification/two_step/reconstruction.py": ("tests/test_two_step.py",),
+    "coax_env/identification/two_step/regression.py": ("tests/test_two_step.py",),
 }  # fmt: skip
 """File -> the tests that belong to it, tried first, in this order."""
 

@@ -22,8 +22,8 @@ def measure(say: Callable[[str], None]) -> list[dict[str, Any]]:
     """What was hidden, what was named, the seconds that took (warm) and those flown, per flight."""
     from study.plan import injector
 
-    from coax_env.diagnosis import diagnose
-    from coax_env.flight import read_flight
+    from coax_env.diagnosis.diagnose import diagnose
+    from coax_env.logs.flight import read_flight
 
     rows = []
     for effects in (HIDDEN[-1], *HIDDEN):  # the first one only warms up

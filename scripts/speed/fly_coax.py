@@ -33,8 +33,8 @@ def open_kernel(count: int | None) -> Flown:
     import numpy as np
 
     import coax_env
-    from coax_env import dynamics
-    from coax_env.fleet_lanes import fly_dynamics
+    from coax_env.env.fleet_simd import fly_dynamics
+    from coax_env.model import dynamics
 
     vehicle = coax_env.load_vehicle("lama400d")
     state, command = dynamics.hover_trim(vehicle)

@@ -19,15 +19,16 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter, savgol_filter
 
-from coax_env import flow as F
-from coax_env.dynamics import measure
-from coax_env.effects import CATALOGUE
-from coax_env.engine.fit import Engine, RunPass
-from coax_env.engine.model import FreeParameter
-from coax_env.flight import Flight
-from coax_env.heli_model import GUST_LEVELS, HeliModel, record_of, starting_noise
-from coax_env.jit import compiled
-from coax_env.layout import (
+from coax_env.diagnosis.search import GLANCE, PROMISE
+from coax_env.estimation.fit import Engine, RunPass
+from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel, record_of, starting_noise
+from coax_env.estimation.state_space import FreeParameter
+from coax_env.kernel.compilation import compiled
+from coax_env.logs.flight import Flight
+from coax_env.model import workspace as F
+from coax_env.model.dynamics import measure
+from coax_env.model.effects import CATALOGUE
+from coax_env.model.layout import (
     CHANNELS,
     FLYBAR,
     GUST_FORCE,
@@ -37,8 +38,7 @@ from coax_env.layout import (
     ROTOR_SPEED,
     SWASH,
 )
-from coax_env.search import GLANCE, PROMISE
-from coax_env.vehicle import load_vehicle
+from coax_env.model.vehicle import load_vehicle
 from study.judge import tied
 
 SETTLING = 1.0  # s of each run that the filter needs

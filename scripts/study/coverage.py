@@ -12,12 +12,12 @@ import numpy as np
 
 from coax_env import derivative, hover_trim, identify, load_vehicle, simulate
 from coax_env.errors import require
-from coax_env.flight import Flight
-from coax_env.layout import COMMANDS, STATES
-from coax_env.simulation import Gusts
-from coax_env.two_step.method import two_step
-from coax_env.two_step.regression import Regression
-from coax_env.vehicle import Vehicle
+from coax_env.identification.two_step.method import two_step
+from coax_env.identification.two_step.regression import Regression
+from coax_env.logs.flight import Flight
+from coax_env.model.layout import COMMANDS, STATES
+from coax_env.model.vehicle import Vehicle
+from coax_env.simulation.simulate import Gusts
 
 METHODS = ("tls", "ls", "ml", "ml on p, q", "AeroID on p, q")
 GUSTS = Gusts()

@@ -14,16 +14,17 @@ from typing import Any
 import injector
 import numpy as np
 
-from coax_env.diagnosis import HORIZON, Diagnosis, diagnose
-from coax_env.effects import CATALOGUE
-from coax_env.engine.fit import Engine
-from coax_env.engine.model import Record
-from coax_env.flight import Flight, read_flight
-from coax_env.gain import gain_of
-from coax_env.heli_model import HeliModel, record_of, starting_noise
-from coax_env.prediction import fly_again
-from coax_env.search import EVIDENCE, Quadratic, Search, State
-from coax_env.vehicle import load_vehicle
+from coax_env.diagnosis.diagnose import HORIZON, Diagnosis, diagnose
+from coax_env.diagnosis.gain import gain_of
+from coax_env.diagnosis.search import EVIDENCE, Search, State
+from coax_env.estimation.fit import Engine
+from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.prediction import fly_again
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import Record
+from coax_env.logs.flight import Flight, read_flight
+from coax_env.model.effects import CATALOGUE
+from coax_env.model.vehicle import load_vehicle
 from study import baselines
 from study.judge import OWN
 from study.plan import PlannedFlight

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from coax_env import figures
-from coax_env.effects import CATALOGUE
-from coax_env.search import EVIDENCE
+from coax_env.diagnosis.search import EVIDENCE
+from coax_env.model.effects import CATALOGUE
+from coax_env.report import figures
 from study import judge
 from study.judge import OWN, Row
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.search import EVIDENCE
+from coax_env.diagnosis.search import EVIDENCE
 from study import judge
 from study.judge import Row
 

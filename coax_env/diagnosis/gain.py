@@ -1,0 +1,126 @@
+"""What mending the model is worth: prediction error before and after, on runs it has not seen.
+
+Per channel e^2 = max(rms^2 - noise_rms^2, 0); the share removed is one minus the mean of
+e_after/e_before (contract.md). Intervals by a block bootstrap over runs and stretches of starts.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from coax_env.estimation.prediction import COMPARED, RunReplay
+from coax_env.model.layout import CHANNEL_UNITS
+
+BLOCK = 8  # starts, 2 s
+DRAWS = 400
+
+
+def gain_of(
+    before: Sequence[RunReplay],
+    refitted: Sequence[RunReplay],
+    after: Sequence[RunReplay],
+    noise: Mapping[str, float],
+    horizon: float,
+    black_box: Sequence[RunReplay] = (),
+) -> dict[str, Any]:
+    """The `gain` of findings.json, without the names of the held-out runs.
+
+    noise: the sensors' std by channel. black_box: the same runs flown by a flexible model.
+    """
+    sums = [_block_sums(runs) for runs in (before, refitted, after)]
+    channels = [c for c in COMPARED if all(c in s for s in sums)]
+    rng = np.random.default_rng(0)
+    blocks = len(next(iter(sums[0].values())))
+    draws = rng.integers(0, blocks, (DRAWS, blocks))
+    noise_rms = {c: noise[c] for c in channels}
+    rms = [{c: _rms(s[c]) for c in channels} for s in sums]
+    drawn = [{c: _rms(s[c][draws].transpose(1, 0, 2)) for c in channels} for s in sums]
+    table = {
+        c: {
+            "before": _number(rms[0][c]),
+            "before_refitted": _number(rms[1][c]),
+            "after": _number(rms[2][c]),
+            "noise": float(noise_rms[c]),
+            "unit": CHANNEL_UNITS[c],
+            "ci95": _interval(drawn[2][c]),
+        }
+        for c in channels
+    }
+    floor = {
+        c: np.hypot(noise_rms[c], np.sqrt(np.mean([r.floor.get(c, 0.0) ** 2 for r in after])))
+        for c in channels
+    }
+    gained = removed(rms[0], rms[2], noise_rms)
+    ceiling = {}
+    if black_box:
+        boxed = _block_sums(black_box)
+        flexible = removed(rms[0], {c: _rms(boxed[c]) for c in channels}, noise_rms)
+        ceiling = {"black_box_percent": _number(flexible)}
+    # the floor is an expectation, the gain a sample: luck can lift the sample above it
+    return {
+        "held_out": [],
+        "horizon_s": horizon,
+        "channels": table,
+        "error_removed_percent": _number(gained),
+        "ci95": _interval(removed(drawn[0], drawn[2], noise_rms)),
+        "refitted_base_percent": _number(removed(rms[0], rms[1], noise_rms)),
+        "noise_floor_percent": _number(np.fmax(removed(rms[0], floor, noise_rms), gained)),
+        **ceiling,
+    }
+
+
+def removed(before: Mapping[str, Any], after: Mapping[str, Any], noise: Mapping[str, float]) -> Any:
+    """Percent of the error removed, averaged over channels that had any."""
+    ratios = []
+    for channel, level in noise.items():
+        e_before = np.sqrt(np.maximum(np.square(before[channel]) - level**2, 0.0))
+        e_after = np.sqrt(np.maximum(np.square(after[channel]) - level**2, 0.0))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratios.append(np.where(e_before > 0.0, e_after / e_before, np.nan))
+    if not ratios:
+        return np.nan
+    with np.errstate(invalid="ignore"):
+        table = np.array(ratios)
+        return 100.0 * (1.0 - _nanmean(table))
+
+
+def _nanmean(table: np.ndarray) -> Any:
+    there = np.isfinite(table)
+    count = there.sum(0)
+    total = np.where(there, table, 0.0).sum(0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _block_sums(runs: Sequence[RunReplay]) -> dict[str, np.ndarray]:
+    """Per channel: (blocks, 2) of summed squared error and count, over all runs that flew."""
+    sums: dict[str, list[tuple[float, float]]] = {}
+    for run in runs:
+        for channel, replayed in run.channels.items():
+            error = replayed.error
+            for first in range(0, error.size, BLOCK):
+                block = error[first : first + BLOCK]
+                block = block[np.isfinite(block)]
+                if run.diverged:
+                    block = block[:0]
+                sums.setdefault(channel, []).append((float(np.sum(block**2)), float(block.size)))
+    return {c: np.array(rows) for c, rows in sums.items()}
+
+
+def _rms(sums: np.ndarray) -> Any:
+    """RMS from (blocks, ..., 2) sums."""
+    total = sums.sum(0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.sqrt(total[..., 0] / total[..., 1])
+
+
+def _number(value: Any) -> float | None:
+    value = float(value)
+    return value if np.isfinite(value) else None
+
+
+def _interval(draws: np.ndarray) -> list[float | None]:
+    draws = draws[np.isfinite(draws)]
+    if draws.size < DRAWS // 2:
+        return [None, None]
+    return [float(x) for x in np.percentile(draws, [2.5, 97.5])]

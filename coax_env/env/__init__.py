@@ -1,0 +1,1 @@
+"""CoaxHeli-v0: the Gymnasium environment, single and vectorised, on one compiled flight loop."""

@@ -1,0 +1,265 @@
+"""The batch kernel for helicopters without effects: WIDTH rows of the fleet at a time, in lanes.
+
+The same control period as fleet.py's for one row, made of the same parts (period.py); here each part
+is compiled for lanes. Any active rows make a group; the last group is filled up with copies, whose
+results are dropped.
+"""
+
+import numpy as np
+
+from coax_env.env import hover
+from coax_env.env.period import BIAS, BIAS_STD, DT, blow, command, read, rest, seen, turned
+from coax_env.env.threads import in_threads
+from coax_env.errors import InputError
+from coax_env.kernel.compilation import compiled
+from coax_env.kernel.simd import WIDTH, gather, lanes_of, scatter, scratch, select, words_of
+from coax_env.model import effects
+from coax_env.model import parameters as P
+from coax_env.model.actuators import limit
+from coax_env.model.dynamics import WORK_SIZE, measure_bare, step_bare
+from coax_env.model.layout import N_CHANNELS, N_FULL, N_INPUTS, N_STATES, TIME
+from coax_env.model.vehicle import Vehicle
+
+CHUNK = 512
+"""Rows that are flown, and then sense: as many as the second-level cache can hold."""
+
+PHASES = 10
+"""Rows after which the shipped sensors' rates, 10 to 100 Hz, come round again."""
+
+_N_PARAMETERS = P.N_FIXED + len(effects.STAGES)
+_ROW, _AZIMUTH, _REWARD, _OVER = range(4)
+_N_SINGLES = 4
+
+
+@compiled()
+def _next_group(i, last, active, which):
+    """The next WIDTH active rows from row `i` on into `which`; how many they are, and the row after."""
+    n = 0
+    while i < last and n < WIDTH:
+        if active[i]:
+            which[n] = i
+            n += 1
+        i += 1
+    for j in range(n, WIDTH):
+        which[j] = which[0]
+    return n, i
+
+
+@compiled(makes_arrays=True)
+def _by_phase(first, last, active, rows, order):
+    """The active rows first..last-1 into `order`, those together whose sensors are due together; how
+    many they are. What no row of a group has due, none of them draws noise for.
+    """
+    places = np.zeros(PHASES + 1, np.int64)
+    for i in range(first, last):
+        if active[i]:
+            places[rows[i] % PHASES + 1] += 1
+    for phase in range(PHASES):
+        places[phase + 1] += places[phase]
+    for i in range(first, last):
+        if active[i]:
+            phase = rows[i] % PHASES
+            order[places[phase]] = i
+            places[phase] += 1
+    return places[PHASES]
+
+
+def _step_of(own):
+    """Command, flight and judgement, for parameters of each row's own, or for one vehicle."""
+
+    def step_rows(
+        first, last, active, actions, trim, scale, params, limits, gust, weights, scales,
+        x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
+    ):  # fmt: skip
+        """Fly the active rows first..last-1 for one control period. See fleet.Fleet for the arrays."""
+        which = np.empty(WIDTH, np.int64)
+        x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
+        action_block, asked_block = np.empty((4, WIDTH)), np.empty((4, WIDTH))
+        target_block, term_block = np.empty((4, WIDTH)), np.zeros((len(weights), WIDTH))
+        stream_block, row_block = np.empty((2, WIDTH), np.uint64), np.empty((_N_SINGLES, WIDTH))
+        x_, u_, action_ = lanes_of(x_block), lanes_of(u_block), lanes_of(action_block)
+        asked_, target_, terms_ = (
+            lanes_of(asked_block),
+            lanes_of(target_block),
+            lanes_of(term_block),
+        )
+        single_, stream_ = lanes_of(row_block), words_of(stream_block)
+        work, flown_ = scratch(WORK_SIZE), scratch(N_FULL)
+        if own:
+            p_block = np.empty((_N_PARAMETERS, WIDTH))
+            p = lanes_of(p_block)
+        else:
+            p = params[0]
+        gusty = gust[0] > 0.0 or gust[1] > 0.0
+        limited = np.isfinite(limits).any()
+        n, after = _next_group(first, last, active, which)
+        while n > 0:
+            gather(x, which, x_block)
+            gather(actions, which, action_block)
+            gather(targets, which, target_block)
+            if own:
+                gather(params, which, p_block)
+            for j in range(WIDTH):
+                row_block[_ROW, j] = rows[which[j]]
+                row_block[_AZIMUTH, j] = azimuth[which[j]]
+            command(action_, trim, scale, u_)
+            if limited:
+                gather(asked, which, asked_block)
+                limit(u_, asked_, limits, DT)
+                scatter(asked_block, which, n, asked)
+            if gusty:
+                gather(streams, which, stream_block)
+                blow(x_, p, gust, stream_)
+                scatter(stream_block, which, n, streams)
+            u_[TIME] = single_[_ROW] * DT
+            step_bare(x_, u_, DT, p, work, flown_)
+            for k in range(N_FULL):
+                x_[k] = flown_[k]
+            u_[TIME] = (single_[_ROW] + 1.0) * DT
+            single_[_AZIMUTH] = turned(single_[_AZIMUTH], x_[16])
+            single_[_REWARD] = hover.reward(x_, action_, target_, weights, scales, terms_)
+            single_[_OVER] = select(hover.is_over(x_), 1.0, 0.0)
+            scatter(x_block, which, n, flown)
+            scatter(u_block, which, n, u)
+            scatter(term_block, which, n, terms)
+            for j in range(n):
+                row = which[j]
+                rows[row] += 1
+                azimuth[row] = row_block[_AZIMUTH, j]
+                rewards[row] = row_block[_REWARD, j]
+                over[row] = row_block[_OVER, j] != 0.0
+            n, after = _next_group(after, last, active, which)
+
+    return compiled(makes_arrays=True)(step_rows)
+
+
+def _sense_of(own):
+    """Readings, for parameters of each row's own, or for one vehicle."""
+
+    def sense_rows(
+        first, last, active, params, sensors, flags, x, rows, streams, bias, held, observations,
+    ):  # fmt: skip
+        """New readings of the active rows first..last-1. See fleet.Fleet for the arrays."""
+        which, order = np.empty(WIDTH, np.int64), np.empty(last - first, np.int64)
+        count = len(sensors)
+        x_block, reading_block = np.empty((N_FULL, WIDTH)), np.empty((N_CHANNELS, WIDTH))
+        held_block, row_block = np.empty((held.shape[1], WIDTH)), np.empty((1, WIDTH))
+        bias_block, value_block = np.zeros((count, WIDTH)), np.empty((count, WIDTH))
+        stream_block, work = np.empty((2, WIDTH), np.uint64), scratch(WORK_SIZE)
+        x_, held_, row_ = lanes_of(x_block), lanes_of(held_block), lanes_of(row_block)
+        bias_, values_, readings_ = (
+            lanes_of(bias_block), lanes_of(value_block), lanes_of(reading_block)
+        )  # fmt: skip
+        stream_ = words_of(stream_block)
+        if own:
+            p_block = np.empty((_N_PARAMETERS, WIDTH))
+            p = lanes_of(p_block)
+        else:
+            p = params[0]
+        biased = False
+        for k in range(count):
+            biased = biased or sensors[k, BIAS] != 0.0 or sensors[k, BIAS_STD] != 0.0
+        active_rows = _by_phase(first, last, active, rows, order)
+        for at in range(0, active_rows, WIDTH):
+            n = min(WIDTH, active_rows - at)
+            for j in range(WIDTH):
+                which[j] = order[at + j if j < n else at]
+            gather(x, which, x_block)
+            gather(held, which, held_block)
+            gather(streams, which, stream_block)
+            if biased:
+                gather(bias, which, bias_block)
+            if own:
+                gather(params, which, p_block)
+            for j in range(WIDTH):
+                row_block[0, j] = rows[which[j]]
+            # without effects the actuators are where they were sent, and time has no part
+            measure_bare(x_, x_[N_STATES:], p, work, readings_)
+            seen(x_, readings_, sensors, values_)
+            read(values_, row_[0], sensors, bias_, stream_, flags, held_)
+            scatter(held_block, which, n, held)
+            scatter(held_block, which, n, observations)
+            scatter(stream_block, which, n, streams)
+
+    return compiled(makes_arrays=True)(sense_rows)
+
+
+_step_shared, _step_own = _step_of(False), _step_of(True)
+_sense_shared, _sense_own = _sense_of(False), _sense_of(True)
+
+
+def _fly_of(own):
+    """The batch kernel for parameters of each row's own, or for one vehicle."""
+
+    def fly(
+        first, last, active, actions, trim, scale, params, sensors, limits, gust, flags,
+        weights, scales, x, u, rows, azimuth, streams, asked, bias, targets, held, flown,
+        observations, rewards, terms, over,
+    ):  # fmt: skip
+        """One control period of the active rows first..last-1. See fleet.Fleet for the arrays."""
+        for start in range(first, last, CHUNK):
+            end = min(start + CHUNK, last)
+            if own:
+                _step_own(
+                    start, end, active, actions, trim, scale, params, limits, gust, weights, scales,
+                    x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
+                )  # fmt: skip
+            else:
+                _step_shared(
+                    start, end, active, actions, trim, scale, params, limits, gust, weights, scales,
+                    x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
+                )  # fmt: skip
+            for i in range(start, end):
+                if not active[i]:
+                    rest(x[i], flown[i])
+                    rest(held[i], observations[i])
+                    for k in range(terms.shape[1]):
+                        terms[i, k] = 0.0
+                    rewards[i] = 0.0
+                    over[i] = False
+            if own:
+                _sense_own(
+                    start, end, active, params, sensors, flags, flown, rows, streams, bias, held,
+                    observations,
+                )  # fmt: skip
+            else:
+                _sense_shared(
+                    start, end, active, params, sensors, flags, flown, rows, streams, bias, held,
+                    observations,
+                )  # fmt: skip
+
+    return compiled(makes_arrays=True)(fly)
+
+
+fly_shared = _fly_of(False)
+fly_own = _fly_of(True)
+
+
+@compiled(makes_arrays=True)
+def _dynamics_rows(first, last, x, u, p):
+    which, active = np.empty(WIDTH, np.int64), np.ones(len(x), np.bool_)
+    x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
+    x_, u_ = lanes_of(x_block), lanes_of(u_block)
+    work, flown_ = scratch(WORK_SIZE), scratch(N_FULL)
+    n, after = _next_group(first, last, active, which)
+    while n > 0:
+        gather(x, which, x_block)
+        gather(u, which, u_block)
+        step_bare(x_, u_, DT, p, work, flown_)
+        for k in range(N_FULL):
+            x_[k] = flown_[k]
+        scatter(x_block, which, n, x)
+        n, after = _next_group(after, last, active, which)
+
+
+def fly_dynamics(x: np.ndarray, u: np.ndarray, vehicle: Vehicle, threads: int = 1) -> None:
+    """The dynamics alone, of one vehicle without effects, over one control period and in place.
+
+    No sensors, no task, no ends: what the env's speed is measured against.
+
+    Args:
+        x: full states, (count, 26). u: commands and time, (count, 5).
+    """
+    if vehicle.vector[effects.SWITCHES].any():
+        raise InputError(f"vehicle {vehicle.name!r} has effects: lanes are for those without")
+    in_threads(lambda a, b: _dynamics_rows(a, b, x, u, vehicle.vector), len(x), threads)

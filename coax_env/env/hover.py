@@ -1,0 +1,176 @@
+"""The hover task: stay at 1.5 m over the start, heading north. Start, end, reward and cost.
+
+Reward and cost can be taken about another target: the other tasks (tasks.py) do.
+
+Controllers are compared by a quadratic cost: squared errors in units of LIMITS, the success
+conditions of contract.md. The reward has a term 1/(1 + |error|/scale) per error, in (0, 1]: sharp
+at the goal, and with a slope far from it, so that a policy can be learnt from nothing.
+"""
+
+import math
+
+import numpy as np
+
+from coax_env.kernel.compilation import compiled
+from coax_env.kernel.random_streams import uniform
+from coax_env.kernel.simd import negated, select
+from coax_env.model.layout import N_FULL, PLACE, RATE, VELOCITY
+
+HEIGHT = 1.5  # [m] of the centre of gravity above ground
+CONTROL_PERIOD = 0.01  # [s]
+
+_DEGREE = math.pi / 180.0
+
+LIMITS = {
+    "height": 0.10,  # [m]
+    "position": 2.0,  # [m] horizontal distance from the start
+    "speed": 0.25,  # [m/s]
+    "heading": 10.0 * _DEGREE,
+    "rates": 30.0 * _DEGREE,  # [rad/s], of the whole rate vector; ours
+    "effort": 0.5,  # [1], of the whole action vector; ours
+}
+"""An error of this size counts 1. The first four are the success conditions."""
+
+COST_WEIGHTS = {
+    "height": 1.0, "position": 1.0, "speed": 1.0, "heading": 1.0, "rates": 0.1, "effort": 0.1,
+}  # fmt: skip
+"""Weights of the quadratic cost, the same for every controller."""
+
+REWARD_SCALES = {
+    "height": 0.25,  # [m]
+    "position": 2.0,  # [m]
+    "speed": 1.0,  # [m/s]
+    "heading": 20.0 * _DEGREE,
+    "rates": 60.0 * _DEGREE,  # [rad/s]
+    "effort": 0.5,  # [1]
+}
+"""An error of this size halves its reward term."""
+
+REWARD_WEIGHTS = {
+    "alive": 0.1, "height": 0.2, "position": 0.1, "speed": 0.3, "heading": 0.15,
+    "rates": 0.05, "effort": 0.1,
+}  # fmt: skip
+"""Weights of the reward terms; they sum to 1, so a step's reward lies in (0, 1]."""
+
+REWARD_TERMS = tuple(REWARD_WEIGHTS)
+N_TERMS = len(REWARD_TERMS)
+CRASHED_COST = 1000.0
+"""Cost of every step that an episode ended too early to fly."""
+
+START = {
+    "tilt": 5.0 * _DEGREE, "heading": 20.0 * _DEGREE, "rate": 10.0 * _DEGREE,
+    "velocity": 0.3, "height": 0.3,
+}  # fmt: skip
+"""Half widths of the uniform start, per axis, about hover. SI."""
+
+LOWEST = 0.05  # [m] centre of gravity: the skids touch
+HIGHEST = 6.0  # [m] the sonar's range ends soon after
+FARTHEST = 25.0  # [m]
+FASTEST = 15.0  # [m/s]
+STEEPEST = 60.0 * _DEGREE
+
+_LIMITS = np.array(list(LIMITS.values()))
+_COST_WEIGHTS = np.array(list(COST_WEIGHTS.values()))
+_COS_STEEPEST = math.cos(STEEPEST)
+_TILT, _HEADING = START["tilt"], START["heading"]
+_RATE, _VELOCITY, _RISE = START["rate"], START["velocity"], START["height"]
+
+
+@compiled()
+def start(stream, command, x):
+    """A random start into the full state `x` (26,): rotors and swash settled on `command` (4,)."""
+    for i in range(N_FULL):
+        x[i] = 0.0
+    for i in range(3):
+        x[i] = uniform(stream, -_VELOCITY, _VELOCITY)
+        x[3 + i] = uniform(stream, -_RATE, _RATE)
+    x[10] = uniform(stream, -_TILT, _TILT)
+    x[11] = uniform(stream, -_TILT, _TILT)
+    x[12] = uniform(stream, -_HEADING, _HEADING)
+    x[15] = -HEIGHT - uniform(stream, -_RISE, _RISE)
+    for i in range(4):
+        x[16 + i] = command[i]
+
+
+@compiled()
+def reward(x, action, target, weights, scales, terms):
+    """Sum of the weighted reward terms at a full state (26,) after an action (4,).
+
+    `target` is x y z psi, (4,); `weights` and `scales`, (N_TERMS,), are in REWARD_TERMS' order. The
+    weighted terms go into `terms` (N_TERMS,); all are zero where the state is not finite.
+    """
+    north, east, turn = x[13] - target[0], x[14] - target[1], x[12] - target[3]
+    heading = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+    up = x[15] - target[2]
+    # errors squared, in REWARD_TERMS' order
+    terms[0] = 0.0  # alive
+    terms[1] = up * up
+    terms[2] = north * north + east * east
+    terms[3] = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
+    terms[4] = heading * heading
+    terms[5] = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
+    terms[6] = (
+        action[0] * action[0] + action[1] * action[1]
+        + action[2] * action[2] + action[3] * action[3]
+    )  # fmt: skip
+    total = 0.0 * up
+    for k in range(N_TERMS):
+        terms[k] = weights[k] * scales[k] / (scales[k] + math.sqrt(terms[k]))
+        total += terms[k]
+    fine = math.isfinite(total)
+    for k in range(N_TERMS):
+        terms[k] = select(fine, terms[k], 0.0)
+    return select(fine, total, 0.0)
+
+
+@compiled()
+def is_over(x):
+    """Whether the flight has ended: ground, tilt, too fast, too far, too high, or not a number."""
+    nought = 0.0 * x[0]
+    for i in range(1, N_FULL):
+        nought += 0.0 * x[i]  # NaN where a state is not finite
+    inside = (
+        (nought == 0.0)
+        & (-x[15] > LOWEST)
+        & (-x[15] < HIGHEST)
+        & (math.cos(x[10]) * math.cos(x[11]) > _COS_STEEPEST)
+        & (x[13] * x[13] + x[14] * x[14] < FARTHEST * FARTHEST)
+        & (x[0] * x[0] + x[1] * x[1] + x[2] * x[2] < FASTEST * FASTEST)
+    )
+    return negated(inside)  # a comparison with NaN is false
+
+
+def squared_errors(states: np.ndarray, targets: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Squares of the errors that LIMITS names, but for the effort, of every state; SI.
+
+    Args:
+        states: full or paper states, shape (..., >=16).
+        targets: x y z psi, shape (..., 4); None: hover's.
+
+    Returns:
+        height, position (horizontal), speed, heading, rates: each of shape (...).
+    """
+    goal = np.array([0.0, 0.0, -HEIGHT, 0.0]) if targets is None else targets
+    heading = (states[..., 12] - goal[..., 3] + math.pi) % (2.0 * math.pi) - math.pi
+    return {
+        "height": (states[..., 15] - goal[..., 2]) ** 2,
+        "position": ((states[..., PLACE] - goal[..., 0:2]) ** 2).sum(-1),
+        "speed": (states[..., VELOCITY] ** 2).sum(-1),
+        "heading": heading**2,
+        "rates": (states[..., RATE] ** 2).sum(-1),
+    }
+
+
+def cost(states: np.ndarray, actions: np.ndarray, targets: np.ndarray | None = None) -> np.ndarray:
+    """Quadratic cost of every step: COST_WEIGHTS times the squared errors in units of LIMITS.
+
+    Args:
+        states: full or paper states, shape (..., >=16). actions: shape (..., 4).
+        targets: x y z psi, shape (..., 4); None: hover's.
+
+    Returns:
+        shape (...).
+    """
+    errors = squared_errors(states, targets) | {"effort": (np.asarray(actions) ** 2).sum(-1)}
+    squares = np.stack([errors[name] for name in LIMITS], axis=-1)
+    return squares @ (_COST_WEIGHTS / _LIMITS**2)

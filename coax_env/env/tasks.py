@@ -1,0 +1,277 @@
+"""What a flight of the env is for: hover, hold a position, or follow waypoints.
+
+A task is one entry of TASKS: its reward's weights and scales, where its targets are drawn, and whether
+it moves on from one target to the next. All tasks start, end and are rewarded by hover.py about the
+target in force; ``hover`` has its target fixed over the start. A target is (north, east, height,
+heading) [m, rad] for the user, and x y z psi of the state in the kernel.
+
+Success is contract.md's, about the target: see `judge`, and `succeeded` for one recorded flight.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from coax_env.env import hover
+from coax_env.errors import InputError
+from coax_env.kernel.compilation import compiled
+from coax_env.kernel.random_streams import uniform
+from coax_env.model.layout import PLACE
+from coax_env.model.sensors import Sensor
+
+_DEGREE = math.pi / 180.0
+
+RADIUS = 0.3  # [m] from a waypoint, of the whole distance,
+HEADING_TOLERANCE = 15.0 * _DEGREE  # and from its heading:
+DWELL = 0.5  # [s] so long within both, and the waypoint is reached
+
+SETTLED = 3.0  # [s] from here on success is judged:
+FIRST_JUDGED = round(SETTLED / hover.CONTROL_PERIOD)
+"""The state after so many control periods is the first that counts."""
+SUCCESS = {
+    "height": hover.LIMITS["height"],
+    "speed": hover.LIMITS["speed"],
+    "heading": hover.LIMITS["heading"],
+    "drift": hover.LIMITS["position"],
+}
+"""Contract.md: rms of the errors of height [m], speed [m/s] and heading [rad]; farthest drift [m]."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task. Weights and scales have the same keys, but for ``alive`` and ``reached``.
+
+    ``lowest`` and ``highest``: the box targets are drawn from, (north, east, height, heading).
+    ``aims``: whether the target is in the observation; ``moves_on``: whether one follows the other.
+    """
+
+    summary: str
+    weights: Mapping[str, float]
+    scales: Mapping[str, float]
+    lowest: tuple[float, float, float, float]
+    highest: tuple[float, float, float, float]
+    aims: bool = True
+    moves_on: bool = False
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Names of the reward terms."""
+        return tuple(self.weights)
+
+
+HOVER_TARGET = (0.0, 0.0, hover.HEIGHT, 0.0)
+
+TASKS: dict[str, Task] = {
+    "hover": Task(
+        "stay at 1.5 m over the start, heading north",
+        hover.REWARD_WEIGHTS, hover.REWARD_SCALES, HOVER_TARGET, HOVER_TARGET, aims=False,
+    ),
+    "position": Task(
+        "go to a position and a heading, and stay there",
+        {
+            "alive": 0.1, "height": 0.2, "position": 0.25, "speed": 0.15, "heading": 0.15,
+            "rates": 0.05, "effort": 0.1,
+        },
+        {**hover.REWARD_SCALES, "position": 0.5},
+        (-1.0, -1.0, 1.0, -45.0 * _DEGREE), (1.0, 1.0, 2.0, 45.0 * _DEGREE),
+    ),
+    "waypoints": Task(
+        "go from waypoint to waypoint, each with its heading, and stay at the last",
+        {
+            "alive": 0.1, "height": 0.2, "position": 0.35, "speed": 0.05, "heading": 0.15,
+            "rates": 0.05, "effort": 0.1, "reached": 50.0,
+        },
+        {**hover.REWARD_SCALES, "position": 1.0, "speed": 2.0},
+        (-2.0, -2.0, 1.0, -math.pi), (2.0, 2.0, 2.5, math.pi),
+        moves_on=True,
+    ),
+}  # fmt: skip
+"""The tasks by name. ``reached`` is paid once per waypoint: more than moving on costs at first."""
+
+AIM = (
+    ("target_forward", "m", 50.0), ("target_right", "m", 50.0), ("target_up", "m", 10.0),
+    ("heading_error", "rad", math.pi),
+)  # fmt: skip
+"""Name, unit and bound of what a task's target adds to the observation.
+
+Target minus *measured* position, turned by the measured heading; target minus measured heading.
+"""
+N_AIM = len(AIM)
+_BOUNDS = np.array([bound for *_, bound in AIM])
+
+WITHIN, REACHED = range(2)
+"""Columns of a helicopter's progress: rows spent at the target so far, and targets reached."""
+
+
+def task(name: str) -> Task:
+    """A task by name."""
+    if name not in TASKS:
+        raise InputError(f"no task {name!r}: choose one of {', '.join(TASKS)}")
+    return TASKS[name]
+
+
+def course(name: str, target: Any = None) -> np.ndarray:
+    """Targets that are given, in order, as x y z psi, shape (k, 4); k = 0: they are drawn.
+
+    Args:
+        target: (north, east, height, heading), for waypoints one or several; None: drawn, but for
+            ``hover``, whose target is fixed.
+    """
+    own = task(name)
+    if name == "hover":
+        if target is not None:
+            raise InputError(
+                "task 'hover' has its target over the start: 'position' takes a target"
+            )
+        target = HOVER_TARGET
+    if target is None:
+        return np.empty((0, 4))
+    try:
+        given = np.atleast_2d(np.array(target, dtype=float))
+    except (TypeError, ValueError):
+        given = np.empty(0)
+    if given.ndim != 2 or given.shape[1] != 4 or not len(given) or not np.isfinite(given).all():
+        raise InputError("a target is (north, east, height, heading) in m and rad, all finite")
+    if len(given) > 1 and not own.moves_on:
+        raise InputError(f"task {name!r} takes one target, found {len(given)}")
+    outside = (given[:, 2] <= hover.LOWEST) | (given[:, 2] >= hover.HIGHEST)
+    if (outside | (np.hypot(given[:, 0], given[:, 1]) >= hover.FARTHEST)).any():
+        raise InputError(
+            f"a target must be {hover.LOWEST:g} to {hover.HIGHEST:g} m high and within "
+            f"{hover.FARTHEST:g} m of the start"
+        )
+    return given * (1.0, 1.0, -1.0, 1.0)
+
+
+def box(name: str) -> np.ndarray:
+    """Where targets are drawn: lowest and highest x y z psi, shape (2, 4)."""
+    own = task(name)
+    return np.array([own.lowest, own.highest]) * (1.0, 1.0, -1.0, 1.0)
+
+
+def places(name: str, sensors: Sequence[Sensor]) -> np.ndarray:
+    """Where the observation has north, east, height and heading, (4,); empty without an aim.
+
+    Raises:
+        InputError: the task needs a position that these sensors do not measure.
+    """
+    if not task(name).aims:
+        return np.empty(0, dtype=np.int64)
+    names = [sensor.name for sensor in sensors]
+    for wanted in (["x", "y", "z", "psi"], ["pn", "pe", "h", "psi"]):
+        if all(channel in names for channel in wanted):
+            return np.array([names.index(channel) for channel in wanted])
+    raise InputError(
+        f"task {name!r} needs sensors that measure position and heading: 'mocap' or 'state'"
+    )
+
+
+def height_sign(name: str, sensors: Sequence[Sensor]) -> float:
+    """What makes the height reading at `places` the state z: 1 for z itself, -1 for h."""
+    place = places(name, sensors)
+    return 1.0 if len(place) and sensors[place[2]].name == "z" else -1.0
+
+
+@compiled()
+def aim(stream, course, box, reached, target):
+    """The target after `reached` ones into `target` (4,): from the course, or drawn."""
+    if len(course) > 0:
+        k = min(reached, len(course) - 1)
+        for i in range(4):
+            target[i] = course[k, i]
+    else:
+        for i in range(4):
+            target[i] = uniform(stream, box[0, i], box[1, i])
+
+
+@compiled()
+def arrive(x, target, dwell, progress, course):
+    """Count a row at the target; whether this row completes it. `dwell` rows do, none where 0."""
+    east, north, down = x[14] - target[1], x[13] - target[0], x[15] - target[2]
+    turn = x[12] - target[3]
+    turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+    there = (
+        north * north + east * east + down * down < RADIUS * RADIUS
+        and abs(turn) < HEADING_TOLERANCE
+    )
+    progress[WITHIN] = progress[WITHIN] + 1 if there else 0
+    left = len(course) == 0 or progress[REACHED] < len(course)
+    if dwell == 0 or not left or progress[WITHIN] < dwell:
+        return False
+    progress[WITHIN] = 0
+    progress[REACHED] += 1
+    return True
+
+
+@compiled()
+def point(held, places, height_sign, target, out):
+    """What the readings `held` say of the way to the target, AIM, into `out` (4,), within bounds."""
+    psi = held[places[3]]
+    north = target[0] - held[places[0]]
+    east = target[1] - held[places[1]]
+    turn = target[3] - psi
+    out[0] = math.cos(psi) * north + math.sin(psi) * east
+    out[1] = math.cos(psi) * east - math.sin(psi) * north
+    out[2] = height_sign * held[places[2]] - target[2]
+    out[3] = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+    for i in range(N_AIM):
+        out[i] = min(max(out[i], -_BOUNDS[i]), _BOUNDS[i])
+
+
+def judge(
+    name: str,
+    flown: np.ndarray,
+    errors: Mapping[str, np.ndarray],
+    reached: np.ndarray | int = 0,
+    wanted: int = 1,
+) -> np.ndarray:
+    """Which flights were successes, (count,) bool.
+
+    ``hover`` and ``position``: flown to the end, and from SETTLED on every error under SUCCESS's.
+    ``waypoints``: flown to the end, and `wanted` of them reached.
+
+    Args:
+        flown: whether each was flown to the end, (count,).
+        errors: with the keys of SUCCESS, each (count,): rms of the errors of height, speed and
+            heading from SETTLED on, and the farthest drift: from the place at that time in
+            ``hover``, whose sensors need not show the position, else from the target.
+        reached: waypoints reached, (count,). wanted: how many it should have been.
+    """
+    if task(name).moves_on:
+        return np.asarray(flown & (reached >= wanted))
+    within = [errors[key] < limit for key, limit in SUCCESS.items()]
+    return np.logical_and.reduce([flown, *within])
+
+
+def succeeded(
+    name: str,
+    states: np.ndarray,
+    targets: np.ndarray,
+    steps: int,
+    reached: int = 0,
+    wanted: int = 1,
+) -> bool:
+    """Whether one flight was a success by `judge`, from true states.
+
+    Args:
+        states: (n, >=16), one row after each step flown. targets: x y z psi in force, (n, 4).
+        steps: how many the flight should have had.
+        reached: waypoints reached, ``info["reached"]``. wanted: how many it should have been.
+    """
+    flown = np.array([len(states) >= steps and bool(np.isfinite(states).all())])
+    x, goal = states[FIRST_JUDGED - 1 :], targets[FIRST_JUDGED - 1 :]
+    errors = dict.fromkeys(SUCCESS, np.array([np.inf]))
+    if len(x):
+        place = x[0, PLACE] if name == "hover" else goal[:, 0:2]
+        squares = hover.squared_errors(x, goal)
+        errors = {k: np.sqrt([squares[k].mean()]) for k in ("height", "speed", "heading")}
+        errors["drift"] = np.linalg.norm(x[:, PLACE] - place, axis=1).max(keepdims=True)
+    return bool(judge(name, flown, errors, reached, wanted)[0])
+
+
+def dwell_rows(name: str) -> int:
+    """Rows at a target that complete it; 0 where the task does not move on."""
+    return round(DWELL / hover.CONTROL_PERIOD) if task(name).moves_on else 0

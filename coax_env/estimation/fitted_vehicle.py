@@ -1,0 +1,66 @@
+"""A vehicle with numbers fitted to a flight: std, correlation, and what they were fitted on."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from coax_env.estimation.state_space import FreeParameter, Record
+from coax_env.logs.flight import Flight
+from coax_env.model import effects
+from coax_env.model.vehicle import Parameter, Vehicle
+
+
+def double_counting(flight: Flight, vehicle: Vehicle) -> list[str]:
+    """A warning where the vehicle was already fitted on this flight."""
+    used = set(vehicle.provenance.get("flights", ()))
+    if used & set(flight.hashes.values()):
+        return [f"{vehicle.name} was already fitted on this flight: its evidence counts twice"]
+    return []
+
+
+def median_step(records: Sequence[Record]) -> float:
+    """Usual time between rows [s]."""
+    return float(np.median(np.concatenate([np.diff(r.t) for r in records])))
+
+
+def with_timing(parameter: FreeParameter, std: float, dt: float) -> float:
+    """Std of a lag or delay with the half sample that a log cannot show.
+
+    Within a row it is not known when the machine takes a command over (zero-order hold against the
+    simulator's or autopilot's own loop): uniform over a row, std dt/sqrt(12) (numerics.md, timing).
+    """
+    group, _, own = parameter.name.rpartition(".")
+    known = effects.GROUPS[group].parameters if group else ()
+    if any(p.name == own and p.timing for p in known):
+        return float(np.hypot(std, dt / np.sqrt(12.0)))
+    return float(std)
+
+
+def fitted_vehicle(
+    vehicle: Vehicle,
+    free: Sequence[FreeParameter],
+    values: Mapping[str, float],
+    std: Mapping[str, float],
+    covariance: np.ndarray,
+    source: str,
+    flight: Flight,
+) -> Vehicle:
+    """A vehicle with fitted values, their std and correlation, and what they were fitted on."""
+    changed = {}
+    for f in free:
+        group, _, own = f.name.rpartition(".")
+        if group:
+            unit = next(p.unit for p in effects.GROUPS[group].parameters if p.name == own)
+        else:
+            unit = vehicle[f.name].unit
+        changed[f.name] = Parameter(float(values[f.name]), float(std[f.name]), unit, source)
+    scale = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(scale, scale)
+    correlation = 0.5 * (correlation + correlation.T)
+    np.fill_diagonal(correlation, 1.0)
+    return replace(
+        vehicle.with_parameters(changed).seen(flight.hashes.values()),
+        correlated=tuple(f.name for f in free),
+        correlation=correlation,
+    )

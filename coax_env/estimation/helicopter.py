@@ -1,0 +1,317 @@
+"""The helicopter as the engine sees it: the compiled kernel, its parameters with priors, its noise.
+
+Command delay enters here: with servo_delay the swash commands are looked up late and, where a row's
+interval holds two commands, replaced by their mean over it (the step is split to second order).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numba import float64, types
+
+from coax_env.estimation.state_space import FreeParameter, Noise, Record
+from coax_env.kernel.compilation import compiled, pointer
+from coax_env.logs.flight import Flight, Run
+from coax_env.model import dynamics, effects
+from coax_env.model import parameters as P
+from coax_env.model.layout import (
+    ANGLES,
+    CHANNELS,
+    N_FULL,
+    N_INPUTS,
+    N_STATES,
+    TIME,
+)
+from coax_env.model.vehicle import Vehicle
+
+FARTHEST = 5.0
+"""Usual sizes that an effect may have at most."""
+
+UNUSUAL = 2.5
+"""Usual sizes beyond which an effect's name is to be taken with care."""
+
+GUST_LEVELS = ("force_xy", "force_z", "moment_xy", "moment_z")
+"""Std of the gust states [N, N m]; x and y share one level."""
+
+BUFFET_LEVELS = ("buffet_xy", "buffet_z", "buffet_moment_xy", "buffet_moment_z")
+"""Intensity of what shakes too fast to have a memory [N s^1/2, N m s^1/2]: white force and moment.
+
+Without it, real flights buy damping that is not there: a damped rate driven by a gust with memory is
+how a likelihood with nothing else at hand writes a rate driven by white noise, and the gust states
+then undo the damping in every prediction.
+"""
+
+HELD = (
+    "gravity", "air_density", "rotor_radius",
+    "fuselage_length", "fuselage_width", "fuselage_drag_coefficient", "flybar_inertia",
+    "flap_coupling_lon", "flap_coupling_lat",
+)  # fmt: skip
+"""Base parameters that are never fitted: exact, or one column with others that are."""
+
+LEAST_READING_STD = {
+    "rpm_upper": 1.0, "rpm_lower": 1.0, "p": 0.01, "q": 0.01, "r": 0.01,
+    "ax": 0.05, "ay": 0.05, "az": 0.05, "phi": 0.006, "theta": 0.006, "psi": 0.008,
+    "h": 0.005, "vn": 0.02, "ve": 0.02, "vd": 0.02, "pn": 0.004, "pe": 0.004, "v": 0.02,
+}  # fmt: skip
+"""Where the card states no noise, readings are not believed more than this.
+
+A motion capture is far finer than any rigid-body model (vibration, jitter of the time stamps): with
+its true noise the likelihood would be spent on what no parameter can mend.
+"""
+
+
+_A = float64[::1]
+STEP = types.void(_A, _A, float64, _A, _A, _A)
+MEASURE = types.void(_A, _A, _A, _A, _A)
+
+
+@compiled()
+def _heed(u: Any, p: Any, x: Any) -> None:
+    """Correct a state (26,) in place by the news of the commands, u[5:9]; see closed_loop.py."""
+    if u.size == N_INPUTS:
+        return
+    gain = p[P.COMMAND_GAIN : P.N_FIXED]
+    lon, lat = u[N_INPUTS + 2], u[N_INPUTS + 3]
+    turn, lift = u[N_INPUTS] - u[N_INPUTS + 1], u[N_INPUTS] + u[N_INPUTS + 1]
+    x[3] += gain[0] * lat
+    x[4] += gain[0] * lon
+    x[23] += gain[1] * lat
+    x[24] += gain[1] * lon
+    x[20] += gain[2] * lon
+    x[21] -= gain[2] * lat
+    x[5] += gain[3] * turn
+    x[25] += gain[4] * turn
+    x[2] += gain[5] * lift
+    x[22] += gain[6] * lift
+
+
+@pointer(STEP)
+def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.step` after what the commands tell, in the engine's form."""
+    for i in range(N_FULL):
+        out[i] = x[i]
+    _heed(u, p, out)
+    dynamics.step(out, u, dt, p, work, out)
+
+
+@pointer(MEASURE)
+def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.measure`, in the form in which the engine takes a model."""
+    dynamics.measure(x, u, p, work, out)
+
+
+@pointer(STEP)
+def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.drift_and_readings` and what the commands tell, in the engine's form."""
+    dynamics.drift_and_readings(x, u, dt, p, work, out)
+    _heed(u, p, out)
+
+
+class HeliModel:
+    """A vehicle, through the engine's protocol."""
+
+    channels = CHANNELS
+    wraps = np.array([c in ANGLES for c in CHANNELS])
+    step = _step
+    measure = _measure
+    drift_and_readings = _drift_and_readings
+    exact = np.arange(N_FULL) >= N_STATES
+    work_size = dynamics.WORK_SIZE
+    state_scale = np.array(
+        [1e-4] * 6 + [1e-5] * 4 + [1e-5] * 3 + [1e-4] * 3 + [1e-2] * 2 + [1e-5] * 2
+        + [1e-4] * 3 + [1e-5] * 3
+    )  # fmt: skip
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        self.bare_values = vehicle.values()
+
+    def vector(self, values: Mapping[str, float]) -> np.ndarray:
+        """Parameter vector of the vehicle with some values changed, effects included."""
+        vector = effects.pack({**self.bare_values, **values})
+        for reference, own in P.GUST_REFERENCE.items():
+            vector[reference] = self.vehicle.vector[own]
+        return vector
+
+    def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
+        """Commands and time since the run's start, (n, 5); and the commands' news, (n, 9)."""
+        u = np.empty((record.t.size, N_INPUTS))
+        u[:, :TIME] = record.command
+        u[:, TIME] = record.t - record.origin
+        delay = vector[_DELAY]
+        if delay > 0.0:
+            for column in (2, 3):
+                u[:, column] = _mean_of_late(record.t, record.command[:, column], delay)
+        return u if record.news is None else np.hstack([u, record.news])
+
+    def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
+        """First state from the medians of the first half second, with a wide covariance."""
+        early = record.t <= record.t[0] + 0.5
+
+        def first(channel: str, otherwise: float, spread: float) -> tuple[float, float]:
+            values = record.z[early, CHANNELS.index(channel)]
+            values = values[np.isfinite(values)]
+            if values.size == 0:
+                return otherwise, spread
+            if channel in ANGLES:
+                values = np.unwrap(values[:3])
+            return float(np.median(values)), 0.5 if channel in ("h", "pn", "pe") else spread
+
+        x = np.zeros(N_FULL)
+        spread = np.zeros(N_FULL)
+        for i, channel in ((10, "phi"), (11, "theta"), (12, "psi")):
+            x[i], spread[i] = first(channel, 0.0, 0.2)
+        height, spread[15] = first("h", 1.0, 1.0)
+        x[15] = -height
+        x[13], spread[13] = first("pn", 0.0, 1e-3)
+        x[14], spread[14] = first("pe", 0.0, 1e-3)
+        spread[0:3] = 1.0
+        spread[3:6] = 0.6
+        spread[6:10] = 0.06
+        x[16:20] = record.command[0]
+        spread[16:18] = 4.0
+        spread[18:20] = 0.03
+        return x, np.diag(spread**2 + 1e-12)
+
+    def start_noise(self, noise: Noise) -> np.ndarray:
+        """Variances of the gusts at the start of a run (26,)."""
+        return np.append(np.zeros(N_FULL - 6), _gust_levels(noise) ** 2)
+
+    def process_noise(self, noise: Noise) -> np.ndarray:
+        """Growth of the states' variances per second (26,): gusts, and a little everywhere."""
+        q = np.zeros(N_FULL)
+        q[0:3] = 1e-4**2
+        q[3:6] = 1e-3**2
+        q[6:10] = 1e-4**2
+        q[10:16] = 1e-5**2
+        q[16:18] = 0.1**2
+        q[18:20] = 1e-4**2
+        level = noise.process
+        p = self.vehicle
+        mass = p["mass"].value
+        q[0:2] += (level.get("buffet_xy", 0.0) / mass) ** 2
+        q[2] += (level.get("buffet_z", 0.0) / mass) ** 2
+        q[3] += (level.get("buffet_moment_xy", 0.0) / p["inertia_xx"].value) ** 2
+        q[4] += (level.get("buffet_moment_xy", 0.0) / p["inertia_yy"].value) ** 2
+        q[5] += (level.get("buffet_moment_z", 0.0) / p["inertia_zz"].value) ** 2
+        q[20:26] = 2.0 * _gust_levels(noise) ** 2 / noise.process["memory"]
+        return q
+
+    # --- what may be fitted -------------------------------------------------------------------------
+
+    def base_parameters(self) -> list[FreeParameter]:
+        """The vehicle's own numbers under their priors."""
+        return [
+            FreeParameter(name, p.value, p.std, lower=0.3 * p.value, upper=3.0 * p.value)
+            for name, p in self.vehicle.parameters.items()
+            if p.std > 0.0 and name not in HELD
+        ]
+
+    @staticmethod
+    def effect_parameters(effect: str) -> list[FreeParameter]:
+        """An effect's parameters; the prior is centred on its off-value.
+
+        Nothing is taken to be more than FARTHEST usual sizes: beyond that it is another effect.
+        """
+        entry = effects.CATALOGUE[effect]
+        return [
+            FreeParameter(
+                full,
+                p.off,
+                p.usual,
+                max(p.lower, p.off - FARTHEST * p.usual),
+                min(p.upper, p.off + FARTHEST * p.usual),
+                p.probe,
+                entry.stage == effects.SENSOR,
+            )
+            for full, p in zip(entry.names(), entry.parameters, strict=True)
+        ]
+
+
+_DELAY = effects.parameter_index("servo_delay.time")
+
+
+def _gust_levels(noise: Noise) -> np.ndarray:
+    level = noise.process
+    return np.array(
+        [level["force_xy"]] * 2
+        + [level["force_z"]]
+        + [level["moment_xy"]] * 2
+        + [level["moment_z"]]
+    )
+
+
+def _mean_of_late(t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
+    """Mean over each row's interval of a held command that arrives late."""
+    area = np.concatenate([[0.0], np.cumsum(command[:-1] * np.diff(t))])
+
+    def integral(time: np.ndarray) -> np.ndarray:
+        inside = np.interp(time, t, area)
+        return inside + np.minimum(time - t[0], 0.0) * command[0]
+
+    end = np.append(t[1:], t[-1] + (t[-1] - t[-2]))
+    start = t - delay
+    stop = np.minimum(end - delay, t[-1])
+    return (integral(stop) - integral(start)) / np.maximum(stop - start, 1e-9)
+
+
+def record_of(run: Run) -> Record:
+    """A run as the engine sees it."""
+    z = np.full((run.t.size, len(CHANNELS)), np.nan)
+    for channel, values in run.measured.items():
+        z[:, CHANNELS.index(channel)] = values
+    return Record(run.name, run.t, run.command, z, origin=float(run.t[0]))
+
+
+def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
+    """Noise to start from: readings as the card says or the data show, gusts by guess.
+
+    A vehicle's vibration is noise to the filter, on top of what the card says: its phase is not known.
+    """
+    weight = vehicle["mass"].value * vehicle["gravity"].value
+    arm = vehicle["arm_upper"].value
+    process = {
+        "force_xy": 0.01 * weight,
+        "force_z": 0.01 * weight,
+        "moment_xy": 0.005 * weight * arm,
+        "moment_z": 0.003 * weight * arm,
+        "memory": 0.5,
+    }
+    floor = {
+        "force_xy": 5e-4 * weight,
+        "force_z": 5e-4 * weight,
+        "moment_xy": 3e-4 * weight * arm,
+        "moment_z": 1e-4 * weight * arm,
+    }
+    for gust, buffet in zip(GUST_LEVELS, BUFFET_LEVELS, strict=True):
+        floor[buffet] = 0.1 * floor[gust]
+        process[buffet] = 0.1 * floor[gust]
+    shake = vehicle.values().get("vibration.amplitude", 0.0) / np.sqrt(2.0)
+    reading = {
+        c: float(np.hypot(flight.noise[c], shake if c in ("ax", "ay", "az") else 0.0))
+        if c in flight.noise
+        else max(2.0 * sensor_std(flight, c), LEAST_READING_STD[c])
+        for c in flight.channels
+    }
+    return Noise(process, reading, floor)
+
+
+def sensor_std(flight: Flight, channel: str) -> float:
+    """Std of a sensor: the card's, else from its scatter from sample to sample.
+
+    Third differences, robustly: white noise stays, motion cancels.
+    """
+    if channel in flight.noise:
+        return flight.noise[channel]
+    parts = []
+    for run in flight.runs:
+        if channel in run.measured:
+            values = run.measured[channel][np.isfinite(run.measured[channel])]
+            if channel in ANGLES:
+                values = np.unwrap(values)
+            if values.size > 8:
+                parts.append(np.diff(values, 3))
+    if not parts:
+        return LEAST_READING_STD[channel]
+    return float(np.median(np.abs(np.concatenate(parts)))) / 0.6745 / float(np.sqrt(20.0))

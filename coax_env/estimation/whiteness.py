@@ -1,0 +1,79 @@
+"""Are innovations white? A Ljung-Box statistic per channel, with an effect size beside it.
+
+Ljung and Box, Biometrika 65, 1978. On long records the test alone finds correlations that matter to
+nobody, so a channel counts as coloured only where the correlation is also large, against the noise
+that was assumed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.stats import chi2
+
+from coax_env.estimation.fit import RunPass
+
+LAGS = 20
+SETTLING = 1.0  # s at the start of each run that are not counted
+P_VALUE = 1e-5
+SHARE = 0.04  # of a channel's innovation variance that its own past predicts
+SPREAD = 1.25  # std of whitened innovations (1 where model and noise are right)
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Of one channel's whitened innovations, the worst run's figures.
+
+    coloured_share: share of the variance that its own past predicts. spread: std.
+    """
+
+    coloured_share: float
+    p_value: float
+    spread: float
+    run: str
+    white: bool
+
+    @property
+    def inflation(self) -> float:
+        """How many coloured innovations carry what one white one does, at most 5."""
+        return 1.0 / max(1.0 - self.coloured_share, 0.2)
+
+
+def whiteness(passes: Sequence[RunPass], channels: Sequence[str]) -> dict[str, Whiteness]:
+    """Whiteness by channel, for channels with readings."""
+    result = {}
+    for i, channel in enumerate(channels):
+        parts = []
+        for run in passes:
+            late = run.record.t > run.record.t[0] + SETTLING
+            e = run.innovations[late, i]
+            e = e[np.isfinite(e)]
+            if e.size > 3 * LAGS:
+                parts.append((run.record.name, e))
+        if parts:
+            result[channel] = _judge(parts)
+    return result
+
+
+def _judge(parts: Sequence[tuple[str, np.ndarray]]) -> Whiteness:
+    worst = None
+    for name, e in parts:
+        n = e.size
+        rho = np.array([np.sum(e[k:] * e[:-k]) for k in range(1, LAGS + 1)]) / np.sum(e**2)
+        q = n * (n + 2) * np.sum(rho**2 / (n - np.arange(1, LAGS + 1)))
+        predictor = solve_toeplitz(np.append(1.0, rho[:-1]), rho)  # Yule-Walker
+        share = float(np.clip(predictor @ rho - LAGS / n, 0.0, 1.0))
+        p = float(chi2.sf(q, LAGS)) * len(parts)
+        spread = float(e.std())
+        white = not ((p < P_VALUE and share * min(spread, 1.0) ** 2 > SHARE) or spread > SPREAD)
+        judged = Whiteness(share, min(p, 1.0), spread, name, white)
+        if worst is None or (worst.white, -worst.coloured_share) > (white, -share):
+            worst = judged
+    assert worst is not None
+    return worst
+
+
+def is_white(passes: Sequence[RunPass], channels: Sequence[str]) -> bool:
+    """Whether the innovations leave nothing to explain in any channel."""
+    return all(judged.white for judged in whiteness(passes, channels).values())

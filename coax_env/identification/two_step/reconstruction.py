@@ -1,0 +1,151 @@
+"""Step 1 of the paper's method: the helicopter's states from gyro, accelerometers and sonar.
+
+Longitudinal, five states theta u w h lambda_az, (46)-(57): the IMU is the input, the sonar the only
+measurement, the bias of a_z a state. The height alone hardly observes u, which is dead reckoned from
+rest: its std says so. Beside the filter the fixed-interval smoother of Rauch, Tung and Striebel 1965.
+
+Flapping (50)-(51) is integrated apart, from the swash command and the filtered rate. The paper prints
+tau_f,f for the lower rotor in (50); it must be tau_f,l. The same with beta, p and delta_lat.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from coax_env.kernel.compilation import compiled
+
+THETA, U, W, H, BIAS = range(5)
+START_STD = np.array([0.02, 0.05, 0.05, 0.05, 0.1])
+"""Of the first state, from rest: 1 deg, 5 cm/s, the sonar's reading, 0.1 m/s2. Ours."""
+
+
+@dataclass(frozen=True)
+class Longitudinal:
+    """States theta [rad], u, w [m/s], h [m], bias of a_z [m/s2], each with its std, (n, 5).
+
+    smoothed, smoothed_std: the same from the whole record. residual: (n,) sonar less the filtered
+    height [m], NaN where the sonar was silent.
+    """
+
+    states: np.ndarray
+    std: np.ndarray
+    smoothed: np.ndarray
+    smoothed_std: np.ndarray
+    residual: np.ndarray
+
+
+def longitudinal(
+    q: np.ndarray,
+    ax: np.ndarray,
+    az: np.ndarray,
+    sonar: np.ndarray,
+    dt: float,
+    gravity: float,
+    noise: tuple[float, float, float],
+) -> Longitudinal:
+    """Extended Kalman filter of (46)-(57) and its smoother, over one run.
+
+    Args:
+        q, ax, az: (n,) the IMU [rad/s, m/s2]. sonar: (n,) height [m], NaN where silent.
+        noise: std of the gyro [rad/s], the accelerometers [m/s2] and the sonar [m]. The paper gives no
+            Q, R or P0: Q is the IMU's noise through the model, R the sonar's, both of Table V.
+    """
+    gyro, accelerometer, echo = noise
+    heard = sonar[np.isfinite(sonar)]
+    start = np.array([0.0, 0.0, 0.0, float(np.median(heard[:20])) if heard.size else 0.0, 0.0])
+    shake = np.array([gyro, accelerometer, accelerometer]) ** 2
+    columns = [np.ascontiguousarray(column, float) for column in (q, ax, az, sonar)]
+    predicted, P_predicted, filtered, P_filtered, transition = _filter(
+        *columns, float(dt), float(gravity), shake, float(echo) ** 2, start, START_STD**2
+    )
+    smooth, P_smooth = _smooth(predicted, P_predicted, filtered, P_filtered, transition)
+    return Longitudinal(
+        filtered, _std(P_filtered), smooth, _std(P_smooth), columns[3] - filtered[:, H]
+    )
+
+
+@compiled(makes_arrays=True)
+def _filter(
+    q: np.ndarray, ax: np.ndarray, az: np.ndarray, sonar: np.ndarray, dt: float, g: float,
+    shake: np.ndarray, echo: float, start: np.ndarray, spread: np.ndarray,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """Forward pass: predicted and filtered states (n, 5), covariances (n, 5, 5), transitions."""
+    n = q.size
+    x = start.copy()
+    P = np.diag(spread)
+    predicted, filtered = np.zeros((n, 5)), np.zeros((n, 5))
+    P_predicted, P_filtered = np.zeros((n, 5, 5)), np.zeros((n, 5, 5))
+    transition = np.zeros((n, 5, 5))
+    middle, slope = np.zeros(5), np.zeros(5)
+    for k in range(n):
+        predicted[k], P_predicted[k] = x, P
+        if np.isfinite(sonar[k]):
+            gain = P[:, H].copy() / (P[H, H] + echo)
+            x = x + gain * (sonar[k] - x[H])
+            P = P - np.outer(gain, P[H].copy())
+            P = 0.5 * (P + P.T)
+        filtered[k], P_filtered[k] = x, P
+        after = min(k + 1, n - 1)
+        _rates(x, q[k], ax[k], az[k], g, slope)
+        middle[:] = x + 0.5 * dt * slope
+        halfway = 0.5 * (q[k] + q[after]), 0.5 * (ax[k] + ax[after]), 0.5 * (az[k] + az[after])
+        _rates(middle, halfway[0], halfway[1], halfway[2], g, slope)
+        x = x + dt * slope
+        sin, cos = np.sin(middle[THETA]), np.cos(middle[THETA])
+        A = np.zeros((5, 5))
+        A[U, THETA], A[U, W] = -g * cos, -q[k]
+        A[W, THETA], A[W, U], A[W, BIAS] = -g * sin, q[k], -1.0
+        A[H, THETA] = middle[U] * cos + middle[W] * sin
+        A[H, U], A[H, W] = sin, -cos
+        F = np.eye(5) + dt * A + 0.5 * dt * dt * (A @ A)
+        G = np.zeros((5, 3))
+        G[THETA, 0], G[U, 0], G[W, 0] = 1.0, -middle[W], middle[U]
+        G[U, 1] = G[W, 2] = 1.0
+        transition[k] = F
+        P = F @ P @ F.T + dt * dt * ((G * shake) @ G.T)
+    return predicted, P_predicted, filtered, P_filtered, transition
+
+
+@compiled()
+def _rates(x: np.ndarray, q: float, ax: float, az: float, g: float, out: np.ndarray) -> None:
+    """(46)-(49) with (54)-(55)."""
+    sin, cos = np.sin(x[THETA]), np.cos(x[THETA])
+    out[THETA] = q
+    out[U] = ax - q * x[W] - g * sin
+    out[W] = az - x[BIAS] + q * x[U] + g * cos
+    out[H] = x[U] * sin - x[W] * cos
+    out[BIAS] = 0.0
+
+
+@compiled(makes_arrays=True)
+def _smooth(
+    predicted: np.ndarray, P_predicted: np.ndarray, filtered: np.ndarray,
+    P_filtered: np.ndarray, transition: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Backward pass of Rauch, Tung and Striebel."""
+    smooth, P_smooth = filtered.copy(), P_filtered.copy()
+    for k in range(len(filtered) - 2, -1, -1):
+        back = np.linalg.solve(P_predicted[k + 1], transition[k] @ P_filtered[k]).T.copy()
+        smooth[k] += back @ (smooth[k + 1] - predicted[k + 1])
+        P_smooth[k] += back @ (P_smooth[k + 1] - P_predicted[k + 1]) @ back.T
+    return smooth, P_smooth
+
+
+def _std(P: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.maximum(np.einsum("kii->ki", P), 0.0))
+
+
+def flapping(
+    rate: np.ndarray, tilt: np.ndarray | float, dt: float, time_constant: float, gain: float
+) -> np.ndarray:
+    """A rotor's or fly-bar's flap angle by (26)-(29) without coupling, (n,) [rad], from rest.
+
+    a' = (gain tilt - a) / time_constant - rate: the tilt held from row to row, exactly; the rate by the
+    trapezoidal rule. Columns of an (n, k) `rate` are followed each on its own.
+    """
+    half = 0.5 * dt / time_constant
+    turning = lfilter([0.5 * dt, 0.5 * dt], [1.0 + half, half - 1.0], rate, axis=0)
+    keep = np.exp(-dt / time_constant)
+    following = lfilter([0.0, gain * (1.0 - keep)], [1.0, -keep], np.atleast_1d(tilt), axis=0)
+    return np.asarray(following - turning)

@@ -1,0 +1,1 @@
+"""Compilation by numba: a cache that stays true, lazy compilation, SIMD, random streams."""

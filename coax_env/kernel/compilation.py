@@ -1,0 +1,126 @@
+"""numba, with a cache that stays true.
+
+numba's own cache looks at the file of the function being compiled, not at the files of the functions
+it calls: edit a callee in another module and the old machine code still runs (numerics.md, traps).
+So the cache folder here is named by a hash over every source that takes part in the kernel; any edit
+gives a new folder, and the old one is left to age.
+"""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numba
+
+PACKAGE = Path(__file__).parents[1]
+TABLES = ("model/layout.py", "model/parameters.py", "model/workspace.py")
+"""Places and sizes that compiled code has as constants; these files compile nothing themselves."""
+
+
+def kernel_sources() -> list[Path]:
+    """The package's files that take part in compiled code: those that import this room, and TABLES."""
+    compiling = [
+        path
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if "coax_env.kernel" in path.read_text(encoding="utf-8")
+    ]
+    return [*compiling, *(PACKAGE / name for name in TABLES)]
+
+
+def source_hash(extra: tuple[Path, ...] = ()) -> str:
+    """Twelve hex digits over the kernel's sources, numba's version and files named by the caller."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for path in (*kernel_sources(), *extra):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _cache_root() -> Path:
+    root = os.environ.get("COAX_CACHE_DIR")
+    if root:
+        return Path(root)
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return (
+        home / "coax" if os.access(home.parent, os.W_OK) else Path(tempfile.gettempdir()) / "coax"
+    )
+
+
+CACHE_DIR = _cache_root() / source_hash()
+_included: list[Path] = []
+
+
+def include(path: Path) -> None:
+    """Let a user's file take part in the kernel: what is compiled from now on has its own cache."""
+    global CACHE_DIR
+    _included.append(path)
+    CACHE_DIR = _cache_root() / source_hash(tuple(_included))
+
+
+@contextmanager
+def _own_cache() -> Iterator[None]:
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(CACHE_DIR)
+    try:
+        yield
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def name_apart(function: Callable, *values: Any) -> Callable:
+    """Give a closure a name with its values in it, or with those given.
+
+    numba tells functions apart by name and by a count of what this process has compiled so far, in the
+    cache's index as in the machine code's symbols. Closures of one name can therefore be mixed up where
+    one process loads what two have compiled, or one that was stopped half way and began again.
+    """
+    if not values:
+        cells = [cell.cell_contents for cell in function.__closure__ or ()]
+        values = tuple(v for v in cells if isinstance(v, bool | int | float | str))
+    if values:
+        function.__qualname__ += "_" + "_".join(map(str, values))
+    return function
+
+
+BORROWING = {"error_model": "numpy", "_nrt": False}
+"""Options of what works on its callers' arrays, makes none and returns none.
+
+References to arrays are then not counted, at every call of every function: two thirds of the kernel's
+time. numba refuses to compile what makes an array all the same; what returns one it does not notice.
+"""
+
+
+def compiled(
+    signature: Any = None, makes_arrays: bool = False, **options: Any
+) -> Callable[[Callable], Any]:
+    """``numba.njit`` that caches under CACHE_DIR and releases the GIL.
+
+    makes_arrays: the function makes arrays or returns them, see BORROWING.
+    """
+    settings = {
+        "cache": True, "nogil": True, "no_cfunc_wrapper": True,
+        **BORROWING, "_nrt": makes_arrays, **options,
+    }  # fmt: skip
+
+    def decorate(function: Callable) -> Any:
+        name_apart(function)
+        with _own_cache():
+            if signature is None:
+                return numba.njit(**settings)(function)
+            return numba.njit(signature, **settings)(function)
+
+    return decorate
+
+
+def pointer(signature: Any) -> Callable[[Callable], Any]:
+    """``numba.cfunc`` with the same cache: a compiled function that can be passed as an argument."""
+
+    def decorate(function: Callable) -> Any:
+        with _own_cache():
+            settings = {"cache": True, "nopython": True, **BORROWING}
+            return numba.cfunc(signature, **settings)(function)
+
+    return decorate

@@ -1,0 +1,91 @@
+"""Compiled functions that are compiled when they are first called.
+
+numba compiles every function that a compiled function might call, so that whoever flies a vehicle
+without effects would wait for the code of them all. A late function is called through its address
+instead, which stands in a cell of memory; while the cell is empty, the call goes to Python first and
+has the function compiled. What compiled code remembers is the cell's name, so it can be cached.
+"""
+
+import ctypes
+import threading
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import llvmlite.binding
+from llvmlite import ir
+from numba import float64, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from coax_env.kernel.compilation import name_apart, pointer
+
+DONE, FAILED, INTERRUPTED = range(3)
+_MAKER = ctypes.CFUNCTYPE(ctypes.c_int)
+_ARRAY = float64[::1]
+_compiling = threading.RLock()
+_kept: list[Any] = []  # cells and makers: compiled code has their addresses
+
+
+def late(function: Callable) -> Any:
+    """Make a function of 3 to 6 arguments one that compiled code can call; see above.
+
+    All are arrays of doubles, but for one called ``dt``, a number.
+    """
+    name = name_apart(function).__qualname__
+    arguments = function.__code__.co_varnames[: function.__code__.co_argcount]
+    signature = types.void(*(float64 if a == "dt" else _ARRAY for a in arguments))
+    cell = ctypes.c_size_t(0)
+
+    def compile_now() -> int:
+        try:
+            with _compiling:
+                if not cell.value:
+                    made = pointer(signature)(function)
+                    _kept.append(made)
+                    cell.value = made.address
+        except KeyboardInterrupt:
+            return INTERRUPTED
+        except Exception:  # Python cannot raise through compiled code: the caller there does
+            traceback.print_exc()
+            return FAILED
+        return DONE
+
+    maker = _MAKER(compile_now)
+    _kept.extend((cell, maker))
+    cell_symbol, maker_symbol = f"coax_env.kernel.lazy.{name}", f"coax_env.kernel.lazy.{name}.maker"
+    llvmlite.binding.add_symbol(cell_symbol, ctypes.addressof(cell))
+    llvmlite.binding.add_symbol(maker_symbol, ctypes.cast(maker, ctypes.c_void_p).value)
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kinds = [context.get_value_type(kind) for kind in signature.args]
+        function = ir.FunctionType(ir.VoidType(), kinds).as_pointer()
+        place = context.get_c_value(builder, cgutils.intp_t, cell_symbol)
+        empty = builder.icmp_unsigned("==", builder.load(place), cgutils.intp_t(0))
+        with cgutils.if_unlikely(builder, empty):
+            kind = ir.FunctionType(cgutils.int32_t, [])
+            call = cgutils.get_or_insert_function(builder.module, kind, maker_symbol)
+            outcome = builder.call(call, [])
+            for code, error in ((INTERRUPTED, KeyboardInterrupt), (FAILED, RuntimeError)):
+                with cgutils.if_unlikely(
+                    builder, builder.icmp_unsigned("==", outcome, cgutils.int32_t(code))
+                ):
+                    message = () if code == INTERRUPTED else (f"{name} did not compile",)
+                    context.call_conv.return_user_exc(builder, error, message)
+        builder.call(builder.inttoptr(builder.load(place), function), args)
+        return context.get_dummy_value()
+
+    def of_three(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
+        return signature, emit
+
+    def of_four(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+        return signature, emit
+
+    def of_five(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any) -> Any:
+        return signature, emit
+
+    def of_six(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> Any:
+        return signature, emit
+
+    # numba takes no *args here
+    return intrinsic({3: of_three, 4: of_four, 5: of_five, 6: of_six}[len(signature.args)])

@@ -1,0 +1,1 @@
+"""The helicopter: state vector, parameters, effects, dynamics, sensors, actuators, vehicle files."""

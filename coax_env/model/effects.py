@@ -1,0 +1,792 @@
+"""The catalogue of effects: what a real small coaxial helicopter has and the bare model lacks.
+
+An effect is a group of parameters of the one model; at its off-value it is not there. **To add one,
+write one function under an** `@effect(...)` **entry below; nothing else changes**: the vehicle files,
+the kernel, the estimator, the diagnosis and the reports all read the catalogue.
+
+The function gets ``(x, f, p, e)``: full state (layout.py), the kernel's workspace (workspace.py), the
+parameter vector, and the index ``e`` of the effect's first parameter in it. It changes the workspace
+in place. It runs at its *stage* of the kernel (dynamics.py):
+
+- ``PROPERTY``, once a step: mass, inertia, gains, lags of the actuators;
+- ``AIR``: the velocity through the air;
+- ``SWASH``: the swash plate's tilt;
+- ``ROTOR``: thrust and torque of the two rotors;
+- ``LOAD``: forces, moments and flap rates;
+- ``UNLISTED``: the generic terms of what no effect here explains (generic_terms.py);
+- ``SENSOR``: readings.
+
+An effect with a memory of its own uses one: first-order lags of rotors and servos are states of the
+kernel (MOTOR_LAG_*, SERVO_LAG, discretised exactly, so that zero is a limit and not a branch); a
+pure delay of the command is a shift of the input (helicopter.py), of a reading its rate of change.
+
+A stage whose effects are all off is skipped by one test, so that the bare model pays nothing.
+Signs, sizes and look-alikes follow design/effects.md; "usual" is also the width of the prior. What
+physics gives one sign only (drag, damping, stiffness, lag) is bounded at zero: a fit that wants the
+other sign is explaining something else.
+"""
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from coax_env.errors import InputError
+from coax_env.kernel.compilation import BORROWING, name_apart
+from coax_env.model import generic_terms
+from coax_env.model import parameters as P
+from coax_env.model import workspace as F
+from coax_env.model.layout import CHANNELS
+
+STAGES = ("PROPERTY", "AIR", "SWASH", "ROTOR", "LOAD", "UNLISTED", "SENSOR")
+PROPERTY, AIR, SWASH, ROTOR, LOAD, UNLISTED, SENSOR = (P.N_FIXED + i for i in range(len(STAGES)))
+SWITCHES = slice(P.N_FIXED, P.N_FIXED + len(STAGES))
+"""Where a parameter vector says of each stage whether it has an effect: 0 or 1."""
+"""Where each stage's switch stands in the parameter vector."""
+
+INFINITY = math.inf
+DEGREE = math.pi / 180.0
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """One parameter of an effect.
+
+    ``usual`` is the usual size and the std of the prior about ``off``; ``smallest`` the size under
+    which it does not matter in prediction and is never named; a ``shape`` parameter (a decay, say)
+    acts only once the effect itself does; ``timing``: a lag or delay of the command.
+    """
+
+    name: str
+    unit: str
+    usual: float
+    smallest: float
+    off: float = 0.0
+    lower: float = -INFINITY
+    upper: float = INFINITY
+    shape: bool = False
+    timing: bool = False
+    probe: float = (
+        0.0  # finite step for the signature where the effect has no slope at its off-value
+    )
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One group of parameters with the function that acts on them.
+
+    ``replaces`` names base parameters that are the same column. ``input_shift``: acts on the input,
+    not in the kernel. ``line``: found by its line in the spectrum (vibration.py), not by a signature.
+    ``generic``: unlisted terms, of which a vehicle file holds those that are not zero. ``damps``: its
+    one parameter damps the motion, and so changes what a filter makes of gusts.
+    """
+
+    name: str
+    stage: int
+    parameters: tuple[EffectParameter, ...]
+    channels: tuple[str, ...]
+    source: str
+    summary: str
+    function: Any  # compiled
+    replaces: tuple[str, ...] = ()
+    input_shift: bool = False
+    line: bool = False
+    generic: bool = False
+    damps: bool = False
+    index: int = -1
+
+    def names(self) -> tuple[str, ...]:
+        """Full names of the parameters, ``effect.parameter``."""
+        return tuple(f"{self.name}.{p.name}" for p in self.parameters)
+
+
+CATALOGUE: dict[str, Effect] = {}
+"""The effects that have a name: what can be found, excluded and listed as a cause."""
+GROUPS: dict[str, Effect] = {}
+"""Those and the generic groups: everything that a vehicle file and the kernel know."""
+_FIRST = P.N_FIXED + len(STAGES)
+
+
+def effect(
+    stage: int,
+    *parameters: EffectParameter,
+    channels: str,
+    source: str,
+    replaces: tuple[str, ...] = (),
+    input_shift: bool = False,
+    line: bool = False,
+    generic: bool = False,
+    damps: bool = False,
+    name: str = "",
+) -> Callable[[Callable], Callable]:
+    """Enter a function into the catalogue under its own (or this) name; its docstring says what it is.
+
+    Raises:
+        InputError: the name is taken, a channel does not exist, or the stage or parameters are none.
+    """
+
+    def enter(function: Callable) -> Callable:
+        own = name or function.__name__
+        if not isinstance(stage, int) or not parameters:
+            raise InputError(f"effect {own!r}: @effect(stage, EffectParameter(...), ...) is wanted")
+        if own in GROUPS:
+            raise InputError(f"the catalogue of effects has {own!r} already")
+        if damps and sum(not p.shape for p in parameters) != 1:
+            raise InputError(f"effect {own!r}: damps=True is for an effect of one parameter")
+        for channel in channels.split():
+            if channel not in CHANNELS:
+                raise InputError(f"effect {own!r}: no channel {channel!r}")
+        users = not function.__module__.startswith("coax_env.")  # which may make arrays
+        function_compiled = njit(**{**BORROWING, "_nrt": users})(name_apart(function))
+        entry = Effect(
+            name=own,
+            stage=stage,
+            parameters=parameters,
+            channels=tuple(channels.split()),
+            source=source,
+            summary=(function.__doc__ or "").strip(),
+            function=function_compiled,
+            replaces=replaces,
+            input_shift=input_shift,
+            line=line,
+            generic=generic,
+            damps=damps,
+            index=n_parameters(),
+        )
+        GROUPS[own] = entry
+        if not generic:
+            CATALOGUE[own] = entry
+        _offs.cache_clear()
+        return function_compiled
+
+    return enter
+
+
+def forget(names: Collection[str]) -> None:
+    """Take the latest entries out again (a user's file that turned out faulty)."""
+    for name in names:
+        GROUPS.pop(name)
+        CATALOGUE.pop(name, None)
+    _offs.cache_clear()
+
+
+def n_parameters() -> int:
+    """Length of the parameter vector."""
+    return _FIRST + sum(len(e.parameters) for e in GROUPS.values())
+
+
+@cache
+def _offs() -> tuple[np.ndarray, np.ndarray]:
+    """Off-values of all effects' parameters, (k,), and which switch each one throws, (k, stages)."""
+    every = [(p, e.stage) for e in GROUPS.values() for p in e.parameters]
+    throws = [
+        [not p.shape and stage == switch for switch in range(P.N_FIXED, _FIRST)]
+        for p, stage in every
+    ]
+    return np.array([p.off for p, _ in every]), np.array(throws, dtype=float)
+
+
+# --- properties -----------------------------------------------------------------------------------
+
+
+@effect(
+    PROPERTY,
+    EffectParameter("mass", "kg", usual=0.05, smallest=0.01),
+    channels="az vd h",
+    source="Newton; a payload at the centre of gravity",
+    replaces=("mass",),
+)
+def added_mass(x, f, p, e):
+    """Mass m + dm: something is carried that the scale did not see."""
+    f[F.MASS] += p[e]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter("scale", "1", usual=0.07, smallest=0.02, lower=-0.3, upper=0.5),
+    channels="az vd h",
+    source="eqs (15)-(16)",
+    replaces=("thrust_coefficient_upper",),
+)
+def thrust_scale(x, f, p, e):
+    """Both thrust coefficients times (1 + s)."""
+    f[F.THRUST_FACTOR_U] *= 1.0 + p[e]
+    f[F.THRUST_FACTOR_L] *= 1.0 + p[e]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter("scale", "1", usual=0.07, smallest=0.02, lower=-0.3, upper=0.5),
+    channels="r psi",
+    source="eqs (19)-(20)",
+    replaces=("torque_coefficient_lower",),
+)
+def torque_balance(x, f, p, e):
+    """Torque coefficient of the lower rotor times (1 + s)."""
+    f[F.TORQUE_FACTOR_L] *= 1.0 + p[e]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter("scale", "1", usual=0.2, smallest=0.05, lower=-0.8),
+    channels="r psi",
+    source="eq (37)",
+    replaces=("inertia_zz",),
+)
+def yaw_inertia(x, f, p, e):
+    """Yaw inertia I_zz (1 + s)."""
+    f[F.INERTIA_ZZ] *= 1.0 + p[e]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter("scale", "1", usual=0.15, smallest=0.03, lower=-0.9),
+    channels="p q phi theta",
+    source="eqs (26)-(27)",
+    replaces=("swash_to_flap",),
+)
+def swash_gain(x, f, p, e):
+    """Linkage gain K_b (1 + s)."""
+    f[F.SWASH_TO_FLAP] *= 1.0 + p[e]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter("scale", "1", usual=0.35, smallest=0.1, lower=-0.9),
+    channels="p q phi theta",
+    source="eqs (28)-(29)",
+    replaces=("flybar_time_constant",),
+)
+def flybar_time_constant(x, f, p, e):
+    """Following time of the stabiliser bar, tau_ff (1 + s)."""
+    f[F.FLYBAR_TIME] *= 1.0 + p[e]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter(
+        "upper", "s", usual=0.1, smallest=0.01, lower=0.0, upper=1.0, timing=True, probe=0.03
+    ),
+    EffectParameter(
+        "lower", "s", usual=0.1, smallest=0.01, lower=0.0, upper=1.0, timing=True, probe=0.03
+    ),
+    channels="rpm_upper rpm_lower az r",
+    source="first-order motor and speed controller, Beard and McLain 2012, ch. 4",
+)
+def motor_lag(x, f, p, e):
+    """Rotor speeds follow their commands with first-order lags."""
+    f[F.MOTOR_LAG_U] = p[e]
+    f[F.MOTOR_LAG_L] = p[e + 1]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter(
+        "time", "s", usual=0.04, smallest=0.008, lower=0.0, upper=0.5, timing=True, probe=0.02
+    ),
+    channels="p q",
+    source="first-order servo, Mettler 2003, ch. 3",
+)
+def servo_lag(x, f, p, e):
+    """Swash plate servos follow their commands with a first-order lag."""
+    f[F.SERVO_LAG] = p[e]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter(
+        "time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3, timing=True, probe=0.02
+    ),
+    channels="p q",
+    source="transport delay; commands are looked up late and the step is split",
+    input_shift=True,
+)
+def servo_delay(x, f, p, e):
+    """Swash plate commands arrive late by a pure delay (the input is shifted, see helicopter.py)."""
+
+
+@effect(
+    PROPERTY,
+    EffectParameter("rate", "1/s", usual=0.002, smallest=0.0003, lower=0.0),
+    channels="rpm_upper rpm_lower az r",
+    source="falling battery voltage, to first order in time",
+)
+def battery_sag(x, f, p, e):
+    """Rotor speed per command falls with time: omega = (1 - rate t) command."""
+    f[F.SPEED_SCALE] *= 1.0 - p[e] * f[F.TIME]
+
+
+# --- air ------------------------------------------------------------------------------------------
+
+
+@effect(
+    AIR,
+    EffectParameter("north", "m/s", usual=1.5, smallest=0.2),
+    EffectParameter("east", "m/s", usual=1.5, smallest=0.2),
+    channels="ax ay p q",
+    source="V_a = V - R^T w; acts only through a drag or blow-back",
+)
+def wind(x, f, p, e):
+    """Steady wind: the air's velocity towards north and east (turbulence adds to it in the env)."""
+    north, east = p[e], p[e + 1]
+    forward = north * f[F.COS_PSI] + east * f[F.SIN_PSI]
+    right = -north * f[F.SIN_PSI] + east * f[F.COS_PSI]
+    down = p[P.AIR_DOWN]
+    f[F.AIR_U] -= f[F.COS_THETA] * forward - f[F.SIN_THETA] * down
+    f[F.AIR_V] -= (
+        f[F.SIN_PHI] * f[F.SIN_THETA] * forward
+        + f[F.COS_PHI] * right
+        + f[F.SIN_PHI] * f[F.COS_THETA] * down
+    )
+    f[F.AIR_W] -= (
+        f[F.COS_PHI] * f[F.SIN_THETA] * forward
+        - f[F.SIN_PHI] * right
+        + f[F.COS_PHI] * f[F.COS_THETA] * down
+    )
+
+
+# --- swash plate ----------------------------------------------------------------------------------
+
+
+@effect(
+    SWASH,
+    EffectParameter("angle", "rad", usual=0.2, smallest=0.03),
+    channels="p q",
+    source="control phase angle, Bramwell 2001, ch. 5",
+)
+def swash_phase(x, f, p, e):
+    """Swash plate turned about the mast: lon and lat commands mix by an angle."""
+    cosine, sine = math.cos(p[e]), math.sin(p[e])
+    lon, lat = f[F.DELTA_LON], f[F.DELTA_LAT]
+    f[F.DELTA_LON] = cosine * lon - sine * lat
+    f[F.DELTA_LAT] = sine * lon + cosine * lat
+
+
+@effect(
+    SWASH,
+    EffectParameter("lon", "rad", usual=DEGREE, smallest=0.003),
+    EffectParameter("lat", "rad", usual=DEGREE, smallest=0.003),
+    channels="p q ax ay",
+    source="rigging error, added to the plate's tilt",
+)
+def swash_offset(x, f, p, e):
+    """Swash plate not level at zero command."""
+    f[F.DELTA_LON] += p[e]
+    f[F.DELTA_LAT] += p[e + 1]
+
+
+# --- rotors ---------------------------------------------------------------------------------------
+
+
+@effect(
+    ROTOR,
+    EffectParameter("gain", "1", usual=0.4, smallest=0.05, lower=0.0),
+    EffectParameter(
+        "decay", "1", usual=0.6, smallest=0.0, off=2.0, lower=0.5, upper=6.0, shape=True
+    ),
+    channels="az h vd",
+    source="exponential fit to Cheeseman and Bennett, ARC R&M 3021, 1955; z is the height of the CG",
+)
+def ground_effect(x, f, p, e):
+    """Thrust times 1 + gain exp(-decay z/R) near the ground."""
+    height = max(f[F.HEIGHT], 0.0)
+    rise = 1.0 + p[e] * math.exp(-p[e + 1] * height / p[P.ROTOR_RADIUS])
+    f[F.THRUST_U] *= rise
+    f[F.THRUST_L] *= rise
+
+
+@effect(
+    ROTOR,
+    EffectParameter("coefficient", "s/m", usual=0.1, smallest=0.015, lower=0.0),
+    channels="az h vd",
+    source="blade-element theory, climb inflow; Leishman 2006, ch. 3",
+    damps=True,
+)
+def axial_damping(x, f, p, e):
+    """Thrust times (1 + k w_air): a climb loses thrust, a descent gains it."""
+    rise = max(1.0 + p[e] * f[F.AIR_W], 0.0)
+    f[F.THRUST_U] *= rise
+    f[F.THRUST_L] *= rise
+
+
+@effect(
+    ROTOR,
+    EffectParameter("gain", "1", usual=0.27, smallest=0.06, lower=0.0, upper=1.5),
+    channels="az r",
+    source="lower rotor in the upper one's wake; Leishman and Ananthan, AHS J. 2008",
+)
+def wake_interference(x, f, p, e):
+    """Lower thrust times 1 - gain (share of the load on the upper rotor)."""
+    total = f[F.THRUST_U] + f[F.THRUST_L]
+    if total > 0.0:
+        f[F.THRUST_L] *= 1.0 - p[e] * f[F.THRUST_U] / total
+
+
+@effect(
+    ROTOR,
+    EffectParameter("excess", "1", usual=0.2, smallest=0.05, lower=-1.5, upper=2.0),
+    channels="az",
+    source="measured propeller curves depart from the square of speed; about hover",
+)
+def thrust_exponent(x, f, p, e):
+    """Thrust goes as speed to the power 2 + excess, unchanged at the bare model's hover speed."""
+    hover_u, hover_l = generic_terms.hover_speeds(p)
+    if f[F.OMEGA_U] > 0.0 and f[F.OMEGA_L] > 0.0:
+        f[F.THRUST_U] *= (f[F.OMEGA_U] / hover_u) ** p[e]
+        f[F.THRUST_L] *= (f[F.OMEGA_L] / hover_l) ** p[e]
+
+
+# --- forces, moments, flap rates ------------------------------------------------------------------
+
+
+@effect(
+    LOAD,
+    EffectParameter("area_x", "m2", usual=0.02, smallest=0.003, lower=0.0),
+    EffectParameter("area_y", "m2", usual=0.02, smallest=0.003, lower=0.0),
+    EffectParameter("area_z", "m2", usual=0.02, smallest=0.003, lower=0.0),
+    channels="ax ay az vn ve vd",
+    source="Hoerner 1965: quadratic drag, per axis",
+)
+def airframe_drag(x, f, p, e):
+    """Drag of the airframe, -1/2 rho area_i |V_a| V_a,i."""
+    u, v, w = f[F.AIR_U], f[F.AIR_V], f[F.AIR_W]
+    pressure = 0.5 * p[P.AIR_DENSITY] * math.sqrt(u * u + v * v + w * w)
+    f[F.FORCE_X] -= pressure * p[e] * u
+    f[F.FORCE_Y] -= pressure * p[e + 1] * v
+    f[F.FORCE_Z] -= pressure * p[e + 2] * w
+
+
+@effect(
+    LOAD,
+    EffectParameter("coefficient", "N s/m per rad/s", usual=4e-4, smallest=5e-5, lower=0.0),
+    channels="ax ay vn ve",
+    source="rotor H-force and induced drag; Martin and Salaun, ICRA 2010",
+    damps=True,
+)
+def rotor_drag(x, f, p, e):
+    """Drag in the rotor plane, -k (omega_u + omega_l) V_perp."""
+    k = p[e] * (f[F.OMEGA_U] + f[F.OMEGA_L])
+    f[F.FORCE_X] -= k * f[F.AIR_U]
+    f[F.FORCE_Y] -= k * f[F.AIR_V]
+
+
+@effect(
+    LOAD,
+    EffectParameter("gain", "rad per m/s", usual=0.0075, smallest=0.001, lower=0.0),
+    channels="p q",
+    source="longitudinal flapping with speed; Prouty 1986, ch. 3",
+    damps=True,
+)
+def flap_blowback(x, f, p, e):
+    """The lower disc tilts back from the airflow: alpha_l' + k u/tau, beta_l' - k v/tau."""
+    f[F.ALPHA_L_DOT] += p[e] * f[F.AIR_U] / f[F.FLAP_TIME]
+    f[F.BETA_L_DOT] -= p[e] * f[F.AIR_V] / f[F.FLAP_TIME]
+
+
+@effect(
+    LOAD,
+    EffectParameter("coefficient", "N m s", usual=0.004, smallest=0.0005, lower=0.0),
+    channels="r psi",
+    source="aerodynamic yaw damping, to first order",
+    damps=True,
+)
+def yaw_damping(x, f, p, e):
+    """Yaw moment -k r."""
+    f[F.MOMENT_Z] -= p[e] * x[5]
+
+
+@effect(
+    LOAD,
+    EffectParameter("coefficient", "N m s", usual=0.004, smallest=0.0008, lower=0.0),
+    channels="p q",
+    source="aerodynamic rate damping, to first order",
+    damps=True,
+)
+def rate_damping(x, f, p, e):
+    """Roll and pitch moments -k p and -k q."""
+    f[F.MOMENT_X] -= p[e] * x[3]
+    f[F.MOMENT_Y] -= p[e] * x[4]
+
+
+@effect(
+    LOAD,
+    EffectParameter("x", "m", usual=1.5e-3, smallest=2e-4),
+    EffectParameter("y", "m", usual=1.5e-3, smallest=2e-4),
+    channels="p q",
+    source="statics",
+)
+def cg_offset(x, f, p, e):
+    """Centre of gravity beside the mast: M - T x, L + T y (x forward, y right)."""
+    thrust = f[F.THRUST_U] + f[F.THRUST_L]
+    f[F.MOMENT_X] += thrust * p[e + 1]
+    f[F.MOMENT_Y] -= thrust * p[e]
+
+
+@effect(
+    LOAD,
+    EffectParameter("upper", "N m/rad", usual=0.2, smallest=0.03, lower=0.0),
+    EffectParameter("lower", "N m/rad", usual=0.2, smallest=0.03, lower=0.0),
+    channels="p q",
+    source="spring at the flap hinge, Johnson 1980, ch. 5",
+)
+def hub_stiffness(x, f, p, e):
+    """Each hub passes a moment k (tilt of its disc) beside its thrust's."""
+    f[F.MOMENT_X] += p[e] * f[F.BETA_U] + p[e + 1] * f[F.BETA_L]
+    f[F.MOMENT_Y] += p[e] * f[F.ALPHA_U] + p[e + 1] * f[F.ALPHA_L]
+
+
+@effect(
+    LOAD,
+    EffectParameter("gain", "1", usual=1.0, smallest=0.25, lower=0.0),
+    channels="r psi",
+    source="angular momentum along z; the paper's (37) leaves it out",
+)
+def spin_up_reaction(x, f, p, e):
+    """Reaction to rotor acceleration, N + g ((J_u + J_f) omega_u' - J_l omega_l')."""
+    f[F.MOMENT_Z] += p[e] * (
+        (p[P.ROTOR_INERTIA_U] + p[P.FLYBAR_INERTIA]) * f[F.OMEGA_U_DOT]
+        - p[P.ROTOR_INERTIA_L] * f[F.OMEGA_L_DOT]
+    )
+
+
+# --- sensors --------------------------------------------------------------------------------------
+# Places of the readings in the workspace.
+_GYRO, _ACCEL = F.READING + CHANNELS.index("p"), F.READING + CHANNELS.index("ax")
+_ATTITUDE, _HEIGHT = F.READING + CHANNELS.index("phi"), F.READING + CHANNELS.index("h")
+_SINK = F.READING + CHANNELS.index("vd")
+
+
+@effect(
+    SENSOR,
+    EffectParameter("x", "m", usual=0.03, smallest=0.008),
+    EffectParameter("y", "m", usual=0.03, smallest=0.008),
+    EffectParameter("z", "m", usual=0.03, smallest=0.008),
+    channels="ax ay az",
+    source="rigid-body kinematics, all in body axes; Titterton and Weston 2004",
+)
+def imu_lever_arm(x, f, p, e):
+    """Accelerometers off the centre of gravity: f + omega' x r + omega x (omega x r)."""
+    rx, ry, rz = p[e], p[e + 1], p[e + 2]
+    wx, wy, wz = x[3], x[4], x[5]
+    along = wx * rx + wy * ry + wz * rz
+    square = wx * wx + wy * wy + wz * wz
+    f[_ACCEL] += f[F.Q_DOT] * rz - f[F.R_DOT] * ry + wx * along - square * rx
+    f[_ACCEL + 1] += f[F.R_DOT] * rx - f[F.P_DOT] * rz + wy * along - square * ry
+    f[_ACCEL + 2] += f[F.P_DOT] * ry - f[F.Q_DOT] * rx + wz * along - square * rz
+
+
+@effect(
+    SENSOR,
+    EffectParameter("x", "rad", usual=0.02, smallest=0.003),
+    EffectParameter("y", "rad", usual=0.02, smallest=0.003),
+    channels="ax ay",
+    source="rotation of the sensor's axes against the body's; Rodrigues' formula",
+)
+def imu_tilt(x, f, p, e):
+    """IMU turned by the rotation vector t = (x, y, 0): f - t x f (1 - t^2/6) + t x (t x f) / 2."""
+    tx, ty = p[e], p[e + 1]
+    once = 1.0 - (tx * tx + ty * ty) / 6.0
+    for first in (_GYRO, _ACCEL):
+        a, b, c = f[first], f[first + 1], f[first + 2]
+        turn = tx * b - ty * a  # z of t x f; x and y are ty c, -tx c
+        f[first] = a - once * ty * c + 0.5 * ty * turn
+        f[first + 1] = b + once * tx * c - 0.5 * tx * turn
+        f[first + 2] = c - once * turn - 0.5 * (tx * tx + ty * ty) * c
+
+
+@effect(
+    SENSOR,
+    EffectParameter("x", "1", usual=0.02, smallest=0.005),
+    EffectParameter("y", "1", usual=0.02, smallest=0.005),
+    EffectParameter("z", "1", usual=0.02, smallest=0.005),
+    channels="ax ay az",
+    source="measured = true (1 + s)",
+)
+def accel_scale(x, f, p, e):
+    """Scale error of the accelerometers."""
+    for i in range(3):
+        f[_ACCEL + i] *= 1.0 + p[e + i]
+
+
+@effect(
+    SENSOR,
+    EffectParameter("x", "m/s2", usual=0.15, smallest=0.02),
+    EffectParameter("y", "m/s2", usual=0.15, smallest=0.02),
+    EffectParameter("z", "m/s2", usual=0.15, smallest=0.02),
+    channels="ax ay az",
+    source="measured = true + b",
+)
+def accel_bias(x, f, p, e):
+    """Bias of the accelerometers."""
+    for i in range(3):
+        f[_ACCEL + i] += p[e + i]
+
+
+@effect(
+    SENSOR,
+    EffectParameter("x", "rad/s", usual=0.03, smallest=0.002),
+    EffectParameter("y", "rad/s", usual=0.03, smallest=0.002),
+    EffectParameter("z", "rad/s", usual=0.03, smallest=0.002),
+    channels="p q r",
+    source="measured = true + b",
+)
+def gyro_bias(x, f, p, e):
+    """Bias of the gyros."""
+    for i in range(3):
+        f[_GYRO + i] += p[e + i]
+
+
+@effect(
+    SENSOR,
+    EffectParameter("x", "rad", usual=0.025, smallest=0.003),
+    EffectParameter("y", "rad", usual=0.025, smallest=0.003),
+    EffectParameter("z", "rad", usual=0.025, smallest=0.003),
+    channels="phi theta psi",
+    source="compass or mounting: measured = true + b",
+)
+def attitude_bias(x, f, p, e):
+    """Bias of the attitude readings."""
+    for i in range(3):
+        f[_ATTITUDE + i] += p[e + i]
+
+
+@effect(
+    SENSOR,
+    EffectParameter("on", "1", usual=1.0, smallest=0.3),
+    channels="h",
+    source="slant range of a sonar fixed to the body, h/(cos phi cos theta)",
+)
+def sonar_tilt(x, f, p, e):
+    """The height reading is the slant range (on = 1), not the height (on = 0)."""
+    slant = f[F.COS_PHI] * f[F.COS_THETA]
+    if slant > 0.1:
+        f[_HEIGHT] *= 1.0 + p[e] * (1.0 / slant - 1.0)
+
+
+@effect(
+    SENSOR,
+    EffectParameter("scale", "1", usual=0.035, smallest=0.007),
+    channels="h",
+    source="speed of sound off its calibration: measured = true (1 + s)",
+)
+def sonar_scale(x, f, p, e):
+    """Scale error of the height reading."""
+    f[_HEIGHT] *= 1.0 + p[e]
+
+
+@effect(
+    SENSOR,
+    EffectParameter("time", "s", usual=0.1, smallest=0.02, lower=0.0, upper=0.5),
+    channels="h",
+    source="late echo, to first order: h - d h'",
+)
+def sonar_delay(x, f, p, e):
+    """The height reading is late."""
+    f[_HEIGHT] += p[e] * f[_SINK]
+
+
+@effect(
+    SENSOR,
+    EffectParameter("amplitude", "m/s2", usual=0.5, smallest=0.1, lower=0.0),
+    channels="ax ay az",
+    source="a rotor out of balance; a line at its speed and the aliases that sampling makes of it",
+    line=True,
+)
+def vibration(x, f, p, e):
+    """The accelerometers shake at rotor speed: readings + amplitude sin(azimuth) (vibration.py)."""
+
+
+# --- what no list explains --------------------------------------------------------------------------
+
+for _group, (_unit, _) in generic_terms.AXES.items():
+    effect(
+        UNLISTED,
+        *(
+            EffectParameter(
+                term.key,
+                generic_terms.unit_of(_group, term),
+                usual=generic_terms.USUAL[_unit] / term.usual,
+                smallest=0.1 * generic_terms.USUAL[_unit] / term.usual,
+            )
+            for term in generic_terms.TERMS
+        ),
+        channels="",
+        source="low-order terms, Morelli and Klein 2016, ch. 5",
+        generic=True,
+        name=_group,
+    )(generic_terms.AXIS_FUNCTIONS[_group])
+
+
+# --- what the kernel and the vehicle files read -----------------------------------------------------
+
+
+def parameter_index(name: str) -> int:
+    """Place of ``"mass"`` or ``"ground_effect.gain"`` in the parameter vector."""
+    group, _, own = name.rpartition(".")
+    if not group:
+        return P.GUST_MEMORY if name == "gust_memory" else list(P.BASE).index(name)
+    if name in P.COMMAND_GAINS:
+        return P.COMMAND_GAIN + list(P.COMMAND_GAINS).index(name)
+    entry = GROUPS[group]
+    return entry.index + [p.name for p in entry.parameters].index(own)
+
+
+def off_vector() -> np.ndarray:
+    """Parameter vector with every effect off and the base parameters NaN."""
+    vector = np.full(n_parameters(), np.nan)
+    vector[P.GUST_MEMORY] = 0.5
+    vector[P.AIR_DOWN : P.N_FIXED] = 0.0
+    vector[_FIRST:] = _offs()[0]
+    set_switches(vector)
+    return vector
+
+
+def pack(values: Mapping[str, float]) -> np.ndarray:
+    """The kernel's parameter vector from full names and values; effects not named are off."""
+    vector = off_vector()
+    for name, value in values.items():
+        vector[parameter_index(name)] = value
+    for reference, own in P.GUST_REFERENCE.items():
+        vector[reference] = vector[own]
+    set_switches(vector)
+    return vector
+
+
+def set_switches(vector: np.ndarray) -> None:
+    """Switch on, in place, the stages that have an effect away from its off-value.
+
+    Of one parameter vector, or of many at once, shape (..., n_parameters()).
+    """
+    off, throws = _offs()
+    vector[..., P.N_FIXED : _FIRST] = (vector[..., _FIRST:] != off) @ throws > 0.0
+
+
+def completed(effect_name: str, table: Mapping[str, Any], make: Callable) -> dict[str, Any]:
+    """An effect's parameters in catalogue order, absent ones at their off-value.
+
+    Of a generic group only what is not zero.
+    """
+    entry = GROUPS[effect_name]
+    if entry.generic:
+        names = [p.name for p in entry.parameters if p.name in table and table[p.name].value != 0.0]
+        return {name: table[name] for name in names}
+    return {
+        p.name: table.get(p.name) or make(p.off, 0.0, p.unit, "off-value") for p in entry.parameters
+    }
+
+
+def stage_function(stage: int) -> Callable:
+    """One function that runs all effects of a stage in the catalogue's order, for compiled code.
+
+    Written out as source, one call a line: a chain of closures takes numba three times as long.
+    """
+    entries = [e for e in GROUPS.values() if e.stage == stage]
+    calls = [f"    {e.name}(x, f, p, {e.index})" for e in entries]
+    names = {"__name__": __name__, **{e.name: e.function for e in entries}}
+    exec("\n".join(["def run(x, f, p):", *calls, "    pass"]), names)
+    names["run"].__qualname__ = f"stage_{stage}"
+    return njit(**BORROWING)(names["run"])

@@ -1,0 +1,165 @@
+"""Generic terms: a force or moment on one body axis as a sum of low-order terms of state and command.
+
+What no effect of the catalogue explains can still be written down: coefficients of these terms, six
+groups of them (`unlisted_X` .. `unlisted_N`), one per axis of the wrench. The groups are effects like
+any other to the kernel and to the vehicle files; they have no name of their own to be blamed by, and
+the catalogue's search never proposes them. unlisted.py does, for what the catalogue leaves.
+
+Speeds are those of the body, not of the air; rotor speeds count from the bare model's hover, whose
+torques balance and whose thrust carries the weight (15)-(20). Swash rates are left out: without a
+servo lag the plate jumps and has none.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from coax_env.kernel.compilation import compiled
+from coax_env.model import parameters as P
+from coax_env.model import workspace as F
+
+HARMONICS = 4
+"""Harmonics of the heading, sin(k psi) and cos(k psi)."""
+
+AXES = {
+    "unlisted_X": ("N", F.FORCE_X),
+    "unlisted_Y": ("N", F.FORCE_Y),
+    "unlisted_Z": ("N", F.FORCE_Z),
+    "unlisted_L": ("N m", F.MOMENT_X),
+    "unlisted_M": ("N m", F.MOMENT_Y),
+    "unlisted_N": ("N m", F.MOMENT_Z),
+}
+"""Group -> unit and place in the kernel's workspace, in the order of the gust states."""
+
+USUAL = {"N": 0.4, "N m": 0.02}
+"""Usual size of an unlisted force and moment, the width of the prior: 5 % of the weight of the 0.8 kg
+machine, and that times a quarter of the lower hub's arm, ours."""
+SMALLEST = {"N": 0.04, "N m": 1.5e-3}
+"""RMS on a flight under which a force or moment does not matter in prediction."""
+
+_SPEEDS = (("u", "m/s", 1.0), ("v", "m/s", 1.0), ("w", "m/s", 0.5),
+           ("p", "rad/s", 0.5), ("q", "rad/s", 0.5), ("r", "rad/s", 0.5))  # fmt: skip
+_PAIRS = tuple(combinations(range(6), 2))
+
+
+@dataclass(frozen=True)
+class Term:
+    """One term. ``key`` names it in a vehicle file, ``form`` in a formula; ``usual`` is its usual size.
+
+    ``follows``: the states or commands it depends on. ``kin``: terms that share it are one physical
+    term in two columns (sine and cosine of one angle) and may be taken together.
+    """
+
+    key: str
+    form: str
+    unit: str
+    usual: float
+    follows: tuple[str, ...]
+    kin: str = ""
+
+
+def _heading(k: int) -> tuple[Term, Term]:
+    key, angle = ("psi", "psi") if k == 1 else (f"{k}psi", f"{k} psi")
+    return (
+        Term(f"sin_{key}", f"sin({angle})", "1", 1.0, ("psi",), f"{key}"),
+        Term(f"cos_{key}", f"cos({angle})", "1", 1.0, ("psi",), f"{key}"),
+    )
+
+
+TERMS: tuple[Term, ...] = (
+    *(Term(n, n, unit, size, (n,)) for n, unit, size in _SPEEDS),
+    *(Term(f"abs_{n}_{n}", f"|{n}| {n}", f"({unit})2", size**2, (n,)) for n, unit, size in _SPEEDS),
+    *(
+        Term(
+            f"{_SPEEDS[i][0]}_{_SPEEDS[j][0]}",
+            f"{_SPEEDS[i][0]} {_SPEEDS[j][0]}",
+            f"({_SPEEDS[i][1]})({_SPEEDS[j][1]})",
+            _SPEEDS[i][2] * _SPEEDS[j][2],
+            (_SPEEDS[i][0], _SPEEDS[j][0]),
+        )
+        for i, j in _PAIRS
+    ),
+    Term("sin_phi", "sin(phi)", "1", 0.1, ("phi",)),
+    Term("sin_theta", "sin(theta)", "1", 0.1, ("theta",)),
+    Term("cos_phi", "(1 - cos(phi))", "1", 0.01, ("phi",)),
+    Term("cos_theta", "(1 - cos(theta))", "1", 0.01, ("theta",)),
+    *(term for k in range(1, HARMONICS + 1) for term in _heading(k)),
+    Term("omega_u", "(omega_u - hover)", "rad/s", 10.0, ("omega_u",)),
+    Term("omega_l", "(omega_l - hover)", "rad/s", 10.0, ("omega_l",)),
+    Term("delta_lon", "delta_lon", "rad", 0.05, ("delta_lon",)),
+    Term("delta_lat", "delta_lat", "rad", 0.05, ("delta_lat",)),
+    Term("omega_u_rate", "omega_u'", "rad/s2", 50.0, ("omega_u",)),
+    Term("omega_l_rate", "omega_l'", "rad/s2", 50.0, ("omega_l",)),
+)
+"""Every term, in the order of the coefficients in the parameter vector."""
+
+_N_TERMS = len(TERMS)
+_SQUARES, _PRODUCTS = 6, 12
+_TILT = _PRODUCTS + len(_PAIRS)
+_HEADING = _TILT + 4
+_COMMAND = _HEADING + 2 * HARMONICS
+
+
+@compiled()
+def hover_speeds(p: np.ndarray) -> tuple[float, float]:
+    """Rotor speeds [rad/s] at which the bare model hovers, its download on the fuselage left out."""
+    weight = p[P.MASS] * p[P.GRAVITY]
+    k_T = p[P.AIR_DENSITY] * math.pi * p[P.ROTOR_RADIUS] ** 4
+    ratio2 = p[P.C_QU] / p[P.C_QL]  # (omega_l / omega_u)^2 where torques balance
+    upper = math.sqrt(weight / (k_T * (p[P.C_TU] + p[P.C_TL] * ratio2)))
+    return upper, upper * math.sqrt(ratio2)
+
+
+@compiled()
+def term_value(i: int, x: np.ndarray, f: np.ndarray, p: np.ndarray) -> float:
+    """Value of the term TERMS[i] at a full state and the kernel's workspace."""
+    if i < _SQUARES:
+        return x[i]
+    if i < _PRODUCTS:
+        return abs(x[i - _SQUARES]) * x[i - _SQUARES]
+    if i < _TILT:
+        a, b = _PAIRS[i - _PRODUCTS]
+        return x[a] * x[b]
+    if i < _HEADING:
+        which = i - _TILT
+        angle = x[10 + which % 2]
+        return math.sin(angle) if which < 2 else 1.0 - math.cos(angle)
+    if i < _COMMAND:
+        which = i - _HEADING
+        angle = (which // 2 + 1) * x[12]
+        return math.sin(angle) if which % 2 == 0 else math.cos(angle)
+    which = i - _COMMAND
+    if which < 2:
+        upper, lower = hover_speeds(p)
+        return f[F.OMEGA_U] - upper if which == 0 else f[F.OMEGA_L] - lower
+    if which < 4:
+        return x[16 + which]
+    return f[F.OMEGA_U_DOT] if which == 4 else f[F.OMEGA_L_DOT]
+
+
+def _axis(target: int, summary: str) -> Callable:
+    def add(x: np.ndarray, f: np.ndarray, p: np.ndarray, e: int) -> None:
+        total = 0.0
+        for i in range(_N_TERMS):
+            if p[e + i] != 0.0:
+                total += p[e + i] * term_value(i, x, f, p)
+        f[target] += total
+
+    add.__doc__ = summary
+    return add
+
+
+AXIS_FUNCTIONS = {
+    group: _axis(place, f"Whatever {group[-1]} [{unit}] no effect of the catalogue explains.")
+    for group, (unit, place) in AXES.items()
+}
+"""Group -> the function that adds its axis' terms, for the kernel."""
+
+
+def unit_of(group: str, term: Term) -> str:
+    """Unit of a term's coefficient on an axis."""
+    axis = AXES[group][0]
+    return axis if term.unit == "1" else f"{axis} per {term.unit}"

@@ -1,0 +1,34 @@
+"""The kernel's workspace: every quantity between state and derivative has one named place.
+
+The kernel (dynamics.py) fills it, effects (effects.py) read and change it. Body axes unless said.
+"""
+
+from coax_env.model.layout import N_CHANNELS
+
+(
+    TIME,  # since the start of the run [s]
+    # properties, before any effect those of the vehicle file
+    MASS, INERTIA_XX, INERTIA_YY, INERTIA_ZZ,
+    SWASH_TO_FLAP, FLAP_TIME, FLYBAR_TIME,
+    THRUST_FACTOR_U, THRUST_FACTOR_L,  # T / omega^2 [N s2]
+    TORQUE_FACTOR_U, TORQUE_FACTOR_L,  # Q / omega^2 [N m s2]
+    # actuators
+    MOTOR_LAG_U, MOTOR_LAG_L, SERVO_LAG,  # [s]
+    SPEED_SCALE,  # rotor speed reached per speed commanded [1]
+    OMEGA_U, OMEGA_L, OMEGA_U_DOT, OMEGA_L_DOT,
+    DELTA_LON, DELTA_LAT,  # swash plate tilt as the rotor feels it
+    # attitude and air
+    SIN_PHI, COS_PHI, SIN_THETA, COS_THETA, SIN_PSI, COS_PSI,
+    HEIGHT,
+    AIR_U, AIR_V, AIR_W,  # velocity through the air
+    # loads
+    ALPHA_U, BETA_U, ALPHA_L, BETA_L,  # tilt of the two discs
+    THRUST_U, THRUST_L, TORQUE_U, TORQUE_L,
+    FORCE_X, FORCE_Y, FORCE_Z,  # all but gravity
+    MOMENT_X, MOMENT_Y, MOMENT_Z,
+    # rates of change
+    ALPHA_L_DOT, BETA_L_DOT,
+    P_DOT, Q_DOT, R_DOT,
+    READING,  # first of the N_CHANNELS sensor readings
+) = range(52)  # fmt: skip
+N_FLOW = READING + N_CHANNELS

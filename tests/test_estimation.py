@@ -1,0 +1,678 @@
+"""The engine on a pendulum: it knows no helicopter, and its answers are known without it.
+
+Truth is simulated here in numpy; likelihoods are compared with the stacked Gaussian of the whole
+record, signatures with differences of the innovations, fits with what was planted.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numba import types
+from scipy.optimize import lsq_linear
+from scipy.signal import lfilter
+from scipy.stats import binom, multivariate_normal
+
+from coax_env.estimation import kalman
+from coax_env.estimation.fit import (
+    REFRESH,
+    Engine,
+    Estimate,
+    Linearised,
+    RunPass,
+    bounded_solve,
+    newton_step,
+)
+from coax_env.estimation.state_space import FreeParameter, Noise, Record
+from coax_env.estimation.whiteness import whiteness
+from coax_env.kernel.compilation import pointer
+
+# --- a pendulum with a motor: state angle, rate; input a torque; read by an encoder and two gyros --
+
+ANGLE, RATE = 0, 1
+STIFFNESS, DAMPING, SINE, BIAS = 0, 1, 2, 3  # 1/s2, 1/s, 1: sin(angle) instead of angle, rad/s
+CHANNELS = ("angle", "gyro", "second gyro")
+DT = 0.02
+TRUTH = {"stiffness": 9.0, "damping": 0.6, "sine": 0.0, "bias": 0.0}
+NOISE = Noise(
+    process={"torque": 0.3}, reading={"angle": 0.03, "gyro": 0.1, "second gyro": 0.2},
+    floor={"torque": 1e-3},
+)  # fmt: skip
+
+_A = types.float64[::1]
+
+
+@pointer(types.void(_A, _A, types.float64, _A, _A, _A))
+def _step(x, u, dt, p, work, out):
+    """One symplectic Euler step: linear in the state where `sine` is 0."""
+    pull = (1.0 - p[SINE]) * x[ANGLE] + p[SINE] * math.sin(x[ANGLE])
+    rate = x[RATE] + dt * (u[0] - p[STIFFNESS] * pull - p[DAMPING] * x[RATE])
+    out[RATE] = rate
+    out[ANGLE] = x[ANGLE] + dt * rate
+
+
+@pointer(types.void(_A, _A, _A, _A, _A))
+def _measure(x, u, p, work, out):
+    out[0] = x[ANGLE]
+    out[1] = x[RATE] + p[BIAS]
+    out[2] = x[RATE]
+
+
+@pointer(types.void(_A, _A, types.float64, _A, _A, _A))
+def _drift_and_readings(x, u, dt, p, work, out):
+    pull = (1.0 - p[SINE]) * x[ANGLE] + p[SINE] * math.sin(x[ANGLE])
+    out[RATE] = dt * (u[0] - p[STIFFNESS] * pull - p[DAMPING] * x[RATE])
+    out[ANGLE] = dt * (x[RATE] + out[RATE])
+    out[2] = x[ANGLE]
+    out[3] = x[RATE] + p[BIAS]
+    out[4] = x[RATE]
+
+
+@pointer(types.void(_A, _A, types.float64, _A, _A, _A))
+def _quadruple(x, u, dt, p, work, out):
+    for i in range(x.size):
+        out[i] = 4.0 * x[i]
+
+
+class Pendulum:
+    """The model, through the engine's protocol."""
+
+    channels = CHANNELS
+    wraps = np.array([True, False, False])
+    state_scale = np.array([1e-4, 1e-4])
+    step = _step
+    measure = _measure
+    drift_and_readings = _drift_and_readings
+    exact = np.array([True, True])
+    work_size = 1
+    start_at = np.array([0.2, 0.0])
+    start_std = np.array([0.3, 0.5])
+
+    def vector(self, values: Mapping[str, float]) -> np.ndarray:
+        return np.array([{**TRUTH, **values}[name] for name in TRUTH])
+
+    def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
+        return record.command
+
+    def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
+        return self.start_at.copy(), np.diag(self.start_std**2)
+
+    def start_noise(self, noise: Noise) -> np.ndarray:
+        return np.zeros(2)
+
+    def process_noise(self, noise: Noise) -> np.ndarray:
+        return np.array([0.0, noise.process["torque"] ** 2])
+
+
+def swing(
+    seed: int,
+    n: int = 500,
+    values: Mapping[str, float] = TRUTH,
+    noise: Noise = NOISE,
+    torque: float = 3.0,
+    start: np.ndarray | None = None,
+) -> Record:
+    """A record of the true pendulum: its own equations in numpy, noise as the engine assumes it."""
+    rng = np.random.default_rng(seed)
+    p = {**TRUTH, **values}
+    t = DT * np.arange(n)
+    push = torque * np.sign(np.sin(2.0 * t) + 0.3 * np.sin(5.1 * t))
+    angle, rate = Pendulum.start_at + Pendulum.start_std * rng.standard_normal(2)
+    if start is not None:
+        angle, rate = start
+    z = np.empty((n, 3))
+    for k in range(n):
+        z[k] = angle, rate + p["bias"], rate
+        pull = math.sin(angle) if p["sine"] else angle
+        rate += DT * (push[k] - p["stiffness"] * pull - p["damping"] * rate)
+        angle += DT * rate
+        rate += noise.process["torque"] * math.sqrt(DT) * rng.standard_normal()
+    z += rng.standard_normal(z.shape) * [noise.reading[c] for c in CHANNELS]
+    z[:, 0] = (z[:, 0] + np.pi) % (2.0 * np.pi) - np.pi
+    return Record(f"swing {seed}", t, push[:, None], z)
+
+
+def prior(name: str, std: float, value: float | None = None, **more: float) -> FreeParameter:
+    return FreeParameter(name, TRUTH[name] if value is None else value, std, **more)
+
+
+# --- likelihood ----------------------------------------------------------------------------------
+
+
+def exact_log_likelihood(record: Record, noise: Noise) -> float:
+    """All readings of a record as one Gaussian vector."""
+    n = record.t.size
+    k, d = TRUTH["stiffness"], TRUTH["damping"]
+    dt = np.append(np.diff(record.t), DT)
+    F = [np.array([[1.0 - h * h * k, h - h * h * d], [-h * k, 1.0 - h * d]]) for h in dt]
+    H = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    mean = [Pendulum.start_at]
+    for row in range(n - 1):
+        pushed = np.array([dt[row] ** 2, dt[row]]) * record.command[row, 0]
+        mean.append(F[row] @ mean[-1] + pushed)
+    blocks = np.zeros((n, 2, n, 2))
+    P = np.diag(Pendulum.start_std**2)
+    for row in range(n):
+        cross = P
+        for later in range(row, n):
+            blocks[later, :, row, :] = cross
+            blocks[row, :, later, :] = cross.T
+            cross = F[later] @ cross
+        Q = np.diag([0.0, noise.process["torque"] ** 2 * dt[row]])
+        P = F[row] @ P @ F[row].T + Q
+    stacked = np.kron(np.eye(n), H)
+    R = np.diag(np.tile([noise.reading[c] ** 2 for c in CHANNELS], n))
+    covariance = stacked @ blocks.reshape(2 * n, 2 * n) @ stacked.T + R
+    z, expected = record.z.ravel(), stacked @ np.concatenate(mean)
+    there = np.isfinite(z)
+    return float(
+        multivariate_normal.logpdf(z[there], expected[there], covariance[np.ix_(there, there)])
+    )
+
+
+def with_holes(record: Record, share: float, seed: int) -> Record:
+    lost = np.random.default_rng(seed).random(record.z.shape) < share
+    return replace(record, z=np.where(lost, np.nan, record.z))
+
+
+@pytest.mark.parametrize("holes", [0.0, 0.4])
+def test_likelihood_is_that_of_the_stacked_gaussian(holes):
+    record = with_holes(swing(1, n=70, torque=1.0), holes, seed=7)
+    engine = Engine(Pendulum(), [record])
+    assert engine.log_likelihood(TRUTH, NOISE) == pytest.approx(
+        exact_log_likelihood(record, NOISE), abs=1e-4
+    )
+    wrong = replace(NOISE, process={"torque": 2.0})
+    assert engine.log_likelihood(TRUTH, wrong) == pytest.approx(
+        exact_log_likelihood(record, wrong), abs=1e-4
+    )
+
+
+def test_likelihood_of_uneven_rows():
+    """A clock that jitters, between new Jacobians too: each row's own step, to first order."""
+    record = swing(1, n=70, torque=1.0)
+    jitter = np.random.default_rng(2).uniform(0.7, 1.3, 70)
+    record = replace(record, t=DT * np.cumsum(jitter))
+    engine = Engine(Pendulum(), [record])
+    loud = replace(NOISE, process={"torque": 2.0})
+    assert engine.log_likelihood(TRUTH, loud) == pytest.approx(
+        exact_log_likelihood(record, loud), abs=0.02
+    )
+
+
+def test_records_add_up():
+    records = [swing(seed, n=200) for seed in range(3)]
+    whole = Engine(Pendulum(), records)
+    parts = [Engine(Pendulum(), [r]).log_likelihood(TRUTH, NOISE) for r in records]
+    assert whole.log_likelihood(TRUTH, NOISE) == pytest.approx(sum(parts))
+    assert whole.log_likelihood(TRUTH, NOISE, which=[2]) == pytest.approx(parts[2])
+
+
+def test_the_clock_may_start_anywhere():
+    """A log that begins in the middle of a flight: same likelihood, slopes and stretches."""
+    record = with_holes(swing(4), 0.2, 6)
+    found = []
+    for start in (0.0, 137.0):
+        engine = Engine(Pendulum(), [replace(record, t=record.t + start)])
+        log_likelihood, by_noise, by_start = engine.noise_score(TRUTH, NOISE)
+        _, lin = engine.linearise(TRUTH, NOISE, [prior("damping", 0.3)])
+        found.append((np.array(log_likelihood), by_noise, by_start, lin.slope, lin.stretches))
+    for first, later in zip(*found, strict=True):
+        np.testing.assert_allclose(first, later, rtol=1e-6, atol=1e-6)
+
+
+def test_innovations_of_the_truth_are_white_with_unit_variance():
+    passes = Engine(Pendulum(), [swing(seed, n=2000) for seed in range(4)]).filter(TRUTH, NOISE)
+    e = np.stack([run.innovations for run in passes])
+    assert sum(run.deweighted for run in passes) == 0
+    assert e.mean((0, 1)) == pytest.approx(0.0, abs=4.0 / math.sqrt(e[:, :, 0].size))
+    together = np.corrcoef(e.reshape(-1, 3).T)
+    assert e.std((0, 1)) == pytest.approx(1.0, abs=0.04)
+    assert together == pytest.approx(np.eye(3), abs=0.05)
+    for lag in (1, 2, 5, 20):
+        assert (e[:, lag:] * e[:, :-lag]).mean((0, 1)) == pytest.approx(0.0, abs=0.05)
+    assert all(w.white for w in whiteness(passes, CHANNELS).values())
+
+
+def test_an_empty_channel_is_no_channel():
+    """NaN everywhere in a channel: what is found does not depend on that channel's noise level."""
+    record = swing(3)
+    z = record.z.copy()
+    z[:, 2] = np.nan
+    engine = Engine(Pendulum(), [replace(record, z=z)])
+    other = replace(NOISE, reading={**NOISE.reading, "second gyro": 1e-4})
+    a, b = (engine.filter(TRUTH, noise, keep=True)[0] for noise in (NOISE, other))
+    assert a.log_likelihood == b.log_likelihood
+    np.testing.assert_array_equal(a.states, b.states)
+    assert np.isnan(a.innovations[:, 2]).all() and not np.isnan(a.innovations[:, :2]).any()
+    np.testing.assert_array_equal(a.gains, b.gains)
+    assert a.per_sigma.size == np.isfinite(z).sum()
+
+
+def test_a_useless_channel_changes_nothing():
+    record = swing(3)
+    z = record.z.copy()
+    z[:, 2] = np.nan
+    vague = replace(NOISE, reading={**NOISE.reading, "second gyro": 1e5})
+    with_it = Engine(Pendulum(), [record]).filter(TRUTH, vague)[0].states
+    without = Engine(Pendulum(), [replace(record, z=z)]).filter(TRUTH, NOISE)[0].states
+    np.testing.assert_allclose(with_it, without, atol=1e-7)
+
+
+def test_a_wild_reading_hardly_counts_but_a_lasting_one_is_believed():
+    record = swing(4)
+    z = record.z.copy()
+    z[100, 0] += 2.0
+    run = Engine(Pendulum(), [replace(record, z=z)]).filter(TRUTH, NOISE)[0]
+    assert run.deweighted == 1
+    clean = Engine(Pendulum(), [record]).filter(TRUTH, NOISE)[0]
+    np.testing.assert_allclose(run.states[200:], clean.states[200:], atol=1e-4)
+    assert run.log_likelihood < clean.log_likelihood - 20.0, "a wild reading must not pay"
+    z = record.z.copy()
+    z[100:, 0] += 1.0  # the encoder slipped
+    slipped = Engine(Pendulum(), [replace(record, z=z)]).filter(TRUTH, NOISE)[0]
+    assert 0 < slipped.deweighted <= 100
+    np.testing.assert_allclose(slipped.states[300:, 0], clean.states[300:, 0] + 1.0, atol=0.1)
+
+
+def test_the_gate_is_no_step():
+    """Likelihood and its slope are continuous in a reading that crosses the gate."""
+    record = swing(4)
+
+    def log_likelihood(error: float) -> float:
+        z = record.z.copy()
+        z[100, 0] += error
+        return Engine(Pendulum(), [replace(record, z=z)]).log_likelihood(TRUTH, NOISE)
+
+    errors = np.linspace(0.0, 0.4, 401)
+    value = np.array([log_likelihood(e) for e in errors])
+    slope = np.diff(value)
+    assert np.abs(np.diff(slope)).max() < 0.1 * np.abs(slope).max()
+
+
+def test_noise_score_is_the_gradient_of_the_likelihood():
+    """In the process noise, exact: the model is nearly linear along the filter's path."""
+    engine = Engine(Pendulum(), [with_holes(swing(7), 0.2, 3)])
+    model = Pendulum()
+
+    def at(factor: float) -> Noise:
+        return replace(NOISE, process={**NOISE.process, "torque": factor * NOISE.process["torque"]})
+
+    for level in (0.5, 1.0, 2.0):
+        _, by_noise, _ = engine.noise_score(TRUTH, at(level))
+        more, less = at(level * 1.01), at(level / 1.01)
+        found = float(np.sum(by_noise @ (model.process_noise(more) - model.process_noise(less))))
+        exact = engine.log_likelihood(TRUTH, more) - engine.log_likelihood(TRUTH, less)
+        assert found == pytest.approx(exact, rel=0.02, abs=0.02)
+
+
+@pytest.mark.parametrize("state", [ANGLE, RATE])
+def test_start_score_is_the_gradient_in_the_first_variances(state):
+    """Exact too, where the pendulum is linear; with uncertain starts too small, right and too large."""
+    record = with_holes(swing(9, n=120), 0.2, 5)
+
+    def engine_at(std: float) -> Engine:
+        model = Pendulum()
+        model.start_std = Pendulum.start_std.copy()
+        model.start_std[state] = std
+        return Engine(model, [record])
+
+    for std in Pendulum.start_std[state] * np.array([0.3, 1.0, 3.0]):
+        *_, by_start = engine_at(std).noise_score(TRUTH, NOISE)
+        more, less = 1.02 * std, std / 1.02
+        found = by_start[0, state] * (more**2 - less**2)
+        exact = engine_at(more).log_likelihood(TRUTH, NOISE)
+        exact -= engine_at(less).log_likelihood(TRUTH, NOISE)
+        assert found == pytest.approx(exact, rel=0.02, abs=2e-4)
+
+
+def test_angles_wrap():
+    """A pendulum that goes over the top many times is followed as if its encoder never jumped."""
+    values = {**TRUTH, "sine": 1.0, "damping": 0.05}
+    model = Pendulum()
+    model.start_at = np.array([0.2, 12.0])
+    record = swing(5, values=values, start=model.start_at)
+    run = Engine(model, [record]).filter(values, NOISE)[0]
+    assert np.abs(run.states[:, ANGLE]).max() > 4.0 * np.pi
+    assert np.abs(np.diff(record.z[:, 0])).max() > 6.0
+    assert run.deweighted <= 2
+    assert np.nanstd(run.innovations[20:, 0]) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("angle", [-9.0, -math.pi, -0.1, 0.0, 3.0, math.pi, 100.0])
+def test_wrap_angle(angle):
+    wrapped = kalman.wrap_angle(angle)
+    assert -math.pi <= wrapped < math.pi
+    assert math.cos(wrapped - angle) == pytest.approx(1.0)
+
+
+def test_uneven_rows_are_followed():
+    """Rows left out of an even record cost accuracy, not balance."""
+    record = swing(6, n=1500)
+    keep = np.random.default_rng(0).random(1500) < 0.6
+    keep[0] = True
+    lost = replace(record, z=np.where(keep[:, None], record.z, np.nan))
+    rows = np.flatnonzero(keep)
+    thin = replace(record, t=record.t[rows], command=record.command[rows], z=record.z[rows])
+    full = Engine(Pendulum(), [lost]).filter(TRUTH, NOISE)[0]
+    run = Engine(Pendulum(), [thin]).filter(TRUTH, NOISE)[0]
+    assert run.deweighted <= full.deweighted + 3
+    # the command inside a longer row is not known, so only the state is compared, loosely
+    error = run.states - full.states[rows]
+    assert np.sqrt(np.mean(error[50:] ** 2, 0)) == pytest.approx(0.0, abs=0.25)
+
+
+@pytest.mark.parametrize("rate", [0.1, 3.0])
+def test_jacobian_of_a_step_is_the_exponential_of_that_of_the_drift(rate):
+    """To third order; rows that the drift takes exactly are I + A; a stiff row has the step's own."""
+    nx = 3
+    exact = np.array([False, True, False])
+    A = np.zeros((nx, kalman.BLOCK))
+    A[:, :nx] = [[-rate, 0.4, 0.0], [0.0, 0.1, 0.2], [0.3, 0.0, -0.2]]
+    AA, F = np.zeros_like(A), np.zeros_like(A)
+    places, counts = np.zeros((nx, nx), int), np.zeros(nx, int)
+    x = np.array([0.3, -0.2, 0.5])
+    kalman._transition(
+        _quadruple, exact, x, np.zeros(1), 0.1, np.zeros(1), np.zeros(1), np.full(nx, 1e-3), 4.0 * x,
+        np.zeros(nx), A, AA, places, counts, F,
+    )  # fmt: skip
+    a = A[:, :nx]
+    expected = np.eye(nx) + a + a @ a / 2.0 + a @ a @ a / 6.0
+    expected[exact] = (np.eye(nx) + a)[exact]
+    if rate > kalman.MOST_DECAY:
+        expected = 4.0 * np.eye(nx)
+    np.testing.assert_allclose(F[:, :nx], expected, rtol=1e-9, atol=1e-12)
+    for i in range(nx):
+        assert set(places[i, : counts[i]]) == set(np.flatnonzero(F[i]))
+
+
+# --- signatures ----------------------------------------------------------------------------------
+
+
+def test_signatures_are_derivatives_of_the_mean_pass_with_the_gains_frozen():
+    record = with_holes(swing(8, values={**TRUTH, "sine": 1.0}), 0.2, seed=1)
+    values = {**TRUTH, "sine": 1.0}
+    model = Pendulum()
+    engine = Engine(model, [record])
+    free = [prior("stiffness", 0.5), prior("damping", 0.2), prior("bias", 0.05)]
+    passes, lin = engine.linearise(values, NOISE, free)
+    run = passes[0]
+
+    def mean(x0: np.ndarray, named: Mapping[str, float]) -> np.ndarray:
+        """Whitened innovations with the kept gains, written out with numpy."""
+        p, out = model.vector(named), np.zeros((record.t.size, 3))
+        x, nxt, h, reading = x0.copy(), np.zeros(2), np.zeros(3), 0
+        for k in range(record.t.size):
+            h[:] = x[ANGLE], x[RATE] + p[BIAS], x[RATE]
+            nu = record.z[k] - h
+            nu[0] = (nu[0] + np.pi) % (2.0 * np.pi) - np.pi
+            nu = np.where(np.isfinite(nu), nu, 0.0)
+            H = run.H[k // REFRESH]
+            moved = np.zeros(2)
+            for i in np.flatnonzero(np.isfinite(record.z[k])):
+                residual = nu[i] - H[i] @ moved
+                out[k, i] = run.per_sigma[reading] * residual
+                moved = moved + run.gains[reading] * residual
+                reading += 1
+            x = x + moved
+            pull = math.sin(x[ANGLE])
+            nxt[RATE] = x[RATE] + DT * (
+                record.command[k, 0] - p[STIFFNESS] * pull - p[DAMPING] * x[RATE]
+            )
+            nxt[ANGLE] = x[ANGLE] + DT * nxt[RATE]
+            x = nxt.copy()
+        return out
+
+    x0 = model.start_at
+    base = mean(x0, values)
+    there = np.isfinite(run.innovations)
+    np.testing.assert_allclose(base[there], run.innovations[there], atol=2e-5)
+    J = []
+    for f in free:
+        h = 1e-4
+        ahead = mean(x0, {**values, f.name: values[f.name] + h})
+        behind = mean(x0, {**values, f.name: values[f.name] - h})
+        J.append((ahead - behind) / (2.0 * h))
+    J = np.array(J)
+    J[:, ~there] = 0.0
+    gram = np.einsum("anm,bnm->ab", J, J)
+    size = np.sqrt(np.diag(gram))
+    np.testing.assert_allclose(
+        lin.information[0] / np.outer(size, size), gram / np.outer(size, size), atol=0.01
+    )
+    np.testing.assert_allclose(
+        lin.slope[0], np.einsum("anm,nm->a", J, np.where(there, base, 0.0)), rtol=0.05, atol=1.0
+    )
+    np.testing.assert_allclose(lin.by_channel[0].sum(1), np.diag(lin.information[0]), rtol=1e-9)
+    np.testing.assert_allclose(lin.stretches.sum(0), lin.slope[0], rtol=1e-9, atol=1e-9)
+
+
+def test_slope_is_the_gradient_of_the_likelihood():
+    """At the truth's gains the frozen slope is close to the whole derivative."""
+    engine = Engine(Pendulum(), [swing(seed, n=800) for seed in (1, 2)])
+    free = [prior("damping", 0.2), prior("bias", 0.05)]
+    values = {**TRUTH, "damping": 0.9, "bias": 0.05}
+    _, lin = engine.linearise(values, NOISE, free)
+    for i, f in enumerate(free):
+        h = 1e-4
+        change = engine.log_likelihood({**values, f.name: values[f.name] + h}, NOISE)
+        change -= engine.log_likelihood({**values, f.name: values[f.name] - h}, NOISE)
+        assert -lin.slope.sum(0)[i] == pytest.approx(change / (2.0 * h), rel=0.05)
+
+
+def test_a_parameter_without_effect_has_no_signature():
+    engine = Engine(Pendulum(), [swing(1)])
+    z = engine.records[0].z.copy()
+    z[:, 1] = np.nan
+    engine = Engine(Pendulum(), [replace(engine.records[0], z=z)])
+    _, lin = engine.linearise(TRUTH, NOISE, [prior("bias", 0.05)])
+    assert lin.information[0] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("parameter", [prior("bias", 0.05), prior("sine", 0.5, probe=0.5)])
+def test_a_run_without_readings_has_no_signature(parameter):
+    record = swing(1)
+    silent = replace(record, z=np.full_like(record.z, np.nan))
+    both, alone = Engine(Pendulum(), [record, silent]), Engine(Pendulum(), [record])
+    _, lin = both.linearise(TRUTH, NOISE, [parameter])
+    _, heard = alone.linearise(TRUTH, NOISE, [parameter])
+    assert heard.information[0, 0, 0] > 0.0
+    assert lin.information[0] == pytest.approx(heard.information[0])
+    assert not lin.information[1].any()
+
+
+# --- fits ----------------------------------------------------------------------------------------
+
+FREE = [prior("stiffness", 3.0, 10.5, lower=1.0), prior("damping", 0.5, 0.3, lower=0.0),
+        prior("bias", 0.3, 0.0)]  # fmt: skip
+PLANTED = {"stiffness": 9.0, "damping": 0.6, "bias": 0.08, "sine": 1.0}
+
+
+@pytest.fixture(scope="module")
+def estimates() -> list[Estimate]:
+    found = []
+    for seed in range(30):
+        engine = Engine(Pendulum(), [swing(100 + seed, n=600, values=PLANTED)])
+        start = {"stiffness": 10.5, "damping": 0.3, "bias": 0.0, "sine": 1.0}
+        found.append(engine.fit(FREE, start, NOISE, iterations=8))
+    return found
+
+
+def test_planted_values_are_found(estimates):
+    for found in estimates[:6]:
+        assert found.converged
+        for name in found.names:
+            assert abs(found.values[name] - PLANTED[name]) < 3.5 * found.std[name]
+            assert found.std[name] < 0.3 * next(f.std for f in FREE if f.name == name)
+
+
+def test_intervals_cover(estimates):
+    """95 % intervals of three parameters on thirty records: about 95 % of them hold the truth."""
+    inside = sum(
+        abs(found.values[name] - PLANTED[name]) < 1.96 * found.std[name]
+        for found in estimates
+        for name in found.names
+    )
+    low, high = binom.ppf([0.001, 0.9999], 90, 0.95)
+    assert low <= inside <= high
+    for name in estimates[0].names:  # and the std is the scatter
+        z = [(found.values[name] - PLANTED[name]) / found.std[name] for found in estimates]
+        assert 0.65 < np.std(z) < 1.45
+
+
+def test_the_fit_stands_at_the_top_of_the_likelihood(estimates):
+    found = estimates[0]
+    engine = Engine(Pendulum(), [swing(100, n=600, values=PLANTED)])
+
+    def cost(values: Mapping[str, float]) -> float:
+        gap = sum(((values[f.name] - f.value) / f.std) ** 2 for f in FREE)
+        return 0.5 * gap - engine.log_likelihood({"sine": 1.0, **values}, NOISE)
+
+    best = cost(found.values)
+    assert found.objective == pytest.approx(best, rel=1e-9)
+    for name, std in found.std.items():
+        for side in (-1.0, 1.0):
+            moved = {**found.values, name: found.values[name] + side * 2.0 * std}
+            assert cost(moved) > best + 0.5
+
+
+def test_a_strong_prior_holds_and_a_bound_stops():
+    engine = Engine(Pendulum(), [swing(1, n=600)])
+    sure = [prior("damping", 1e-4, 0.8)]
+    held = engine.fit(sure, {**TRUTH, "damping": 0.8}, NOISE)
+    assert held.values["damping"] == pytest.approx(0.8, abs=1e-3)
+    fenced = [prior("damping", 0.5, 0.9, lower=0.8)]
+    stopped = engine.fit(fenced, {**TRUTH, "damping": 0.9}, NOISE)
+    assert stopped.values["damping"] == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("level", [0.1, 1.0])
+def test_process_noise_level_is_found(level):
+    truth = replace(NOISE, process={"torque": level})
+    engine = Engine(Pendulum(), [swing(seed, n=1200, noise=truth) for seed in range(2)])
+    found = engine.fit_noise(TRUTH, NOISE, ["torque"])
+    assert found.process["torque"] == pytest.approx(level, rel=0.25)
+    assert found.reading == NOISE.reading
+
+
+def test_noise_level_stops_at_its_floor():
+    still = replace(NOISE, process={"torque": 0.0})
+    engine = Engine(Pendulum(), [swing(1, n=1200, noise=still)])
+    floored = replace(NOISE, floor={"torque": 0.2})
+    found = engine.fit_noise(TRUTH, floored, ["torque"])
+    assert found.process["torque"] == pytest.approx(0.2, rel=0.01)
+
+
+def test_a_diverging_model_has_no_likelihood_and_does_not_crash():
+    mad = {**TRUTH, "stiffness": -1e9}
+    engine = Engine(Pendulum(), [swing(1)])
+    assert engine.log_likelihood(mad, NOISE) < -1e6
+    _, lin = engine.linearise(mad, NOISE, [prior("damping", 0.2)])
+    assert np.isfinite(lin.information).all()
+
+
+# --- the small solvers ---------------------------------------------------------------------------
+
+
+def test_bounded_solve_is_scipys():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        k = int(rng.integers(1, 7))
+        M = rng.standard_normal((k + 3, k))
+        y = 3.0 * rng.standard_normal(k + 3)
+        lower, upper = -rng.exponential(0.5, k), rng.exponential(0.5, k)
+        x = bounded_solve(M.T @ M, M.T @ y, lower, upper)
+        best = lsq_linear(M, y, (lower, upper), tol=1e-13, method="bvls").x
+        assert np.all(x >= lower - 1e-12) and np.all(x <= upper + 1e-12)
+
+        def cost(v: np.ndarray, M: np.ndarray = M, y: np.ndarray = y) -> float:
+            return 0.5 * float(np.sum((M @ v - y) ** 2))
+
+        assert cost(x) <= cost(best) + 1e-9 * (1.0 + cost(best))
+
+
+def test_newton_step_promises_what_a_quadratic_gives():
+    """One step of a linear-Gaussian parameter lands on the optimum."""
+    engine = Engine(Pendulum(), [swing(1, n=600, values={**TRUTH, "bias": 0.1})])
+    free = [prior("bias", 1.0)]
+    passes, lin = engine.linearise(TRUTH, NOISE, free)
+    step, promised = newton_step(lin, free, TRUTH)
+    moved = {**TRUTH, "bias": float(step[0])}
+    gained = engine.frozen_cost(passes, free, TRUTH, NOISE)
+    gained -= engine.frozen_cost(passes, free, moved, NOISE)
+    assert gained == pytest.approx(promised, rel=1e-4)
+    assert step[0] == pytest.approx(0.1, abs=0.02)
+
+
+def test_newton_step_weighs_the_data_against_the_prior():
+    """Two Gaussians: the optimum is their mean by precision, wherever the step starts."""
+    information, slope, start = 4.0, 3.0, 2.5
+    lin = Linearised(
+        ("bias",), np.full((1, 1, 1), information), np.full((1, 1), slope), np.empty((1, 1, 1)),
+        np.empty((1, 1)),
+    )  # fmt: skip
+    step, promised = newton_step(lin, [prior("bias", 0.4, 1.0)], {"bias": start})
+    data, precision = start - slope / information, 0.4**-2
+    best = (information * data + precision * 1.0) / (information + precision)
+
+    def cost(bias: float) -> float:
+        return 0.5 * information * (bias - data) ** 2 + 0.5 * precision * (bias - 1.0) ** 2
+
+    assert start + step[0] == pytest.approx(best)
+    assert promised == pytest.approx(cost(start) - cost(best))
+
+
+# --- whiteness -----------------------------------------------------------------------------------
+
+
+def a_pass(e: np.ndarray) -> RunPass:
+    """A run whose innovations are given."""
+    n = len(e)
+    record = Record("made", 0.01 * np.arange(n), np.zeros((n, 1)), e)
+    none = np.empty(0)
+    return RunPass(record, none, 0.0, e, none, 0, none, none, none, none.astype(int), none)
+
+
+def test_white_noise_is_white():
+    for seed in range(20):
+        e = np.random.default_rng(seed).standard_normal((1500, 2))
+        e[::3, 1] = np.nan
+        judged = whiteness([a_pass(e)], ("a", "b"))
+        assert judged["a"].white and judged["b"].white
+
+
+def test_p_values_of_white_noise_are_uniform():
+    """Also of eighty readings, where Box and Pierce's statistic would be an eighth too small."""
+    draws = np.random.default_rng(5).standard_normal((400, 181, 1))
+    p_values = [whiteness([a_pass(e)], ("a",))["a"].p_value for e in draws]
+    assert np.mean(p_values) == pytest.approx(0.5, abs=0.05)
+    assert np.mean(np.array(p_values) < 0.25) == pytest.approx(0.25, abs=0.07)
+
+
+@pytest.mark.parametrize("pole", [0.4, -0.4, 0.9])
+def test_coloured_noise_is_not_white(pole):
+    shock = np.random.default_rng(1).standard_normal((2000, 2))
+    shock[:, 0] = math.sqrt(1.0 - pole**2) * lfilter([1.0], [1.0, -pole], shock[:, 0])
+    judged = whiteness([a_pass(shock)], ("a", "b"))
+    assert not judged["a"].white and judged["b"].white
+    assert judged["a"].p_value < 1e-5 and judged["a"].coloured_share > 0.1
+
+
+def test_noise_that_is_too_large_is_not_white():
+    e = 1.6 * np.random.default_rng(2).standard_normal((1500, 1))
+    assert not whiteness([a_pass(e)], ("a",))["a"].white
+
+
+def test_an_empty_channel_is_not_judged():
+    e = np.random.default_rng(3).standard_normal((500, 2))
+    e[:, 1] = np.nan
+    assert set(whiteness([a_pass(e)], ("a", "b"))) == {"a"}
+
+
+def test_a_channel_with_few_readings_is_not_judged():
+    """Twenty lags of fifty readings are no statistic, whatever they look like."""
+    e = 3.0 * np.random.default_rng(4).standard_normal((1000, 2))
+    e[150:, 1] = np.nan  # fifty are left after the first second
+    assert set(whiteness([a_pass(e)], ("a", "b"))) == {"a"}

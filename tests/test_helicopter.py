@@ -1,0 +1,271 @@
+"""The helicopter as the engine sees it: noise levels, first states, late inputs, the commands' news.
+
+Variances follow from stationary processes, delays from the command's own integral, first states from
+readings that were made up here.
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from coax_env import load_vehicle
+from coax_env.estimation.helicopter import (
+    BUFFET_LEVELS,
+    FARTHEST,
+    GUST_LEVELS,
+    HELD,
+    LEAST_READING_STD,
+    HeliModel,
+    record_of,
+    sensor_std,
+    starting_noise,
+)
+from coax_env.estimation.state_space import Noise, Record
+from coax_env.logs.flight import Flight, Run
+from coax_env.model import dynamics, effects
+from coax_env.model import parameters as P
+from coax_env.model.layout import CHANNELS, FULL_STATES
+
+LAMA = load_vehicle("lama400d")
+MODEL = HeliModel(LAMA)
+X = {name: i for i, (name, _) in enumerate(FULL_STATES)}
+LEVELS = {
+    "force_xy": 0.2, "force_z": 0.3, "moment_xy": 4e-3, "moment_z": 5e-3, "memory": 0.8,
+    "buffet_xy": 0.02, "buffet_z": 0.03, "buffet_moment_xy": 4e-4, "buffet_moment_z": 5e-4,
+}  # fmt: skip
+QUIET = dict.fromkeys(GUST_LEVELS, 0.0) | {"memory": 1.0}
+
+
+# --- noise ----------------------------------------------------------------------------------------
+
+
+def test_gust_states_are_stationary_at_their_levels():
+    """x' = -x/tau + w has variance q tau / 2: what decays in a moment is what the noise brings."""
+    q, first = MODEL.process_noise(Noise(LEVELS)), MODEL.start_noise(Noise(LEVELS))
+    expected = {"gust_X": 0.2, "gust_Y": 0.2, "gust_Z": 0.3,
+                "gust_L": 4e-3, "gust_M": 4e-3, "gust_N": 5e-3}  # fmt: skip
+    for name, level in expected.items():
+        assert q[X[name]] * 0.8 / 2.0 == pytest.approx(level**2), name
+        assert first[X[name]] == pytest.approx(level**2), name
+    assert not first[:20].any()
+
+
+def test_buffet_is_white_force_over_mass_and_moment_over_inertia():
+    """Newton: a white force of intensity b makes the velocity's variance grow by (b/m)^2 a second."""
+    extra = MODEL.process_noise(Noise(LEVELS)) - MODEL.process_noise(
+        Noise({k: v for k, v in LEVELS.items() if k not in BUFFET_LEVELS})
+    )
+    v = LAMA.values()
+    expected = np.zeros(26)
+    expected[[X["u"], X["v"], X["w"]]] = np.array([0.02, 0.02, 0.03]) / v["mass"]
+    inertias = [v["inertia_xx"], v["inertia_yy"], v["inertia_zz"]]
+    expected[[X["p"], X["q"], X["r"]]] = np.divide([4e-4, 4e-4, 5e-4], inertias)
+    np.testing.assert_allclose(extra, expected**2, rtol=1e-6, atol=1e-15)
+
+
+def test_without_gusts_the_model_is_nearly_believed():
+    """What is left is far below what any sensor here sees in a second, but not zero."""
+    q = np.sqrt(MODEL.process_noise(Noise(QUIET)))
+    assert (q[:20] > 0.0).all() and not q[20:].any()
+    for states, least in (
+        (("u", "v", "w"), 0.02), (("p", "q", "r"), 0.01), (("phi", "theta", "psi"), 0.006),
+        (("x", "y", "z"), 0.004), (("alpha_l", "beta_l", "alpha_f", "beta_f"), 0.006),
+        (("omega_u", "omega_l"), 1.1), (("swash_lon", "swash_lat"), 0.006),
+    ):  # fmt: skip
+        for name in states:
+            assert q[X[name]] < 0.2 * least, name
+
+
+# --- the start ------------------------------------------------------------------------------------
+
+
+def record(seconds=2.0, dt=0.02, **readings) -> Record:
+    """A record at hover commands with these readings, one number or an array each."""
+    t = 5.0 + dt * np.arange(round(seconds / dt))
+    z = np.full((t.size, len(CHANNELS)), np.nan)
+    for channel, values in readings.items():
+        z[:, CHANNELS.index(channel)] = values
+    command = np.tile([210.0, 225.0, 0.01, -0.02], (t.size, 1))
+    return Record("made up", t, command, z, origin=4.0)
+
+
+def test_the_first_state_is_the_median_of_the_first_half_second():
+    """What comes later, and a wild reading or two, do not matter."""
+    t = np.arange(100) * 0.02
+    height = np.where(t <= 0.5, 1.2, 50.0)
+    height[3:5] = 9.0
+    late = record(h=height, phi=0.1, theta=-0.05, psi=2.0, pn=3.0, pe=-4.0)
+    x, P0 = MODEL.start(late)
+    expected = {"phi": 0.1, "theta": -0.05, "psi": 2.0, "x": 3.0, "y": -4.0, "z": -1.2,
+                "omega_u": 210.0, "omega_l": 225.0, "swash_lon": 0.01, "swash_lat": -0.02}  # fmt: skip
+    for name, i in X.items():
+        assert x[i] == pytest.approx(expected.get(name, 0.0)), name
+    assert np.array_equal(P0, np.diag(np.diag(P0))) and (np.diag(P0)[:20] > 0.0).all()
+
+
+def test_a_heading_at_the_seam_starts_at_the_seam():
+    psi = np.where(np.arange(100) % 2, math.pi - 0.01, 0.01 - math.pi)
+    x, _ = MODEL.start(record(psi=psi))
+    assert math.cos(x[X["psi"]]) == pytest.approx(math.cos(math.pi - 0.01), abs=1e-4)
+
+
+def test_what_is_not_measured_starts_anywhere_a_hover_can_be():
+    """A flown start (0.3 m/s, 5 deg, 10 deg/s) lies well within; a place counts from itself."""
+    x, P0 = MODEL.start(record())
+    std = np.sqrt(np.diag(P0))
+    assert x[X["z"]] == pytest.approx(-1.0) and std[X["z"]] == pytest.approx(1.0, rel=1e-6)
+    for states, least, most in (
+        (("u", "v", "w"), 0.6, 2.0), (("p", "q", "r"), 0.35, 1.2),
+        (("phi", "theta", "psi"), 0.15, 0.4), (("x", "y"), 0.0, 0.01),
+        (("alpha_l", "beta_l", "alpha_f", "beta_f"), 0.03, 0.1),
+        (("omega_u", "omega_l"), 2.0, 8.0), (("swash_lon", "swash_lat"), 0.02, 0.06),
+    ):  # fmt: skip
+        for name in states:
+            assert least < std[X[name]] < most, name
+    std = np.sqrt(np.diag(MODEL.start(record(h=1.0, pn=0.0, pe=0.0))[1]))
+    assert std[[X["x"], X["y"], X["z"]]] == pytest.approx(0.5, rel=1e-6)
+
+
+# --- inputs ---------------------------------------------------------------------------------------
+
+
+def test_inputs_are_commands_time_and_news():
+    one = record()
+    u = MODEL.inputs(one, LAMA.vector)
+    assert np.array_equal(u[:, :4], one.command)
+    np.testing.assert_allclose(u[:, 4], one.t - 4.0)
+    news = np.random.default_rng(0).standard_normal((one.t.size, 4))
+    heard = Record(one.name, one.t, one.command, one.z, one.origin, news)
+    assert np.array_equal(MODEL.inputs(heard, LAMA.vector), np.hstack([u, news]))
+
+
+@pytest.mark.parametrize("delay", [0.007, 0.02, 0.05, 0.063])
+def test_a_late_command_is_its_mean_over_the_row(delay):
+    """A held command that is shifted, averaged by counting a fine grid; rotors are not late."""
+    rng = np.random.default_rng(1)
+    t = 3.0 + np.cumsum(rng.uniform(0.01, 0.03, 60))
+    command = rng.standard_normal((60, 4))
+    late = LAMA.with_effect("servo_delay", time=delay)
+    u = HeliModel(late).inputs(Record("", t, command, np.empty((60, 18)), float(t[0])), late.vector)
+    assert np.array_equal(u[:, :2], command[:, :2])
+    for k in range(59):
+        fine = np.linspace(t[k], t[k + 1], 20001)[:-1] + 0.5 * (t[k + 1] - t[k]) / 20000
+        row = np.maximum(np.searchsorted(t, fine - delay, side="right") - 1, 0)
+        assert u[k, 2:4] == pytest.approx(command[row, 2:4].mean(axis=0), abs=2e-4), k
+
+
+@pytest.mark.parametrize("gain", P.COMMAND_GAINS)
+def test_news_corrects_the_states_it_tells_of(gain):
+    """Tilts: a pilot who pulls (lon > 0, tilts back) has seen the nose low, or a push forward."""
+    taken = {  # state -> how it takes (upper, lower, lon, lat)
+        "command_gain.rate_xy": {"p": (0, 0, 0, 1), "q": (0, 0, 1, 0)},
+        "command_gain.moment_xy": {"gust_L": (0, 0, 0, 1), "gust_M": (0, 0, 1, 0)},
+        "command_gain.force_xy": {"gust_X": (0, 0, 1, 0), "gust_Y": (0, 0, 0, -1)},
+        "command_gain.rate_z": {"r": (1, -1, 0, 0)},
+        "command_gain.moment_z": {"gust_N": (1, -1, 0, 0)},
+        "command_gain.speed_z": {"w": (1, 1, 0, 0)},
+        "command_gain.force_z": {"gust_Z": (1, 1, 0, 0)},
+    }[gain]
+    rng = np.random.default_rng(2)
+    x, work, out = 0.1 * rng.standard_normal(26), np.zeros(dynamics.WORK_SIZE), np.zeros(26)
+    x[16:18] = 210.0
+    command, news = np.array([210.0, 220.0, 0.02, -0.01]), rng.standard_normal(4)
+    vector = MODEL.vector({gain: 0.01})
+    told = x.copy()
+    for state, weights in taken.items():
+        told[X[state]] += 0.01 * np.dot(weights, news)
+    expected = np.zeros(26)
+    dynamics.step(told, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
+    heard = np.append(dynamics.kernel_input(command), news)
+    MODEL.step.__wrapped__(x, heard, 0.01, vector, work, out)
+    np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-14)
+    # the drift says the same to first order: what is heard comes on top of what is flown
+    both, flown = np.zeros((2, 26 + len(CHANNELS)))
+    MODEL.drift_and_readings.__wrapped__(x, heard, 0.01, vector, work, both)
+    dynamics.drift_and_readings(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, flown)
+    heeded = both - flown
+    np.testing.assert_allclose(heeded[:26], told - x, rtol=1e-9, atol=1e-13)
+    assert not heeded[26:].any()
+    # and who hears nothing flies the kernel's own step
+    MODEL.step.__wrapped__(x, heard[:5].copy(), 0.01, vector, work, out)
+    dynamics.step(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
+    assert np.array_equal(out, expected)
+
+
+def test_a_fit_does_not_change_what_gusts_do():
+    """The gusts' reference is the file's: a fitted mass must not change the acceleration allowed."""
+    vector = MODEL.vector({"mass": 1.6, "inertia_xx": 1.0})
+    assert vector[P.MASS] == 1.6
+    for reference, own in P.GUST_REFERENCE.items():
+        assert vector[reference] == LAMA.vector[own]
+
+
+# --- where a search starts ------------------------------------------------------------------------
+
+
+def a_flight(noise=None, **measured) -> Flight:
+    n = len(next(iter(measured.values())))
+    t = 0.01 * np.arange(n)
+    run = Run("made up", t, np.tile([210.0, 225.0, 0.0, 0.0], (n, 1)), measured)
+    return Flight("lama400d", (run,), noise=noise or {})
+
+
+def test_a_sensors_std_is_found_under_a_smooth_motion():
+    """Planted noise; the motion is smooth at 100 Hz, and a heading that turns on is no scatter."""
+    rng = np.random.default_rng(3)
+    t = 0.01 * np.arange(6000)
+    noisy = 3.0 * np.sin(2.0 * t) + 0.05 * rng.standard_normal(t.size)
+    psi = 1.5 * t + 0.02 * rng.standard_normal(t.size)
+    flight = a_flight(h=noisy, psi=(psi + math.pi) % (2.0 * math.pi) - math.pi)
+    assert sensor_std(flight, "h") == pytest.approx(0.05, rel=0.06)
+    assert sensor_std(flight, "psi") == pytest.approx(0.02, rel=0.06)
+    assert sensor_std(flight, "p") == LEAST_READING_STD["p"], "never measured"
+    assert sensor_std(a_flight({"h": 0.3}, h=noisy), "h") == 0.3, "the card knows"
+
+
+def test_readings_start_from_the_card_or_from_twice_their_scatter():
+    rng = np.random.default_rng(4)
+    loud, still = 0.4 * rng.standard_normal(4000), np.zeros(4000)
+    flight = a_flight({"az": 0.3}, ax=loud, ay=still, az=loud)
+    reading = starting_noise(flight, LAMA).reading
+    assert reading["ax"] == pytest.approx(0.8, rel=0.08)
+    assert reading["ay"] == LEAST_READING_STD["ay"] and reading["az"] == 0.3
+    shaken = starting_noise(flight, LAMA.with_effect("vibration", amplitude=0.4)).reading
+    assert shaken["az"] == pytest.approx(math.sqrt(0.3**2 + 0.4**2 / 2.0)), "a sine's rms is on top"
+
+
+def test_gusts_start_small_and_end_at_a_floor_below():
+    noise = starting_noise(a_flight(h=np.zeros(10)), LAMA)
+    weight = LAMA["mass"].value * LAMA["gravity"].value
+    for name in GUST_LEVELS:
+        size = weight * (LAMA["arm_upper"].value if "moment" in name else 1.0)
+        assert 1e-3 * size < noise.process[name] < 0.05 * size
+        assert 5e-5 * size < noise.floor[name] < 0.2 * noise.process[name]
+    for gust, buffet in zip(GUST_LEVELS, BUFFET_LEVELS, strict=True):
+        assert noise.process[buffet] == noise.floor[buffet] < noise.floor[gust]
+
+
+def test_record_of_puts_every_channel_in_its_column():
+    flight = a_flight(h=np.arange(10.0), q=-np.arange(10.0))
+    found = record_of(flight.runs[0])
+    assert np.array_equal(found.z[:, CHANNELS.index("h")], np.arange(10.0))
+    assert np.array_equal(found.z[:, CHANNELS.index("q")], -np.arange(10.0))
+    assert np.isfinite(found.z).sum() == 20
+    assert found.origin == found.t[0]
+
+
+def test_what_may_be_fitted_lies_within_its_bounds():
+    base = {f.name: f for f in MODEL.base_parameters()}
+    assert set(base) == {n for n, p in LAMA.parameters.items() if p.std > 0.0} - set(HELD)
+    for name, free in base.items():
+        own = LAMA[name]
+        assert (free.value, free.std) == (own.value, own.std)
+        assert free.lower < own.value - 5.0 * own.std and own.value + 5.0 * own.std < free.upper
+    for name, entry in effects.CATALOGUE.items():
+        for free, own in zip(MODEL.effect_parameters(name), entry.parameters, strict=True):
+            assert own.lower <= free.lower <= own.off <= free.upper <= own.upper
+            assert free.reading_only == (entry.stage == effects.SENSOR)
+            farthest = FARTHEST * own.usual
+            assert free.upper - own.off == pytest.approx(min(farthest, own.upper - own.off))
+            assert own.off - free.lower == pytest.approx(min(farthest, own.off - own.lower))

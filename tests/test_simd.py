@@ -1,0 +1,248 @@
+"""Lanes: several helicopters in one register fly, sense and end as each would alone."""
+
+import math
+
+import numba
+import numpy as np
+import pytest
+
+import coax_env
+from coax_env.env import fleet
+from coax_env.env.gym_env import CoaxVectorEnv
+from coax_env.kernel import simd
+from coax_env.kernel.random_streams import normals_of
+from coax_env.kernel.simd import WIDTH, lanes_of, words_of
+from coax_env.model.dynamics import WORK_SIZE, full_state, hover_trim, measure, step
+from coax_env.model.dynamics import measure_bare as measure_any
+from coax_env.model.dynamics import step_bare as step_any
+from coax_env.model.layout import N_CHANNELS
+
+LAMA = coax_env.load_vehicle("lama400d")
+
+
+@numba.njit
+def _step_lanes(x, u, p, work, out):
+    step_any(lanes_of(x), lanes_of(u), 0.01, lanes_of(p), lanes_of(work), lanes_of(out))
+
+
+@numba.njit
+def _measure_lanes(x, u, p, work, out):
+    measure_any(lanes_of(x), lanes_of(u), lanes_of(p), lanes_of(work), lanes_of(out))
+
+
+@numba.njit
+def _sine_and_cosine(x, sine, cosine):
+    for i in range(len(x)):
+        lanes_of(sine)[i], lanes_of(cosine)[i] = simd.sine_and_cosine(lanes_of(x)[i])
+
+
+@numba.njit
+def _sine_and_cosine_of_numbers(x, sine, cosine):
+    for i in range(len(x)):
+        sine[i], cosine[i] = simd.sine_and_cosine(x[i])
+
+
+@numba.njit
+def _exponential(x, out):
+    for i in range(len(x)):
+        lanes_of(out)[i] = math.exp(lanes_of(x)[i])
+
+
+@numba.njit
+def _logarithm(x, out):
+    for i in range(len(x)):
+        lanes_of(out)[i] = math.log(lanes_of(x)[i])
+
+
+@numba.njit
+def _normals(bits, first, second):
+    for i in range(len(bits)):
+        lanes_of(first)[i], lanes_of(second)[i] = normals_of(words_of(bits)[i])
+
+
+def applied(function, x: np.ndarray, results: int = 1) -> list[np.ndarray]:
+    """A function of lanes at numbers, whose count is a multiple of WIDTH."""
+    outs = [np.empty((len(x) // WIDTH, WIDTH)) for _ in range(results)]
+    function(np.ascontiguousarray(x.reshape(-1, WIDTH)), *outs)
+    return [out.ravel() for out in outs]
+
+
+# --- functions ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1e-9, 0.1, math.pi, 100.0, 1e5, 1.5e6])
+def test_sine_and_cosine_are_right_to_the_last_bits(size):
+    x = np.concatenate(
+        [np.linspace(-size, size, 8000), np.random.default_rng(0).uniform(-size, size, 8000)]
+    )
+    sine, cosine = applied(_sine_and_cosine, x, 2)
+    assert np.abs(sine - np.sin(x)).max() < 4e-16
+    assert np.abs(cosine - np.cos(x)).max() < 4e-16
+    _sine_and_cosine_of_numbers(x, sine, cosine)
+    assert np.abs(sine - np.sin(x)).max() < 4e-16
+    assert np.abs(cosine - np.cos(x)).max() < 4e-16
+
+
+def test_sine_and_cosine_at_the_quarter_turns_and_of_what_is_not_finite():
+    quarters = np.arange(-4000, 4000) * (math.pi / 2.0)
+    beside = np.concatenate([quarters, np.nextafter(quarters, 9e9), quarters + 1e-8])
+    sine, cosine = applied(_sine_and_cosine, beside, 2)
+    assert np.abs(sine - np.sin(beside)).max() < 4e-16
+    assert np.abs(cosine - np.cos(beside)).max() < 4e-16
+    small = applied(_sine_and_cosine, np.full(WIDTH, 1e-300), 2)[0]
+    assert (small == 1e-300).all()
+    for wrong in (math.nan, math.inf, -math.inf, 1e300):
+        assert np.isnan(applied(_sine_and_cosine, np.full(WIDTH, wrong), 2)).all()
+
+
+def test_exponential_and_logarithm_are_right_to_the_last_bits():
+    rng = np.random.default_rng(1)
+    x = np.concatenate([np.linspace(-700.0, 700.0, 8000), rng.uniform(-1.0, 1.0, 8000)])
+    assert np.abs(applied(_exponential, x)[0] / np.exp(x) - 1.0).max() < 5e-16
+    x = np.concatenate([rng.uniform(0.0, 1.0, 8000), np.exp(rng.uniform(-700.0, 700.0, 8000))])
+    x = np.concatenate([x, [2.0**-33, 1.0, np.nextafter(1.0, 0.0), math.sqrt(0.5)] * WIDTH])
+    error = applied(_logarithm, x)[0] - np.log(x)
+    assert (np.abs(error) <= 3e-16 * np.abs(np.log(x)) + 1e-300).all()
+    for wrong in (0.0, -1.0, math.nan):
+        assert np.isnan(applied(_logarithm, np.full(WIDTH, wrong))).all()
+
+
+def test_angles_within_and_beyond_an_eighth_of_a_turn_do_not_hurt_each_other():
+    x = np.random.default_rng(4).uniform(-0.7, 0.7, 800 * WIDTH)
+    small = applied(_sine_and_cosine, x, 2)
+    beside = x.copy()
+    beside[::WIDTH] = 50.0
+    beside[1::WIDTH] = math.nan
+    mixed = applied(_sine_and_cosine, beside, 2)
+    kept = np.ones(len(x), dtype=bool)
+    kept[::WIDTH] = kept[1::WIDTH] = False
+    for one, other in zip(small, mixed, strict=True):
+        assert np.abs(one - other)[kept].max() < 4e-16
+        assert np.isnan(other[1::WIDTH]).all()
+
+
+def test_normal_numbers_are_those_of_box_and_muller():
+    rng = np.random.default_rng(3)
+    bits = rng.integers(0, 2**64, 16000, dtype=np.uint64, endpoint=False)
+    corners = [0, 1, 2**30, 2**31 - 1, 2**31, 2**31 + 1, 2**32 - 1]
+    pairs = [(a << 32) | b for a in corners for b in corners]
+    bits = np.concatenate([bits, np.array(pairs * WIDTH, dtype=np.uint64)])
+    radius = np.sqrt(-2.0 * np.log(((bits >> np.uint64(32)) + 0.5) / 2.0**32))
+    angle = 2.0 * math.pi * (bits & np.uint64(0xFFFFFFFF)) / 2.0**32
+    for found, expected in zip(
+        applied(_normals, bits, 2), (radius * np.cos(angle), radius * np.sin(angle)), strict=True
+    ):
+        assert np.abs(found - expected).max() < 5e-11
+    alone = np.array([normals_of(number) for number in bits[:2000]]).T
+    assert np.abs(alone - applied(_normals, bits[: 250 * WIDTH], 2)).max() < 1e-14
+
+
+# --- dynamics -------------------------------------------------------------------------------------
+
+
+def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """WIDTH states anywhere in flight, commands, and vehicles: (26, WIDTH), (5, WIDTH), (n, WIDTH)."""
+    rng = np.random.default_rng(seed)
+    state, command = hover_trim(LAMA)
+    x = full_state(state, command, LAMA)[:, None] + rng.normal(0.0, 0.3, (26, WIDTH))
+    x[12] += rng.uniform(-30.0, 30.0, WIDTH)
+    u = np.zeros((5, WIDTH))
+    u[:4] = command[:, None] * (1.0 + rng.normal(0.0, 0.1, (4, WIDTH)))
+    u[2:4] += rng.normal(0.0, 0.1, (2, WIDTH))
+    p = np.array([LAMA.draw(rng).vector for _ in range(WIDTH)]).T
+    return x, u, np.ascontiguousarray(p)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_each_lane_flies_and_measures_as_one_helicopter(seed):
+    x, u, p = drawn(seed)
+    work = np.zeros((WORK_SIZE, WIDTH))
+    flown, readings = np.empty_like(x), np.empty((N_CHANNELS, WIDTH))
+    _step_lanes(x, u, p, work, flown)
+    _measure_lanes(x, u, p, work, readings)
+    for j in range(WIDTH):
+        one = [np.ascontiguousarray(a[:, j]) for a in (x, u, p)]
+        expected, measured = np.empty(26), np.empty(N_CHANNELS)
+        step(one[0], one[1], 0.01, one[2], np.zeros(WORK_SIZE), expected)
+        measure(*one, np.zeros(WORK_SIZE), measured)
+        assert flown[:, j] == pytest.approx(expected, rel=1e-12, abs=1e-12)
+        assert readings[:, j] == pytest.approx(measured, rel=1e-11, abs=1e-11)
+
+
+def test_what_is_not_a_number_stays_in_its_lane():
+    x, u, p = drawn(0)
+    work, clean, spoilt = np.zeros((WORK_SIZE, WIDTH)), np.empty_like(x), np.empty_like(x)
+    _step_lanes(x, u, p, work, clean)
+    x[3, 2] = math.nan
+    u[0, 5 % WIDTH] = math.inf
+    _step_lanes(x, u, p, work, spoilt)
+    hit = [2, 5 % WIDTH]
+    assert not np.isfinite(spoilt[:, hit]).all(axis=0).any()
+    others = np.setdiff1d(np.arange(WIDTH), hit)
+    assert np.array_equal(spoilt[:, others], clean[:, others])
+
+
+# --- rows in and out --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("columns", [1, 2, 4, 5, 18, 26])
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_rows_go_into_lanes_and_back_to_where_they_were(columns, kind):
+    rng = np.random.default_rng(columns)
+    rows = rng.normal(size=(40, columns))
+    which = rng.permutation(40)[:WIDTH]
+    block = np.empty((columns, WIDTH))
+    simd.gather(rows, which, block)
+    assert np.array_equal(block, rows[which].T)
+    for some in (WIDTH, WIDTH - 3):
+        back = np.zeros((40, columns), dtype=kind)
+        simd.scatter(block, which, some, back)
+        expected = np.zeros((40, columns), dtype=kind)
+        expected[which[:some]] = rows[which[:some]]
+        assert np.array_equal(back, expected)
+
+
+# --- the fleet ------------------------------------------------------------------------------------
+
+
+def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str, np.ndarray]:
+    """A flight of a batch through ends and resets: what came, (steps, count, ...)."""
+    monkeypatch.setattr(fleet, "LANES_FROM", 2 if side_by_side else 10**9)
+    env = CoaxVectorEnv(count, max_episode_steps=90, threads=1, **arguments)
+    env.reset(seed=7)
+    rng = np.random.default_rng(2)
+    came = []
+    for k in range(200):
+        action = rng.uniform(-1.0, 1.0, (count, 4)) * np.linspace(0.1, 2.0, count)[:, None]
+        if k == 20:
+            action[-1, 1] = math.nan
+        observations, rewards, terminated, truncated, info = env.step(action)
+        terms = np.column_stack([info["reward_terms"][name] for name in env.fleet.task.terms])
+        numbers = np.column_stack([rewards, terms, info["state"]])
+        came.append((observations, numbers, np.column_stack([terminated, truncated])))
+    return dict(
+        zip(("readings", "numbers", "ends"), map(np.array, zip(*came, strict=True)), strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("count", "arguments"),
+    [
+        (WIDTH, {}),
+        (2 * WIDTH + 3, {"gusts": (0.3, 0.01)}),
+        (2, {"sensors": "mocap", "task": "position"}),
+        (WIDTH + 1, {"randomize": "posterior", "gusts": (0.3, 0.01)}),
+        (13, {"sensors": "mocap", "task": "waypoints", "target": [(0, 0, 1.5, 0), (0, 0, 1.6, 0)]}),
+    ],
+    ids=["one group", "and three more", "fewer than a group", "own vehicles", "waypoints"],
+)
+def test_rows_in_lanes_fly_as_rows_one_by_one(monkeypatch, count, arguments):
+    side_by_side = flown(monkeypatch, True, count, **arguments)
+    one_by_one = flown(monkeypatch, False, count, **arguments)
+    assert np.array_equal(side_by_side["ends"], one_by_one["ends"])
+    assert one_by_one["ends"][20, -1, 0] and not one_by_one["ends"][20, :-1].any()
+    assert one_by_one["ends"].sum() >= 2 * count
+    for what, error in (("numbers", 1e-9), ("readings", 1e-6)):
+        ours, theirs = side_by_side[what], one_by_one[what]
+        assert np.array_equal(np.isnan(ours), np.isnan(theirs))
+        assert np.nanmax(np.abs(ours - theirs) / (1.0 + np.abs(theirs))) < error
