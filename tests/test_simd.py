@@ -11,7 +11,7 @@ from coax_env.env import fleet
 from coax_env.env.gym_env import CoaxVectorEnv
 from coax_env.kernel import simd
 from coax_env.kernel.random_streams import normals_of
-from coax_env.kernel.simd import WIDTH, lanes_of, words_of
+from coax_env.kernel.simd import SIMD_WIDTH, simd_view, simd_view_uint64
 from coax_env.model.dynamics import WORK_SIZE, full_state, hover_trim, measure, step
 from coax_env.model.dynamics import measure_bare as measure_any
 from coax_env.model.dynamics import step_bare as step_any
@@ -22,18 +22,18 @@ LAMA = coax_env.load_vehicle("lama400d")
 
 @numba.njit
 def _step_lanes(x, u, p, work, out):
-    step_any(lanes_of(x), lanes_of(u), 0.01, lanes_of(p), lanes_of(work), lanes_of(out))
+    step_any(simd_view(x), simd_view(u), 0.01, simd_view(p), simd_view(work), simd_view(out))
 
 
 @numba.njit
 def _measure_lanes(x, u, p, work, out):
-    measure_any(lanes_of(x), lanes_of(u), lanes_of(p), lanes_of(work), lanes_of(out))
+    measure_any(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
 
 
 @numba.njit
 def _sine_and_cosine(x, sine, cosine):
     for i in range(len(x)):
-        lanes_of(sine)[i], lanes_of(cosine)[i] = simd.sine_and_cosine(lanes_of(x)[i])
+        simd_view(sine)[i], simd_view(cosine)[i] = simd.sine_and_cosine(simd_view(x)[i])
 
 
 @numba.njit
@@ -45,25 +45,25 @@ def _sine_and_cosine_of_numbers(x, sine, cosine):
 @numba.njit
 def _exponential(x, out):
     for i in range(len(x)):
-        lanes_of(out)[i] = math.exp(lanes_of(x)[i])
+        simd_view(out)[i] = math.exp(simd_view(x)[i])
 
 
 @numba.njit
 def _logarithm(x, out):
     for i in range(len(x)):
-        lanes_of(out)[i] = math.log(lanes_of(x)[i])
+        simd_view(out)[i] = math.log(simd_view(x)[i])
 
 
 @numba.njit
 def _normals(bits, first, second):
     for i in range(len(bits)):
-        lanes_of(first)[i], lanes_of(second)[i] = normals_of(words_of(bits)[i])
+        simd_view(first)[i], simd_view(second)[i] = normals_of(simd_view_uint64(bits)[i])
 
 
 def applied(function, x: np.ndarray, results: int = 1) -> list[np.ndarray]:
-    """A function of lanes at numbers, whose count is a multiple of WIDTH."""
-    outs = [np.empty((len(x) // WIDTH, WIDTH)) for _ in range(results)]
-    function(np.ascontiguousarray(x.reshape(-1, WIDTH)), *outs)
+    """A function of lanes at numbers, whose count is a multiple of SIMD_WIDTH."""
+    outs = [np.empty((len(x) // SIMD_WIDTH, SIMD_WIDTH)) for _ in range(results)]
+    function(np.ascontiguousarray(x.reshape(-1, SIMD_WIDTH)), *outs)
     return [out.ravel() for out in outs]
 
 
@@ -89,10 +89,10 @@ def test_sine_and_cosine_at_the_quarter_turns_and_of_what_is_not_finite():
     sine, cosine = applied(_sine_and_cosine, beside, 2)
     assert np.abs(sine - np.sin(beside)).max() < 4e-16
     assert np.abs(cosine - np.cos(beside)).max() < 4e-16
-    small = applied(_sine_and_cosine, np.full(WIDTH, 1e-300), 2)[0]
+    small = applied(_sine_and_cosine, np.full(SIMD_WIDTH, 1e-300), 2)[0]
     assert (small == 1e-300).all()
     for wrong in (math.nan, math.inf, -math.inf, 1e300):
-        assert np.isnan(applied(_sine_and_cosine, np.full(WIDTH, wrong), 2)).all()
+        assert np.isnan(applied(_sine_and_cosine, np.full(SIMD_WIDTH, wrong), 2)).all()
 
 
 def test_exponential_and_logarithm_are_right_to_the_last_bits():
@@ -100,25 +100,25 @@ def test_exponential_and_logarithm_are_right_to_the_last_bits():
     x = np.concatenate([np.linspace(-700.0, 700.0, 8000), rng.uniform(-1.0, 1.0, 8000)])
     assert np.abs(applied(_exponential, x)[0] / np.exp(x) - 1.0).max() < 5e-16
     x = np.concatenate([rng.uniform(0.0, 1.0, 8000), np.exp(rng.uniform(-700.0, 700.0, 8000))])
-    x = np.concatenate([x, [2.0**-33, 1.0, np.nextafter(1.0, 0.0), math.sqrt(0.5)] * WIDTH])
+    x = np.concatenate([x, [2.0**-33, 1.0, np.nextafter(1.0, 0.0), math.sqrt(0.5)] * SIMD_WIDTH])
     error = applied(_logarithm, x)[0] - np.log(x)
     assert (np.abs(error) <= 3e-16 * np.abs(np.log(x)) + 1e-300).all()
     for wrong in (0.0, -1.0, math.nan):
-        assert np.isnan(applied(_logarithm, np.full(WIDTH, wrong))).all()
+        assert np.isnan(applied(_logarithm, np.full(SIMD_WIDTH, wrong))).all()
 
 
 def test_angles_within_and_beyond_an_eighth_of_a_turn_do_not_hurt_each_other():
-    x = np.random.default_rng(4).uniform(-0.7, 0.7, 800 * WIDTH)
+    x = np.random.default_rng(4).uniform(-0.7, 0.7, 800 * SIMD_WIDTH)
     small = applied(_sine_and_cosine, x, 2)
     beside = x.copy()
-    beside[::WIDTH] = 50.0
-    beside[1::WIDTH] = math.nan
+    beside[::SIMD_WIDTH] = 50.0
+    beside[1::SIMD_WIDTH] = math.nan
     mixed = applied(_sine_and_cosine, beside, 2)
     kept = np.ones(len(x), dtype=bool)
-    kept[::WIDTH] = kept[1::WIDTH] = False
+    kept[::SIMD_WIDTH] = kept[1::SIMD_WIDTH] = False
     for one, other in zip(small, mixed, strict=True):
         assert np.abs(one - other)[kept].max() < 4e-16
-        assert np.isnan(other[1::WIDTH]).all()
+        assert np.isnan(other[1::SIMD_WIDTH]).all()
 
 
 def test_normal_numbers_are_those_of_box_and_muller():
@@ -126,7 +126,7 @@ def test_normal_numbers_are_those_of_box_and_muller():
     bits = rng.integers(0, 2**64, 16000, dtype=np.uint64, endpoint=False)
     corners = [0, 1, 2**30, 2**31 - 1, 2**31, 2**31 + 1, 2**32 - 1]
     pairs = [(a << 32) | b for a in corners for b in corners]
-    bits = np.concatenate([bits, np.array(pairs * WIDTH, dtype=np.uint64)])
+    bits = np.concatenate([bits, np.array(pairs * SIMD_WIDTH, dtype=np.uint64)])
     radius = np.sqrt(-2.0 * np.log(((bits >> np.uint64(32)) + 0.5) / 2.0**32))
     angle = 2.0 * math.pi * (bits & np.uint64(0xFFFFFFFF)) / 2.0**32
     for found, expected in zip(
@@ -134,33 +134,33 @@ def test_normal_numbers_are_those_of_box_and_muller():
     ):
         assert np.abs(found - expected).max() < 5e-11
     alone = np.array([normals_of(number) for number in bits[:2000]]).T
-    assert np.abs(alone - applied(_normals, bits[: 250 * WIDTH], 2)).max() < 1e-14
+    assert np.abs(alone - applied(_normals, bits[: 250 * SIMD_WIDTH], 2)).max() < 1e-14
 
 
 # --- dynamics -------------------------------------------------------------------------------------
 
 
 def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """WIDTH states anywhere in flight, commands, and vehicles: (26, WIDTH), (5, WIDTH), (n, WIDTH)."""
+    """SIMD_WIDTH states anywhere in flight, commands, and vehicles: (26, SIMD_WIDTH), (5, SIMD_WIDTH), (n, SIMD_WIDTH)."""
     rng = np.random.default_rng(seed)
     state, command = hover_trim(LAMA)
-    x = full_state(state, command, LAMA)[:, None] + rng.normal(0.0, 0.3, (26, WIDTH))
-    x[12] += rng.uniform(-30.0, 30.0, WIDTH)
-    u = np.zeros((5, WIDTH))
-    u[:4] = command[:, None] * (1.0 + rng.normal(0.0, 0.1, (4, WIDTH)))
-    u[2:4] += rng.normal(0.0, 0.1, (2, WIDTH))
-    p = np.array([LAMA.draw(rng).vector for _ in range(WIDTH)]).T
+    x = full_state(state, command, LAMA)[:, None] + rng.normal(0.0, 0.3, (26, SIMD_WIDTH))
+    x[12] += rng.uniform(-30.0, 30.0, SIMD_WIDTH)
+    u = np.zeros((5, SIMD_WIDTH))
+    u[:4] = command[:, None] * (1.0 + rng.normal(0.0, 0.1, (4, SIMD_WIDTH)))
+    u[2:4] += rng.normal(0.0, 0.1, (2, SIMD_WIDTH))
+    p = np.array([LAMA.draw(rng).vector for _ in range(SIMD_WIDTH)]).T
     return x, u, np.ascontiguousarray(p)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_each_lane_flies_and_measures_as_one_helicopter(seed):
     x, u, p = drawn(seed)
-    work = np.zeros((WORK_SIZE, WIDTH))
-    flown, readings = np.empty_like(x), np.empty((N_CHANNELS, WIDTH))
+    work = np.zeros((WORK_SIZE, SIMD_WIDTH))
+    flown, readings = np.empty_like(x), np.empty((N_CHANNELS, SIMD_WIDTH))
     _step_lanes(x, u, p, work, flown)
     _measure_lanes(x, u, p, work, readings)
-    for j in range(WIDTH):
+    for j in range(SIMD_WIDTH):
         one = [np.ascontiguousarray(a[:, j]) for a in (x, u, p)]
         expected, measured = np.empty(26), np.empty(N_CHANNELS)
         step(one[0], one[1], 0.01, one[2], np.zeros(WORK_SIZE), expected)
@@ -171,14 +171,14 @@ def test_each_lane_flies_and_measures_as_one_helicopter(seed):
 
 def test_what_is_not_a_number_stays_in_its_lane():
     x, u, p = drawn(0)
-    work, clean, spoilt = np.zeros((WORK_SIZE, WIDTH)), np.empty_like(x), np.empty_like(x)
+    work, clean, spoilt = np.zeros((WORK_SIZE, SIMD_WIDTH)), np.empty_like(x), np.empty_like(x)
     _step_lanes(x, u, p, work, clean)
     x[3, 2] = math.nan
-    u[0, 5 % WIDTH] = math.inf
+    u[0, 5 % SIMD_WIDTH] = math.inf
     _step_lanes(x, u, p, work, spoilt)
-    hit = [2, 5 % WIDTH]
+    hit = [2, 5 % SIMD_WIDTH]
     assert not np.isfinite(spoilt[:, hit]).all(axis=0).any()
-    others = np.setdiff1d(np.arange(WIDTH), hit)
+    others = np.setdiff1d(np.arange(SIMD_WIDTH), hit)
     assert np.array_equal(spoilt[:, others], clean[:, others])
 
 
@@ -190,11 +190,11 @@ def test_what_is_not_a_number_stays_in_its_lane():
 def test_rows_go_into_lanes_and_back_to_where_they_were(columns, kind):
     rng = np.random.default_rng(columns)
     rows = rng.normal(size=(40, columns))
-    which = rng.permutation(40)[:WIDTH]
-    block = np.empty((columns, WIDTH))
+    which = rng.permutation(40)[:SIMD_WIDTH]
+    block = np.empty((columns, SIMD_WIDTH))
     simd.gather(rows, which, block)
     assert np.array_equal(block, rows[which].T)
-    for some in (WIDTH, WIDTH - 3):
+    for some in (SIMD_WIDTH, SIMD_WIDTH - 3):
         back = np.zeros((40, columns), dtype=kind)
         simd.scatter(block, which, some, back)
         expected = np.zeros((40, columns), dtype=kind)
@@ -228,10 +228,10 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
 @pytest.mark.parametrize(
     ("count", "arguments"),
     [
-        (WIDTH, {}),
-        (2 * WIDTH + 3, {"gusts": (0.3, 0.01)}),
+        (SIMD_WIDTH, {}),
+        (2 * SIMD_WIDTH + 3, {"gusts": (0.3, 0.01)}),
         (2, {"sensors": "mocap", "task": "position"}),
-        (WIDTH + 1, {"randomize": "posterior", "gusts": (0.3, 0.01)}),
+        (SIMD_WIDTH + 1, {"randomize": "posterior", "gusts": (0.3, 0.01)}),
         (13, {"sensors": "mocap", "task": "waypoints", "target": [(0, 0, 1.5, 0), (0, 0, 1.6, 0)]}),
     ],
     ids=["one group", "and three more", "fewer than a group", "own vehicles", "waypoints"],

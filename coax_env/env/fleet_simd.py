@@ -1,4 +1,4 @@
-"""The batch kernel for helicopters without effects: WIDTH rows of the fleet at a time, in lanes.
+"""The batch kernel for helicopters without effects: SIMD_WIDTH rows of the fleet at a time, in lanes.
 
 The same control period as fleet.py's for one row, made of the same parts (period.py); here each part
 is compiled for lanes. Any active rows make a group; the last group is filled up with copies, whose
@@ -12,7 +12,15 @@ from coax_env.env.period import BIAS, BIAS_STD, DT, blow, command, read, rest, s
 from coax_env.env.threads import in_threads
 from coax_env.errors import InputError
 from coax_env.kernel.compilation import compiled
-from coax_env.kernel.simd import WIDTH, gather, lanes_of, scatter, scratch, select, words_of
+from coax_env.kernel.simd import (
+    SIMD_WIDTH,
+    gather,
+    scatter,
+    select,
+    simd_scratch,
+    simd_view,
+    simd_view_uint64,
+)
 from coax_env.model import effects
 from coax_env.model import parameters as P
 from coax_env.model.actuators import limit
@@ -33,14 +41,14 @@ _N_SINGLES = 4
 
 @compiled()
 def _next_group(i, last, active, which):
-    """The next WIDTH active rows from row `i` on into `which`; how many they are, and the row after."""
+    """The next SIMD_WIDTH active rows from row `i` on into `which`; how many they are, and the row after."""
     n = 0
-    while i < last and n < WIDTH:
+    while i < last and n < SIMD_WIDTH:
         if active[i]:
             which[n] = i
             n += 1
         i += 1
-    for j in range(n, WIDTH):
+    for j in range(n, SIMD_WIDTH):
         which[j] = which[0]
     return n, i
 
@@ -72,22 +80,25 @@ def _step_of(own):
         x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
     ):  # fmt: skip
         """Fly the active rows first..last-1 for one control period. See fleet.Fleet for the arrays."""
-        which = np.empty(WIDTH, np.int64)
-        x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
-        action_block, asked_block = np.empty((4, WIDTH)), np.empty((4, WIDTH))
-        target_block, term_block = np.empty((4, WIDTH)), np.zeros((len(weights), WIDTH))
-        stream_block, row_block = np.empty((2, WIDTH), np.uint64), np.empty((_N_SINGLES, WIDTH))
-        x_, u_, action_ = lanes_of(x_block), lanes_of(u_block), lanes_of(action_block)
-        asked_, target_, terms_ = (
-            lanes_of(asked_block),
-            lanes_of(target_block),
-            lanes_of(term_block),
+        which = np.empty(SIMD_WIDTH, np.int64)
+        x_block, u_block = np.empty((N_FULL, SIMD_WIDTH)), np.empty((N_INPUTS, SIMD_WIDTH))
+        action_block, asked_block = np.empty((4, SIMD_WIDTH)), np.empty((4, SIMD_WIDTH))
+        target_block, term_block = np.empty((4, SIMD_WIDTH)), np.zeros((len(weights), SIMD_WIDTH))
+        stream_block, row_block = (
+            np.empty((2, SIMD_WIDTH), np.uint64),
+            np.empty((_N_SINGLES, SIMD_WIDTH)),
         )
-        single_, stream_ = lanes_of(row_block), words_of(stream_block)
-        work, flown_ = scratch(WORK_SIZE), scratch(N_FULL)
+        x_, u_, action_ = simd_view(x_block), simd_view(u_block), simd_view(action_block)
+        asked_, target_, terms_ = (
+            simd_view(asked_block),
+            simd_view(target_block),
+            simd_view(term_block),
+        )
+        single_, stream_ = simd_view(row_block), simd_view_uint64(stream_block)
+        work, flown_ = simd_scratch(WORK_SIZE), simd_scratch(N_FULL)
         if own:
-            p_block = np.empty((_N_PARAMETERS, WIDTH))
-            p = lanes_of(p_block)
+            p_block = np.empty((_N_PARAMETERS, SIMD_WIDTH))
+            p = simd_view(p_block)
         else:
             p = params[0]
         gusty = gust[0] > 0.0 or gust[1] > 0.0
@@ -99,7 +110,7 @@ def _step_of(own):
             gather(targets, which, target_block)
             if own:
                 gather(params, which, p_block)
-            for j in range(WIDTH):
+            for j in range(SIMD_WIDTH):
                 row_block[_ROW, j] = rows[which[j]]
                 row_block[_AZIMUTH, j] = azimuth[which[j]]
             command(action_, trim, scale, u_)
@@ -140,29 +151,29 @@ def _sense_of(own):
         first, last, active, params, sensors, flags, x, rows, streams, bias, held, observations,
     ):  # fmt: skip
         """New readings of the active rows first..last-1. See fleet.Fleet for the arrays."""
-        which, order = np.empty(WIDTH, np.int64), np.empty(last - first, np.int64)
+        which, order = np.empty(SIMD_WIDTH, np.int64), np.empty(last - first, np.int64)
         count = len(sensors)
-        x_block, reading_block = np.empty((N_FULL, WIDTH)), np.empty((N_CHANNELS, WIDTH))
-        held_block, row_block = np.empty((held.shape[1], WIDTH)), np.empty((1, WIDTH))
-        bias_block, value_block = np.zeros((count, WIDTH)), np.empty((count, WIDTH))
-        stream_block, work = np.empty((2, WIDTH), np.uint64), scratch(WORK_SIZE)
-        x_, held_, row_ = lanes_of(x_block), lanes_of(held_block), lanes_of(row_block)
+        x_block, reading_block = np.empty((N_FULL, SIMD_WIDTH)), np.empty((N_CHANNELS, SIMD_WIDTH))
+        held_block, row_block = np.empty((held.shape[1], SIMD_WIDTH)), np.empty((1, SIMD_WIDTH))
+        bias_block, value_block = np.zeros((count, SIMD_WIDTH)), np.empty((count, SIMD_WIDTH))
+        stream_block, work = np.empty((2, SIMD_WIDTH), np.uint64), simd_scratch(WORK_SIZE)
+        x_, held_, row_ = simd_view(x_block), simd_view(held_block), simd_view(row_block)
         bias_, values_, readings_ = (
-            lanes_of(bias_block), lanes_of(value_block), lanes_of(reading_block)
+            simd_view(bias_block), simd_view(value_block), simd_view(reading_block)
         )  # fmt: skip
-        stream_ = words_of(stream_block)
+        stream_ = simd_view_uint64(stream_block)
         if own:
-            p_block = np.empty((_N_PARAMETERS, WIDTH))
-            p = lanes_of(p_block)
+            p_block = np.empty((_N_PARAMETERS, SIMD_WIDTH))
+            p = simd_view(p_block)
         else:
             p = params[0]
         biased = False
         for k in range(count):
             biased = biased or sensors[k, BIAS] != 0.0 or sensors[k, BIAS_STD] != 0.0
         active_rows = _by_phase(first, last, active, rows, order)
-        for at in range(0, active_rows, WIDTH):
-            n = min(WIDTH, active_rows - at)
-            for j in range(WIDTH):
+        for at in range(0, active_rows, SIMD_WIDTH):
+            n = min(SIMD_WIDTH, active_rows - at)
+            for j in range(SIMD_WIDTH):
                 which[j] = order[at + j if j < n else at]
             gather(x, which, x_block)
             gather(held, which, held_block)
@@ -171,7 +182,7 @@ def _sense_of(own):
                 gather(bias, which, bias_block)
             if own:
                 gather(params, which, p_block)
-            for j in range(WIDTH):
+            for j in range(SIMD_WIDTH):
                 row_block[0, j] = rows[which[j]]
             # without effects the actuators are where they were sent, and time has no part
             measure_bare(x_, x_[N_STATES:], p, work, readings_)
@@ -237,10 +248,10 @@ fly_own = _fly_of(True)
 
 @compiled(makes_arrays=True)
 def _dynamics_rows(first, last, x, u, p):
-    which, active = np.empty(WIDTH, np.int64), np.ones(len(x), np.bool_)
-    x_block, u_block = np.empty((N_FULL, WIDTH)), np.empty((N_INPUTS, WIDTH))
-    x_, u_ = lanes_of(x_block), lanes_of(u_block)
-    work, flown_ = scratch(WORK_SIZE), scratch(N_FULL)
+    which, active = np.empty(SIMD_WIDTH, np.int64), np.ones(len(x), np.bool_)
+    x_block, u_block = np.empty((N_FULL, SIMD_WIDTH)), np.empty((N_INPUTS, SIMD_WIDTH))
+    x_, u_ = simd_view(x_block), simd_view(u_block)
+    work, flown_ = simd_scratch(WORK_SIZE), simd_scratch(N_FULL)
     n, after = _next_group(first, last, active, which)
     while n > 0:
         gather(x, which, x_block)

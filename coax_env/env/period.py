@@ -1,6 +1,6 @@
 """One control period of a helicopter, in parts: command, gusts, judgement and readings.
 
-Each part takes one helicopter's rows of numbers, or WIDTH helicopters' rows of lanes (simd.py), and
+Each part takes one helicopter's rows of numbers, or SIMD_WIDTH helicopters' rows of lanes (simd.py), and
 is compiled for what it is given. fleet.py and fleet_simd.py put the parts together.
 """
 

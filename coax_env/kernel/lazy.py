@@ -1,7 +1,7 @@
 """Compiled functions that are compiled when they are first called.
 
 numba compiles every function that a compiled function might call, so that whoever flies a vehicle
-without effects would wait for the code of them all. A late function is called through its address
+without effects would wait for the code of them all. A lazily compiled function is called through its address
 instead, which stands in a cell of memory; while the cell is empty, the call goes to Python first and
 has the function compiled. What compiled code remembers is the cell's name, so it can be cached.
 """
@@ -27,7 +27,7 @@ _compiling = threading.RLock()
 _kept: list[Any] = []  # cells and makers: compiled code has their addresses
 
 
-def late(function: Callable) -> Any:
+def lazily_compiled(function: Callable) -> Any:
     """Make a function of 3 to 6 arguments one that compiled code can call; see above.
 
     All are arrays of doubles, but for one called ``dt``, a number.

@@ -1,12 +1,12 @@
-"""Lanes: WIDTH helicopters side by side in one register, flown by the same source as one.
+"""Lanes: SIMD_WIDTH helicopters side by side in one register, flown by the same source as one.
 
 A compiled function is compiled anew for every type of its arguments. So the kernel's functions, handed
-arrays of `Lanes` (one double per helicopter) instead of arrays of doubles, become code that flies WIDTH
+arrays of `Lanes` (one double per helicopter) instead of arrays of doubles, become code that flies SIMD_WIDTH
 helicopters with one instruction: one physics, two machine codes. What `dynamics.step` needs of a number
 is defined here for `Lanes`: arithmetic, comparison and the functions of `math`.
 
-Three types: `Lanes`, WIDTH doubles; `Flags`, WIDTH truths, what comparing lanes gives; `Words`,
-WIDTH unsigned 64-bit numbers. Where helicopters differ there is no branch but `select`; a branch on
+Three types: `Lanes`, SIMD_WIDTH doubles; `Flags`, SIMD_WIDTH truths, what comparing lanes gives; `Words`,
+SIMD_WIDTH unsigned 64-bit numbers. Where helicopters differ there is no branch but `select`; a branch on
 flags does not compile. ``!=`` alone gives one truth, whether any lane differs: it asks whether an
 effect is on.
 
@@ -40,7 +40,7 @@ from numba.np.arrayobj import make_array, populate_array
 
 from coax_env.kernel.compilation import compiled, name_apart
 
-WIDTH = 8
+SIMD_WIDTH = 8
 """Helicopters in one group, a multiple of four: the doubles of two AVX2 registers."""
 
 _I32 = ir.IntType(32)
@@ -53,7 +53,7 @@ _INLINE = {"forceinline": True}
 
 
 class _Vector(types.Type):
-    """WIDTH values of one kind in a register."""
+    """SIMD_WIDTH values of one kind in a register."""
 
     def __init__(self, name: str, element: ir.Type) -> None:
         self.element = element
@@ -62,11 +62,11 @@ class _Vector(types.Type):
     @property
     def vector(self) -> ir.Type:
         """The register's type."""
-        return ir.VectorType(self.element, WIDTH)
+        return ir.VectorType(self.element, SIMD_WIDTH)
 
 
 class LanesType(_Vector):
-    """WIDTH doubles."""
+    """SIMD_WIDTH doubles."""
 
     def can_convert_from(self, typingctx: Any, other: types.Type) -> Conversion | None:
         """Any real number stands for itself in every lane."""
@@ -78,11 +78,11 @@ class LanesType(_Vector):
 
 
 class FlagsType(_Vector):
-    """WIDTH truths."""
+    """SIMD_WIDTH truths."""
 
 
 class WordsType(_Vector):
-    """WIDTH unsigned 64-bit numbers."""
+    """SIMD_WIDTH unsigned 64-bit numbers."""
 
     def can_convert_from(self, typingctx: Any, other: types.Type) -> Conversion | None:
         """Any whole number stands for itself in every lane."""
@@ -103,9 +103,9 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _splat(builder: Any, value: Any) -> Any:
-    vector = ir.VectorType(value.type, WIDTH)
+    vector = ir.VectorType(value.type, SIMD_WIDTH)
     first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, _index(0))
-    zeros = ir.Constant(ir.VectorType(_I32, WIDTH), [0] * WIDTH)
+    zeros = ir.Constant(ir.VectorType(_I32, SIMD_WIDTH), [0] * SIMD_WIDTH)
     return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
 
 
@@ -149,7 +149,9 @@ def _define(key: Any, kinds: tuple[_Vector, ...], result: types.Type, emit: Call
     @lower_builtin(key, *kinds)
     def lowered(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         values = [
-            ir.Constant(kind.vector, [kind.element(arg)] * WIDTH) if isinstance(arg, int) else arg
+            ir.Constant(kind.vector, [kind.element(arg)] * SIMD_WIDTH)
+            if isinstance(arg, int)
+            else arg
             for arg, kind in zip(args, kinds, strict=True)
         ]
         return emit(builder, *values)
@@ -160,7 +162,7 @@ def _called(name: str) -> Callable:
 
     def emit(builder: Any, *values: Any) -> Any:
         kinds = [LANES.vector] * len(values)
-        suffix = f"v{WIDTH}f64"
+        suffix = f"v{SIMD_WIDTH}f64"
         function = cgutils.get_or_insert_function(
             builder.module, ir.FunctionType(LANES.vector, kinds), f"llvm.{name}.{suffix}"
         )
@@ -170,7 +172,7 @@ def _called(name: str) -> Callable:
 
 
 def _any(builder: Any, flags: Any) -> Any:
-    bits = builder.bitcast(flags, ir.IntType(WIDTH))
+    bits = builder.bitcast(flags, ir.IntType(SIMD_WIDTH))
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
@@ -180,7 +182,7 @@ def _choose(sign: str) -> Callable:
 
 _TWO = (LANES, LANES)
 _fabs = _called("fabs")
-_INFINITE = ir.Constant(LANES.vector, [math.inf] * WIDTH)
+_INFINITE = ir.Constant(LANES.vector, [math.inf] * SIMD_WIDTH)
 for _name, _emit in {
     "add": lambda b, x, y: b.fadd(x, y, flags=_LOOSE),
     "sub": lambda b, x, y: b.fsub(x, y, flags=_LOOSE),
@@ -470,14 +472,14 @@ def _logarithm(x):
 
 
 def _view(kind: _Vector) -> Callable:
-    """`lanes_of` for one kind: a contiguous array (n, WIDTH) as n lanes, the same memory."""
+    """`simd_view` for one kind: a contiguous array (n, SIMD_WIDTH) as n lanes, the same memory."""
     row = types.Array(kind, 1, "C", aligned=False)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         source = make_array(sig.args[0])(context, builder, args[0])
         rows = make_array(row)(context, builder)
         count, _ = cgutils.unpack_tuple(builder, source.shape, 2)
-        size = context.get_constant(types.intp, 8 * WIDTH)
+        size = context.get_constant(types.intp, 8 * SIMD_WIDTH)
         data = builder.bitcast(source.data, kind.vector.as_pointer())
         populate_array(
             rows, data, shape=[count], strides=[size], itemsize=size, meminfo=source.meminfo
@@ -488,19 +490,19 @@ def _view(kind: _Vector) -> Callable:
 
 
 @intrinsic
-def lanes_of(typingctx, array):
-    """An array (n, WIDTH) of doubles, contiguous, as n `Lanes`, the same memory."""
+def simd_view(typingctx, array):
+    """An array (n, SIMD_WIDTH) of doubles, contiguous, as n `Lanes`, the same memory."""
     return _view(LANES)(typingctx, array)
 
 
 @intrinsic
-def words_of(typingctx, array):
-    """An array (n, WIDTH) of 64-bit numbers, contiguous, as n `Words`, the same memory."""
+def simd_view_uint64(typingctx, array):
+    """An array (n, SIMD_WIDTH) of 64-bit numbers, contiguous, as n `Words`, the same memory."""
     return _view(WORDS)(typingctx, array)
 
 
 @intrinsic
-def scratch(typingctx, n):
+def simd_scratch(typingctx, n):
     """So many `Lanes` on the stack, not set; `n` is a constant.
 
     Where the code that uses them is inlined and its indices are constant, they become registers.
@@ -510,7 +512,9 @@ def scratch(typingctx, n):
     row = types.Array(LANES, 1, "C", aligned=False)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        count, size = (context.get_constant(types.intp, k) for k in (n.literal_value, 8 * WIDTH))
+        count, size = (
+            context.get_constant(types.intp, k) for k in (n.literal_value, 8 * SIMD_WIDTH)
+        )
         with builder.goto_entry_block():
             place = builder.alloca(ir.ArrayType(LANES.vector, n.literal_value))
         rows = make_array(row)(context, builder)
@@ -565,41 +569,41 @@ def _transpose(typingctx, source, places, target, targets):
 
 @compiled()
 def gather(rows, which, lanes):
-    """A group's rows, `which` (WIDTH,) of `rows` (count, >= n), into the lanes (n, WIDTH)."""
+    """A group's rows, `which` (SIMD_WIDTH,) of `rows` (count, >= n), into the lanes (n, SIMD_WIDTH)."""
     n, stride = len(lanes), rows.shape[1]
     if n < 4:
-        for j in range(WIDTH):
+        for j in range(SIMD_WIDTH):
             for k in range(n):
                 lanes[k, j] = rows[which[j], k]
         return
-    for j in range(0, WIDTH, 4):
+    for j in range(0, SIMD_WIDTH, 4):
         a, b, c, d = (which[j] * stride, which[j + 1] * stride, which[j + 2] * stride,
                       which[j + 3] * stride)  # fmt: skip
         for i in range(0, n, 4):
             k = min(i, n - 4)  # the last four columns may overlap those before
-            to = k * WIDTH + j
+            to = k * SIMD_WIDTH + j
             _transpose(
                 rows, (a + k, b + k, c + k, d + k),
-                lanes, (to, to + WIDTH, to + 2 * WIDTH, to + 3 * WIDTH),
+                lanes, (to, to + SIMD_WIDTH, to + 2 * SIMD_WIDTH, to + 3 * SIMD_WIDTH),
             )  # fmt: skip
 
 
 @compiled()
 def scatter(lanes, which, some, rows):
-    """The first `some` lanes of (n, WIDTH) back into their rows, `which` (WIDTH,) of (count, >= n)."""
+    """The first `some` lanes of (n, SIMD_WIDTH) back into their rows, `which` (SIMD_WIDTH,) of (count, >= n)."""
     n, stride = len(lanes), rows.shape[1]
-    if some < WIDTH or n < 4:
+    if some < SIMD_WIDTH or n < 4:
         for j in range(some):
             for k in range(n):
                 rows[which[j], k] = lanes[k, j]
         return
-    for j in range(0, WIDTH, 4):
+    for j in range(0, SIMD_WIDTH, 4):
         a, b, c, d = (which[j] * stride, which[j + 1] * stride, which[j + 2] * stride,
                       which[j + 3] * stride)  # fmt: skip
         for i in range(0, n, 4):
             k = min(i, n - 4)
-            to = k * WIDTH + j
+            to = k * SIMD_WIDTH + j
             _transpose(
-                lanes, (to, to + WIDTH, to + 2 * WIDTH, to + 3 * WIDTH),
+                lanes, (to, to + SIMD_WIDTH, to + 2 * SIMD_WIDTH, to + 3 * SIMD_WIDTH),
                 rows, (a + k, b + k, c + k, d + k),
             )  # fmt: skip

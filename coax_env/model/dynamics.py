@@ -23,7 +23,7 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.kernel.compilation import compiled
-from coax_env.kernel.lazy import late
+from coax_env.kernel.lazy import lazily_compiled
 from coax_env.kernel.simd import sine_and_cosine, sines_and_cosines
 from coax_env.model import effects
 from coax_env.model import parameters as P
@@ -46,13 +46,13 @@ _every_sensor_effect = effects.stage_function(effects.SENSOR)
 _every_property_effect = effects.stage_function(effects.PROPERTY)
 
 
-@late
+@lazily_compiled
 def _sensor_effects(x, f, p):
     """The SENSOR effects of the catalogue."""
     _every_sensor_effect(x, f, p)
 
 
-@late
+@lazily_compiled
 def _property_effects(x, f, p):
     """The PROPERTY effects of the catalogue."""
     _every_property_effect(x, f, p)
@@ -239,7 +239,7 @@ def _rates_of(with_effects):
     return rates
 
 
-_rates_with_effects = late(_rates_of(True))
+_rates_with_effects = lazily_compiled(_rates_of(True))
 _rates_bare = compiled(forceinline=True)(_rates_of(False))
 
 
@@ -319,7 +319,7 @@ def _step_of(with_effects):
             for i in range(20, N_FULL):
                 out[i] *= half_gust * half_gust
 
-    return late(step) if with_effects else compiled(forceinline=True)(step)
+    return lazily_compiled(step) if with_effects else compiled(forceinline=True)(step)
 
 
 _step_with_effects = _step_of(True)
@@ -426,7 +426,7 @@ def _measure_of(with_effects):
         else:
             _read_bare(x, now, slope, p, f, out)
 
-    return late(measure) if with_effects else compiled(forceinline=True)(measure)
+    return lazily_compiled(measure) if with_effects else compiled(forceinline=True)(measure)
 
 
 _measure_with_effects = _measure_of(True)
