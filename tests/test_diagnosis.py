@@ -20,11 +20,17 @@ from shared_flights import shared_flight
 import coax_env
 from coax_env import diagnose, identify, load_vehicle, read_flight, replay
 from coax_env.design.next_maneuver import candidates
-from coax_env.diagnosis import diagnose as diagnosis
+from coax_env.diagnosis.corrected_vehicle import with_held_out
 from coax_env.diagnosis.diagnose import Diagnosis
-from coax_env.diagnosis.search import Search, State
+from coax_env.diagnosis.fits import at_optimum, converged, fitted, linearise, noise_fitted, start
+from coax_env.diagnosis.hold_out import split
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.refinement import refined
+from coax_env.diagnosis.scores import damping_gain, score
+from coax_env.diagnosis.search import search
+from coax_env.diagnosis.settings import SETTINGS
 from coax_env.errors import InputError
-from coax_env.estimation.fit import Engine, objective
+from coax_env.estimation.engine import Engine, objective
 from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
 from coax_env.files import write_text
 from coax_env.logs.flight import Flight
@@ -137,16 +143,16 @@ def test_signatures_are_what_moving_the_parameter_does(tmp_path, also):
     assert shown > 30
 
 
-def search_of(folder: Path, effect: str) -> tuple[Search, State]:
-    """A search for one effect on all runs of a flight, and where it begins."""
+def problem_of(folder: Path, effect: str) -> tuple[Problem, Fit]:
+    """The problem of finding one effect on all runs of a flight, and the first fit."""
     flight = read_flight(folder)
     model = HeliModel(LAMA)
-    search = Search(Engine(model, [record_of(run) for run in flight.runs]), model, (effect,))
-    return search, search.begin(starting_noise(flight, LAMA))
+    problem = Problem.of(model, [record_of(run) for run in flight.runs], (effect,))
+    return problem, start(problem, starting_noise(flight, LAMA))
 
 
 @pytest.mark.slow
-def test_a_polished_fit_is_at_the_top_of_the_likelihood(tmp_path):
+def test_a_refined_fit_is_at_the_top_of_the_likelihood(tmp_path):
     """Also in gusts, where holding the gains still leaves a slope in the lever arm."""
     folder = injector.fly(
         tmp_path / "flight",
@@ -155,78 +161,79 @@ def test_a_polished_fit_is_at_the_top_of_the_likelihood(tmp_path):
         runs=("lon_3211", "yaw_3211"),
         seed=7,
     )
-    search, state = search_of(folder, "imu_lever_arm")
-    engine = search.engine
-    state = search.polish(search.converge(State(["imu_lever_arm"], state.values, state.noise)))
-    free = search.free(state.active)
-    _, quadratic = search.linearise(state)
+    problem, fit = problem_of(folder, "imu_lever_arm")
+    engine = problem.engine
+    fit = refined(problem, converged(problem, replace(fit, active=("imu_lever_arm",))))
+    free = problem.free(fit.active)
+    _, _, quadratic = linearise(problem, fit)
     names = [f.name for f in free]
     std = dict(zip(names, np.sqrt(np.diag(quadratic.covariance(names))), strict=True))
 
     def cost(name: str, change: float) -> float:
-        values = {**state.values, name: state.values[name] + change * std[name]}
-        return objective(engine.filter(values, state.noise), free, values)
+        values = {**fit.values, name: fit.values[name] + change * std[name]}
+        return objective(engine.filter(values, fit.noise), free, values)
 
-    for name in search.candidate_names("imu_lever_arm"):
+    for name in problem.acting_names("imu_lever_arm"):
         slope = (cost(name, 0.5) - cost(name, -0.5)) / 1.0  # nats per standard deviation
         assert abs(slope) < 0.35, name
 
     def profile(name: str, change: float) -> float:
-        there = {name: state.values[name] + change}
-        moved = search.moved(state, quadratic, state.active, there).values
-        return objective(engine.filter(moved, state.noise), free, moved)
+        there = {name: fit.values[name] + change}
+        moved = at_optimum(problem, fit, quadratic, fit.active, there).values
+        return objective(engine.filter(moved, fit.noise), free, moved)
 
-    for name in search.candidate_names("imu_lever_arm"):
-        own = state.wider[name] * std[name]
+    for name in problem.acting_names("imu_lever_arm"):
+        own = fit.std_ratio[name] * std[name]
         risen = profile(name, own) + profile(name, -own) - 2.0 * profile(name, 0.0)
         assert risen == pytest.approx(1.0, rel=0.05), name  # half a nat either way
 
 
 @pytest.mark.slow
-def test_what_the_quadratic_nearly_carries_is_fitted_to_see(tmp_path, monkeypatch):
-    """A damping in gusts is worth more than its slope at nothing promised: found all the same."""
+def test_what_the_quadratic_nearly_carries_is_fitted_as_a_trial(tmp_path):
+    """A damping in gusts is worth more than its slope at nothing predicted: found all the same."""
     folder = injector.fly(
         tmp_path / "flight", {"axial_damping": 0.055}, gusts=True, sensors="onboard",
         runs=("heave_3211", "climb_descend"), seed=1,
     )  # fmt: skip
-    search, bare = search_of(folder, "axial_damping")
-    bare = search.settle(search.refit_noise(search.settle(bare)))
-    _, quadratic = search.linearise(bare)
-    promised = search.score(quadratic, [], "axial_damping")[0]
-    full = search.settle(search.moved(bare, quadratic, ["axial_damping"], {}))
-    occam = quadratic.occam(["axial_damping.coefficient"], search.free_names([]))
+    problem, bare = problem_of(folder, "axial_damping")
+    bare = fitted(problem, noise_fitted(problem, fitted(problem, bare)))
+    bare, _, quadratic = linearise(problem, bare)
+    predicted = score(problem, quadratic, (), "axial_damping").nats
+    full = fitted(problem, at_optimum(problem, bare, quadratic, ("axial_damping",), {}))
+    occam = quadratic.occam(["axial_damping.coefficient"], problem.free_names([]))
     worth = bare.objective - full.objective - occam
-    assert worth > promised + 0.5
+    assert worth > predicted + 0.5
 
-    def found(threshold: float) -> list[str]:
-        monkeypatch.setattr("coax_env.diagnosis.search.EVIDENCE", threshold)
-        return search.run(replace(bare, active=[]))[0].active
+    def found(threshold: float) -> tuple[str, ...]:
+        settings = replace(SETTINGS, evidence=threshold)
+        return search(replace(problem, settings=settings), bare)[0].active
 
-    assert found(0.5 * (promised + worth)) == ["axial_damping"]
-    assert found(1.05 * worth) == []
+    assert found(0.5 * (predicted + worth)) == ("axial_damping",)
+    assert found(1.05 * worth) == ()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hidden", [0.1, 0.0])
-def test_a_damping_promises_what_the_likelihood_says(tmp_path, hidden):
+def test_the_predicted_gain_of_a_damping_is_what_the_likelihood_says(tmp_path, hidden):
     """Nearer to what the fit finds than the quadratic, which holds the gains still; never more."""
     folder = injector.fly(
         tmp_path / "flight", {"axial_damping": hidden} if hidden else {}, gusts=True,
         runs=("heave_3211", "climb_descend"), seed=3,
     )  # fmt: skip
-    search, bare = search_of(folder, "axial_damping")
-    bare = search.settle(search.refit_noise(search.settle(bare)), 4, 0.1)
-    _, quadratic = search.linearise(bare)
-    held = search.score(quadratic, [], "axial_damping")[0]
-    promised, at = search.promise(bare, quadratic, "axial_damping")
-    full = search.settle(search.moved(bare, quadratic, ["axial_damping"], at), 10, 0.02)
-    occam = quadratic.occam(["axial_damping.coefficient"], search.free_names([]))
+    problem, bare = problem_of(folder, "axial_damping")
+    bare = fitted(problem, noise_fitted(problem, fitted(problem, bare)), 4, 0.1)
+    bare, _, quadratic = linearise(problem, bare)
+    held = score(problem, quadratic, (), "axial_damping").nats
+    predicted, at = damping_gain(problem, bare, quadratic, "axial_damping")
+    full = at_optimum(problem, bare, quadratic, ("axial_damping",), at)
+    full = fitted(problem, full, 10, 0.02)
+    occam = quadratic.occam(["axial_damping.coefficient"], problem.free_names([]))
     worth = bare.objective - full.objective - occam
     if hidden:
-        assert held < promised < worth + 0.5
-        assert worth - promised < 0.7 * (worth - held)
+        assert held < predicted < worth + 0.5
+        assert worth - predicted < 0.7 * (worth - held)
     else:
-        assert promised < 0.0 and worth < 0.0
+        assert predicted < 0.0 and worth < 0.0
 
 
 # --- hidden effects ------------------------------------------------------------------------------
@@ -445,17 +452,16 @@ def test_hold_out_as_told(still):
     assert {run.name for run in result.replay_after} == {"lat_3211", "yaw_3211"}
 
 
-def test_the_held_out_runs_are_heard_in_the_end(still):
+def test_the_held_out_runs_are_taken_in_at_the_end(still):
     """What the vehicle file gets is what a fit on all runs finds, not that on the others alone."""
     model = HeliModel(LAMA)
     records = [record_of(run) for run in still.runs]
     noise = starting_noise(still, LAMA)
-    search = Search(Engine(model, records[:2]), model, ())
-    few = State([], search.begin(noise).values, noise)
-    search.settle(few, steps=6, tolerance=0.01)
-    _, quadratic = search.linearise(few)
-    values, covariance = diagnosis._with_held_out(search, few, quadratic, records[2:])
-    whole = Engine(model, records).fit(search.free([]), few.values, noise, 6, 0.01)
+    problem = Problem.of(model, records[:2])
+    few = Fit((), start(problem, noise).values, noise)
+    few, _, quadratic = linearise(problem, fitted(problem, few, steps=6, tolerance=0.01))
+    values, covariance = with_held_out(problem, few, quadratic, records[2:])
+    whole = Engine(model, records).fit(problem.free([]), few.values, noise, 6, 0.01)
     std = np.array(list(whole.std.values()))
     off = np.array([(values[n] - whole.values[n]) / whole.std[n] for n in whole.names])
     before = np.array([(few.values[n] - whole.values[n]) / whole.std[n] for n in whole.names])
@@ -471,16 +477,16 @@ def test_the_choice_of_the_hold_out_does_not_look_at_residuals(still, monkeypatc
     def chosen() -> list[str]:
         model = HeliModel(LAMA)
         records = [record_of(run) for run in still.runs]
-        fit, held = diagnosis._split(
-            model, records, starting_noise(still, LAMA), None, tuple(effects.CATALOGUE)
-        )
+        noise = starting_noise(still, LAMA)
+        candidates = tuple(effects.CATALOGUE)
+        fit, held = split(model, records, noise, None, candidates, SETTINGS)
         assert sorted(r.name for r in (*fit, *held)) == sorted(ON_AXES)
         return [r.name for r in held]
 
     def blind(engine: Engine, *arguments: Any) -> Any:
         passes, lin = looking(engine, *arguments)
         passes = [replace(run, innovations=np.nan * run.innovations) for run in passes]
-        return passes, replace(lin, slope=np.nan * lin.slope, stretches=np.nan * lin.stretches)
+        return passes, replace(lin, slope=np.nan * lin.slope, blocks=np.nan * lin.blocks)
 
     looking = Engine.linearise
     before = chosen()

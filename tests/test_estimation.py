@@ -16,15 +16,14 @@ from scipy.signal import lfilter
 from scipy.stats import binom, multivariate_normal
 
 from coax_env.estimation import kalman
-from coax_env.estimation.fit import (
+from coax_env.estimation.engine import (
     REFRESH,
     Engine,
     Estimate,
-    Linearised,
     RunPass,
-    bounded_solve,
-    newton_step,
 )
+from coax_env.estimation.noise_levels import fit_noise
+from coax_env.estimation.quadratic import Linearised, Quadratic, bounded_solve
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.estimation.whiteness import whiteness
 from coax_env.kernel.compilation import pointer
@@ -218,7 +217,7 @@ def test_the_clock_may_start_anywhere():
         engine = Engine(Pendulum(), [replace(record, t=record.t + start)])
         log_likelihood, by_noise, by_start = engine.noise_score(TRUTH, NOISE)
         _, lin = engine.linearise(TRUTH, NOISE, [prior("damping", 0.3)])
-        found.append((np.array(log_likelihood), by_noise, by_start, lin.slope, lin.stretches))
+        found.append((np.array(log_likelihood), by_noise, by_start, lin.slope, lin.blocks))
     for first, later in zip(*found, strict=True):
         np.testing.assert_allclose(first, later, rtol=1e-6, atol=1e-6)
 
@@ -446,7 +445,7 @@ def test_signatures_are_derivatives_of_the_mean_pass_with_the_gains_frozen():
         lin.slope[0], np.einsum("anm,nm->a", J, np.where(there, base, 0.0)), rtol=0.05, atol=1.0
     )
     np.testing.assert_allclose(lin.by_channel[0].sum(1), np.diag(lin.information[0]), rtol=1e-9)
-    np.testing.assert_allclose(lin.stretches.sum(0), lin.slope[0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(lin.blocks.sum(0), lin.slope[0], rtol=1e-9, atol=1e-9)
 
 
 def test_slope_is_the_gradient_of_the_likelihood():
@@ -552,7 +551,7 @@ def test_a_strong_prior_holds_and_a_bound_stops():
 def test_process_noise_level_is_found(level):
     truth = replace(NOISE, process={"torque": level})
     engine = Engine(Pendulum(), [swing(seed, n=1200, noise=truth) for seed in range(2)])
-    found = engine.fit_noise(TRUTH, NOISE, ["torque"])
+    found = fit_noise(engine, TRUTH, NOISE, ["torque"])
     assert found.process["torque"] == pytest.approx(level, rel=0.25)
     assert found.reading == NOISE.reading
 
@@ -561,7 +560,7 @@ def test_noise_level_stops_at_its_floor():
     still = replace(NOISE, process={"torque": 0.0})
     engine = Engine(Pendulum(), [swing(1, n=1200, noise=still)])
     floored = replace(NOISE, floor={"torque": 0.2})
-    found = engine.fit_noise(TRUTH, floored, ["torque"])
+    found = fit_noise(engine, TRUTH, floored, ["torque"])
     assert found.process["torque"] == pytest.approx(0.2, rel=0.01)
 
 
@@ -593,27 +592,27 @@ def test_bounded_solve_is_scipys():
         assert cost(x) <= cost(best) + 1e-9 * (1.0 + cost(best))
 
 
-def test_newton_step_promises_what_a_quadratic_gives():
+def test_a_newton_step_gains_what_the_quadratic_predicts():
     """One step of a linear-Gaussian parameter lands on the optimum."""
     engine = Engine(Pendulum(), [swing(1, n=600, values={**TRUTH, "bias": 0.1})])
     free = [prior("bias", 1.0)]
     passes, lin = engine.linearise(TRUTH, NOISE, free)
-    step, promised = newton_step(lin, free, TRUTH)
+    change, step = Quadratic.of(lin, free, TRUTH).best(["bias"])
     moved = {**TRUTH, "bias": float(step[0])}
     gained = engine.frozen_cost(passes, free, TRUTH, NOISE)
     gained -= engine.frozen_cost(passes, free, moved, NOISE)
-    assert gained == pytest.approx(promised, rel=1e-4)
+    assert gained == pytest.approx(-change, rel=1e-4)
     assert step[0] == pytest.approx(0.1, abs=0.02)
 
 
-def test_newton_step_weighs_the_data_against_the_prior():
+def test_a_newton_step_weighs_the_data_against_the_prior():
     """Two Gaussians: the optimum is their mean by precision, wherever the step starts."""
     information, slope, start = 4.0, 3.0, 2.5
     lin = Linearised(
         ("bias",), np.full((1, 1, 1), information), np.full((1, 1), slope), np.empty((1, 1, 1)),
         np.empty((1, 1)),
     )  # fmt: skip
-    step, promised = newton_step(lin, [prior("bias", 0.4, 1.0)], {"bias": start})
+    change, step = Quadratic.of(lin, [prior("bias", 0.4, 1.0)], {"bias": start}).best(["bias"])
     data, precision = start - slope / information, 0.4**-2
     best = (information * data + precision * 1.0) / (information + precision)
 
@@ -621,7 +620,7 @@ def test_newton_step_weighs_the_data_against_the_prior():
         return 0.5 * information * (bias - data) ** 2 + 0.5 * precision * (bias - 1.0) ** 2
 
     assert start + step[0] == pytest.approx(best)
-    assert promised == pytest.approx(cost(start) - cost(best))
+    assert change == pytest.approx(cost(best) - cost(start))
 
 
 # --- whiteness -----------------------------------------------------------------------------------

@@ -10,17 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coax_env.diagnosis.search import Search, State
+from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.errors import InputError
 from coax_env.estimation.state_space import Noise
 from coax_env.inspection.flight_check import (
     FlightCheck,
-    _channels,
     _next_step,
-    _sick,
-    _suspicions,
     check_flight,
 )
+from coax_env.inspection.readings import channel_checks, sensor_faults
+from coax_env.inspection.units_and_signs import unit_and_sign_faults
 from coax_env.logs.columns import draft_card, guesses
 from coax_env.logs.flight import Flight, read_flight, write_flight
 from coax_env.model.sensors import log_suite
@@ -53,7 +52,7 @@ def changed(flight: Flight, **factors: float) -> Flight:
 
 
 def suspicions(flight: Flight) -> str:
-    return "; ".join([*_suspicions(flight, LAMA), *_sick(_channels(flight))])
+    return "; ".join([*unit_and_sign_faults(flight, LAMA), *sensor_faults(channel_checks(flight))])
 
 
 # --- what is there --------------------------------------------------------------------------------
@@ -130,11 +129,11 @@ def test_what_is_not_excited_stays_hidden():
 def test_more_flight_tells_more(monkeypatch):
     """Information adds up: the same run twice tells twice as much, where no noise level is fitted."""
 
-    def as_given(search: Search, noise: Noise) -> State:
-        off = {f.name: f.value for f in search.all}
-        return State([], {**off, **search.model.bare_values, "gust_memory": 0.5}, noise)
+    def as_given(problem: Problem, noise: Noise) -> Fit:
+        off = {f.name: f.value for f in problem.parameters}
+        return Fit((), {**off, **problem.model.bare_values, "gust_memory": 0.5}, noise)
 
-    monkeypatch.setattr(Search, "begin", as_given)
+    monkeypatch.setattr("coax_env.inspection.learnable.start", as_given)
     run = flown("lon_3211").runs[0]
     noise = {s.name: s.noise for s in log_suite("onboard")}
     once, again = (

@@ -11,11 +11,11 @@ import pytest
 
 from coax_env import load_vehicle
 from coax_env.estimation.helicopter import (
-    BUFFET_LEVELS,
     FARTHEST,
     GUST_LEVELS,
     HELD,
     LEAST_READING_STD,
+    WHITE_LEVELS,
     HeliModel,
     record_of,
     sensor_std,
@@ -32,7 +32,7 @@ MODEL = HeliModel(LAMA)
 X = {name: i for i, (name, _) in enumerate(FULL_STATES)}
 LEVELS = {
     "force_xy": 0.2, "force_z": 0.3, "moment_xy": 4e-3, "moment_z": 5e-3, "memory": 0.8,
-    "buffet_xy": 0.02, "buffet_z": 0.03, "buffet_moment_xy": 4e-4, "buffet_moment_z": 5e-4,
+    "white_force_xy": 0.02, "white_force_z": 0.03, "white_moment_xy": 4e-4, "white_moment_z": 5e-4,
 }  # fmt: skip
 QUIET = dict.fromkeys(GUST_LEVELS, 0.0) | {"memory": 1.0}
 
@@ -51,10 +51,10 @@ def test_gust_states_are_stationary_at_their_levels():
     assert not first[:20].any()
 
 
-def test_buffet_is_white_force_over_mass_and_moment_over_inertia():
+def test_white_noise_is_white_force_over_mass_and_moment_over_inertia():
     """Newton: a white force of intensity b makes the velocity's variance grow by (b/m)^2 a second."""
     extra = MODEL.process_noise(Noise(LEVELS)) - MODEL.process_noise(
-        Noise({k: v for k, v in LEVELS.items() if k not in BUFFET_LEVELS})
+        Noise({k: v for k, v in LEVELS.items() if k not in WHITE_LEVELS})
     )
     v = LAMA.values()
     expected = np.zeros(26)
@@ -242,8 +242,8 @@ def test_gusts_start_small_and_end_at_a_floor_below():
         size = weight * (LAMA["arm_upper"].value if "moment" in name else 1.0)
         assert 1e-3 * size < noise.process[name] < 0.05 * size
         assert 5e-5 * size < noise.floor[name] < 0.2 * noise.process[name]
-    for gust, buffet in zip(GUST_LEVELS, BUFFET_LEVELS, strict=True):
-        assert noise.process[buffet] == noise.floor[buffet] < noise.floor[gust]
+    for gust, white in zip(GUST_LEVELS, WHITE_LEVELS, strict=True):
+        assert noise.process[white] == noise.floor[white] < noise.floor[gust]
 
 
 def test_record_of_puts_every_channel_in_its_column():

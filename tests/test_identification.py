@@ -54,7 +54,7 @@ def test_from_a_file_with_every_number_a_fifth_off(flight, factors):
 
 
 def _engine(flight):
-    from coax_env.estimation.fit import Engine
+    from coax_env.estimation.engine import Engine
     from coax_env.estimation.helicopter import record_of
 
     return Engine(HeliModel(LAMA), [record_of(run) for run in flight.runs])

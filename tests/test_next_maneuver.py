@@ -17,8 +17,9 @@ from coax_env.design.next_maneuver import (
     distance,
     write_flight_card,
 )
-from coax_env.diagnosis.search import Search, State
-from coax_env.estimation.fit import Engine
+from coax_env.diagnosis.fits import fitted
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
 from coax_env.estimation.state_space import Noise
 from coax_env.model.layout import CHANNELS
@@ -50,8 +51,8 @@ def tied_on_a_hover(
 ) -> tuple[list[Alternative], Noise, dict[str, float]]:
     """Both descriptions fitted to one windy hover, with what it told of their numbers."""
     flight = simulate(truth, maneuver("hover", duration=12.0), gusts=gusts, seed=3)
-    engine = Engine(MODEL, [record_of(run) for run in flight.runs])
-    search = Search(engine, MODEL, (*effects, *common))
+    records = [record_of(run) for run in flight.runs]
+    problem = Problem.of(MODEL, records, (*effects, *common))
     noise = replace(
         starting_noise(flight, LAMA),
         process=dict(
@@ -59,14 +60,14 @@ def tied_on_a_hover(
             moment_xy=gusts.moment_Nm[0], moment_z=gusts.moment_Nm[2], memory=gusts.memory_s,
         ),
     )  # fmt: skip
-    start = {f.name: f.value for f in search.all}
+    start = {f.name: f.value for f in problem.parameters}
     start |= {**MODEL.bare_values, "gust_memory": gusts.memory_s}
     found = []
     for effect in effects:
-        fitted = search.settle(State([*common, effect], dict(start), noise), steps=3)
-        free = search.free(fitted.active)
-        _, lin = engine.linearise(fitted.values, noise, free)
-        found.append(Alternative.of(effect, LAMA, free, fitted.values, lin.information.sum(0)))
+        fit = fitted(problem, Fit((*common, effect), start, noise), steps=3)
+        free = problem.free(fit.active)
+        _, lin = problem.engine.linearise(fit.values, noise, free)
+        found.append(Alternative.of(effect, LAMA, free, fit.values, lin.information.sum(0)))
     return found, noise, {c: RATES.get(c, 100.0) for c in flight.channels}
 
 

@@ -23,9 +23,9 @@ from study.plan import PlannedFlight
 
 from coax_env import load_vehicle, read_flight
 from coax_env.diagnosis import calibration
-from coax_env.diagnosis.search import EVIDENCE
+from coax_env.diagnosis.settings import SETTINGS
 from coax_env.errors import InputError
-from coax_env.estimation.fit import Engine
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
 from coax_env.model.effects import CATALOGUE
 
@@ -105,7 +105,7 @@ def row_of(flight: PlannedFlight, causes: list[dict[str, Any]], **more: Any) -> 
         "hidden": hidden,
         "values": {f"{e}.{p}": v for e, t in flight.effects.items() for p, v in t.items()},
         "comparable": {},
-        "expected": dict.fromkeys(hidden, 100.0 * EVIDENCE),
+        "expected": dict.fromkeys(hidden, 100.0 * SETTINGS.evidence),
         "methods": {"coax": {"verdict": "explained", "causes": named, "unexplained": []}},
         "gain": None,
         "strongest": {"evidence": 1.0, "effect": "wind"},
@@ -244,7 +244,7 @@ def test_groups_and_wrong_certainty() -> None:
 
 
 def test_an_effect_that_cannot_show_is_counted_apart() -> None:
-    faint = row_of(flight_with("wind", number=1), [], expected={"wind": 1.9 * EVIDENCE})
+    faint = row_of(flight_with("wind", number=1), [], expected={"wind": 1.9 * SETTINGS.evidence})
     unknown = row_of(flight_with("vibration", number=2), [], expected={"vibration": None})
     shown = row_of(flight_with("rotor_drag"), [{"effect": "rotor_drag"}])
     figures = {f.name: f for f in table.all_figures([faint, unknown, shown])}
@@ -289,7 +289,7 @@ def test_intervals_beside_what_cannot_be_seen_are_counted_apart() -> None:
             comparable={"swash_offset.lon": 0.0},
         )  # fmt: skip
 
-    sure, faint = 2.1 * EVIDENCE, 1.9 * EVIDENCE
+    sure, faint = 2.1 * SETTINGS.evidence, 1.9 * SETTINGS.evidence
     rows = [row(0, sure, 1.0), row(1, sure, 1.9), row(2, sure, 2.1), row(3, faint, 9.0)]
     figure = next(f for f in table.all_figures(rows) if "cover, in gusts" in f.name)
     assert (figure.good, figure.count) == (2, 3)
@@ -311,7 +311,7 @@ def test_effects_that_cannot_show_are_left_off(
     def expected(planned: PlannedFlight, *_: Any) -> dict[str, float]:
         carried = 4.0 if "rotor_drag" in planned.effects else 0.0
         worth = {"wind": carried, "rotor_drag": 2.9, "gyro_bias": 3.1}
-        return {e: EVIDENCE * worth[e] for e in planned.effects}
+        return {e: SETTINGS.evidence * worth[e] for e in planned.effects}
 
     monkeypatch.setattr(one_flight, "hide", fly)
     monkeypatch.setattr(one_flight, "read_flight", lambda folder: None)
@@ -374,8 +374,8 @@ def test_a_calibration_says_what_made_it() -> None:
 
 
 def test_the_threshold_in_use_is_calibrated() -> None:
-    """Change EVIDENCE and this asks for `study_diagnosis.py --calibrate --adopt`."""
-    rate = calibration.false_alarm_rate(EVIDENCE)
+    """Change SETTINGS.evidence and this asks for `study_diagnosis.py --calibrate --adopt`."""
+    rate = calibration.false_alarm_rate(SETTINGS.evidence)
     assert rate is not None and rate <= 0.02
 
 
@@ -392,14 +392,14 @@ def test_an_adopted_calibration_is_void_for_another_threshold(
     kept = tmp_path / "package" / "calibration.json"
     kept.parent.mkdir()
     monkeypatch.setattr(calibration, "PATH", kept)
-    assert calibration.false_alarm_rate(EVIDENCE) is None
+    assert calibration.false_alarm_rate(SETTINGS.evidence) is None
     with pytest.raises(InputError, match="takes 20 clean flights"):
         study("--calibrate", "--adopt")
     monkeypatch.setitem(study_diagnosis.QUICK, "clean", 24)
     study("--calibrate", "--adopt")
-    rate = calibration.false_alarm_rate(EVIDENCE)
+    rate = calibration.false_alarm_rate(SETTINGS.evidence)
     assert rate is not None and 0.0 <= rate <= 1.0
-    assert calibration.false_alarm_rate(EVIDENCE + 1.0) is None
+    assert calibration.false_alarm_rate(SETTINGS.evidence + 1.0) is None
 
 
 # --- the baselines -----------------------------------------------------------------------------------

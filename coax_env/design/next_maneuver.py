@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 
 from coax_env.errors import InputError
-from coax_env.estimation.fit import Engine, bounded_solve
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.quadratic import bounded_solve
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.files import write_text
 from coax_env.logs.flight import Flight, Run, write_flight

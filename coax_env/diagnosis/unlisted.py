@@ -16,14 +16,16 @@ A term is a description with a value in prediction, not a cause.
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.search import EVIDENCE, Search, State
-from coax_env.estimation.fit import RunPass
+from coax_env.diagnosis.fits import fitted, linearise, noise_fitted
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.search import search
+from coax_env.estimation.engine import RunPass
 from coax_env.estimation.helicopter import FARTHEST
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
@@ -33,7 +35,7 @@ from coax_env.model import dynamics, effects
 from coax_env.model.generic_terms import AXES, SMALLEST, TERMS, Term, term_value
 from coax_env.model.layout import CHANNELS, GUSTS, N_CHANNELS
 
-SPOKEN_FOR = {
+CHANNELS_OF = {
     "unlisted_X": ("ax", ("ax",)),
     "unlisted_Y": ("ay", ("ay",)),
     "unlisted_Z": ("az", ("az", "h", "vd")),
@@ -41,21 +43,7 @@ SPOKEN_FOR = {
     "unlisted_M": ("q", ("q", "theta")),
     "unlisted_N": ("r", ("r", "psi")),
 }
-"""Channel under which an axis is reported, and the channels it speaks for."""
-TERM_EVIDENCE = 2.0 * EVIDENCE
-"""Nats a term must be worth: more than an effect, since there are ten times as many to choose from."""
-HIDDEN_EVIDENCE = 2.0 * TERM_EVIDENCE
-"""The same on an axis whose innovations are white. On a clean gusty flight of eight runs the best of
-all terms on all axes reached 4 nats, a moment a sin(3 psi) with a rms of the gusts' own 155."""
-SCREENED = 10  # candidates of an axis that are looked at by their signatures
-MOST_TERMS = 4  # taken in all
-MOST_FAILURES = 3  # that do not hold before the search gives up
-SHARE = 0.4
-"""Share of an axis' estimated disturbance that a term must follow: less is told apart from nothing.
-
-On real flights everything is a little coloured, and some term is always worth a few nats.
-"""
-PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.001)  # of a black box' terms, in usual sizes
+"""Channel under which an axis is reported, and all channels in which a load on it shows."""
 SETTLING = 1.0  # s at the start of each run that are not screened
 
 Candidate = tuple[str, tuple[Term, ...]]
@@ -76,23 +64,23 @@ def _evaluate(states: np.ndarray, inputs: np.ndarray, p: np.ndarray, out: np.nda
 
 
 @dataclass
-class Along:
+class TermHistory:
     """The terms along the filtered flight: values (n, terms) and gust estimates (n, 6)."""
 
     values: np.ndarray
     gusts: np.ndarray
 
     @classmethod
-    def of(cls, search: Search, state: State, passes: Sequence[RunPass]) -> "Along":
+    def of(cls, problem: Problem, fit: Fit, passes: Sequence[RunPass]) -> "TermHistory":
         """Evaluated at the filtered states, the first second of each run left out."""
-        p = search.model.vector(state.values)
+        p = problem.model.vector(fit.values)
         values, gusts = [], []
         for run in passes:
-            late = run.record.t > run.record.t[0] + SETTLING
-            table = np.empty((int(late.sum()), len(TERMS)))
-            _evaluate(run.states[late], run.inputs[late], p, table)
+            rows = run.record.t > run.record.t[0] + SETTLING
+            table = np.empty((int(rows.sum()), len(TERMS)))
+            _evaluate(run.states[rows], run.inputs[rows], p, table)
             values.append(table)
-            gusts.append(run.states[late, GUSTS])
+            gusts.append(run.states[rows, GUSTS])
         return cls(np.concatenate(values), np.concatenate(gusts))
 
     def columns(self, terms: Sequence[Term]) -> np.ndarray:
@@ -105,132 +93,150 @@ class Along:
 
 
 def explain(
-    search: Search, state: State, quadratic: Quadratic
-) -> tuple[State, Quadratic, list[Candidate]]:
+    problem: Problem, fit: Fit, quadratic: Quadratic
+) -> tuple[Problem, Fit, Quadratic, list[Candidate]]:
     """Add generic terms to the model for what the catalogue has left.
 
-    Returns the state with the terms in it (loose parameters of `search` from here on), its
-    quadratic, and what was added. Without a term that is worth it nothing changes.
+    Args:
+        problem, fit: after the search.
+        quadratic: linearised at the fit.
+
+    Returns:
+        the problem with the terms free, the fit with them, its quadratic, and what was added. Without
+        a term that is worth it nothing changes.
     """
+    chosen = problem.settings
     taken: list[Candidate] = []
     refused: set[Candidate] = set()
-    while len(taken) < MOST_TERMS and len(refused) < MOST_FAILURES:
-        passes = search.engine.filter(state.values, state.noise)
-        coloured = _coloured_axes(passes)
-        along = Along.of(search, state, passes)
-        known = {name(axis, t) for axis, terms in taken for t in terms} | set(
-            search.model.bare_values
-        )
-        screened = {
-            c: TERM_EVIDENCE if axis in coloured else HIDDEN_EVIDENCE
-            for axis in AXES
-            for c in _screen(along, axis, known)
-            if c not in refused
-        }
-        best = _best(search, state, screened)
+    while len(taken) < chosen.most_terms and len(refused) < chosen.most_failures:
+        best = _best(problem, fit, _screened(problem, fit, taken, refused))
         if best is None:
             break
-        trial = _with(search, state, best, screened[best])
+        candidate, needed = best
+        trial = _with(problem, fit, candidate, needed)
         if trial is None:
-            refused.add(best)
+            refused.add(candidate)
             continue
-        state = trial
-        taken.append(best)
-        search.say(f"no effect explains {SPOKEN_FOR[best[0]][0]}: added {_words(best)}")
+        problem, fit = trial
+        taken.append(candidate)
+        problem.report(
+            f"no effect explains {CHANNELS_OF[candidate[0]][0]}: added {_words(candidate)}"
+        )
     if not taken:
-        return state, quadratic, []
-    search.say("searching again beside the unlisted terms")
-    state, quadratic = search.run(state)
-    return *_prune(search, state, quadratic, taken), taken
+        return problem, fit, quadratic, []
+    problem.report("searching again beside the generic terms")
+    fit, quadratic = search(problem, fit)
+    return _pruned(problem, fit, quadratic, taken)
 
 
-def black_box(search: Search, refitted: State) -> State:
-    """Every term on every axis at once: what a flexible model without names makes of the fit runs.
-
-    Bayesian linear regression on the residual wrench (a Gaussian process whose kernel is these
-    terms), of the whitened innovations and not of reconstructed forces, so that what the pilot does
-    against a gust is not taken for its cause. On each axis the prior's width is that of largest
-    evidence. One Newton step: a wrench enters the innovations nearly linearly.
-    """
-    terms = [FreeParameter(f.name, 0.0, f.std) for axis in AXES for f in _parameters(axis, TERMS)]
-    names = [f.name for f in terms]
-    box = Search(search.engine, search.model, (), search.progress, levels=search.levels)
-    rest = [f.name for f in box.base]
-    box.loosen(terms)
-    state = replace(refitted, values={**refitted.values, **dict.fromkeys(names, 0.0)})
-    _, quadratic = box.linearise(state)
-
-    def with_widths(widths: Mapping[str, float]) -> Quadratic:
-        shrink = np.array([widths[f.name.partition(".")[0]] for f in terms])
-        precision = quadratic.precision.copy()
-        precision[quadratic.index(names)] /= shrink**2
-        return replace(quadratic, precision=precision)
-
-    def worth(widths: Mapping[str, float]) -> float:
-        narrow = with_widths(widths)
-        A = narrow.G + np.diag(narrow.precision)
-        slope = narrow.g + narrow.precision * (narrow.at - narrow.mean)
-        return 0.5 * float(slope @ np.linalg.solve(A, slope)) - narrow.occam(names, rest)
-
-    widths = dict.fromkeys(AXES, PRIOR_WIDTHS[-1])
-    for axis in (*AXES, *AXES):
-        tried = [widths | {axis: width} for width in PRIOR_WIDTHS]
-        widths = max(tried, key=worth)
-    return box.moved(state, with_widths(widths), [], {})
+def _screened(
+    problem: Problem, fit: Fit, taken: Sequence[Candidate], refused: Collection[Candidate]
+) -> dict[Candidate, float]:
+    """Candidates whose signatures are worth a look, and the evidence that each needs [nats]."""
+    chosen = problem.settings
+    passes = problem.engine.filter(fit.values, fit.noise)
+    coloured = _coloured_axes(passes)
+    history = TermHistory.of(problem, fit, passes)
+    known = {name(axis, t) for axis, terms in taken for t in terms} | set(problem.model.bare_values)
+    return {
+        c: chosen.term_evidence if axis in coloured else chosen.term_evidence_white
+        for axis in AXES
+        for c in _screen(problem, history, axis, known)
+        if c not in refused
+    }
 
 
 def entries(
-    search: Search,
-    state: State,
+    problem: Problem,
+    fit: Fit,
     quadratic: Quadratic,
     passes: Sequence[RunPass],
     taken: Sequence[Candidate],
 ) -> list[dict[str, Any]]:
-    """findings.json's `unexplained` for the axes with terms, the largest share first."""
+    """findings.json's `unexplained` for the axes with terms, the largest share first.
+
+    Args:
+        problem, fit: with the terms.
+        quadratic: linearised at the fit.
+        passes: of the filter at the fit.
+        taken: the terms.
+    """
     if not taken:
         return []
-    along = Along.of(search, state, passes)
-    found = []
-    for axis in dict.fromkeys(axis for axis, _ in taken):
-        terms = [t for a, group in taken if a == axis for t in group]
-        names = [name(axis, t) for t in terms]
-        values = np.array([state.values[n] for n in names])
-        std = np.array([standard_deviation(search, state, quadratic, n) for n in names])
-        rest, load = along.gust(axis), along.columns(terms) @ values
-        form = " + ".join(
-            f"({v:.3g} ± {s:.1g}) {t.form}" for v, s, t in zip(values, std, terms, strict=True)
-        )
-        found.append(
-            {
-                "channel": SPOKEN_FOR[axis][0],
-                "depends_on": list(dict.fromkeys(s for t in terms for s in t.follows)),
-                "share": round(max(0.0, 1.0 - float(np.var(rest) / np.var(rest + load))), 3),
-                "form": f"{form} [{AXES[axis][0]}]",
-            }
-        )
-    return sorted(found, key=lambda entry: -entry["share"])
+    history = TermHistory.of(problem, fit, passes)
+    return sorted(
+        (
+            _entry(
+                problem,
+                fit,
+                quadratic,
+                history,
+                axis,
+                [t for a, g in taken if a == axis for t in g],
+            )
+            for axis in dict.fromkeys(axis for axis, _ in taken)
+        ),
+        key=lambda entry: -entry["share"],
+    )
 
 
-def speaks_for(found: Sequence[dict[str, Any]]) -> set[str]:
-    """Channels whose colour these entries describe."""
-    families = dict(SPOKEN_FOR.values())
+def _entry(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    history: TermHistory,
+    axis: str,
+    terms: Sequence[Term],
+) -> dict[str, Any]:
+    names = [name(axis, t) for t in terms]
+    values = np.array([fit.values[n] for n in names])
+    std = [standard_deviation(problem, fit, quadratic, n) for n in names]
+    rest, load = history.gust(axis), history.columns(terms) @ values
+    form = " + ".join(
+        f"({v:.3g} ± {s:.1g}) {t.form}" for v, s, t in zip(values, std, terms, strict=True)
+    )
+    return {
+        "channel": CHANNELS_OF[axis][0],
+        "depends_on": list(dict.fromkeys(s for t in terms for s in t.follows)),
+        "share": round(max(0.0, 1.0 - float(np.var(rest) / np.var(rest + load))), 3),
+        "form": f"{form} [{AXES[axis][0]}]",
+    }
+
+
+def described_channels(found: Sequence[dict[str, Any]]) -> set[str]:
+    """Channels whose coloured innovations these entries describe."""
+    families = dict(CHANNELS_OF.values())
     return {c for entry in found for c in families[entry["channel"]]}
 
 
-def standard_deviation(search: Search, state: State, quadratic: Quadratic, one: str) -> float:
-    """Posterior std of a term's coefficient, coloured innovations counted as `colours` does."""
-    names = search.free_names(state.active)
+def standard_deviation(problem: Problem, fit: Fit, quadratic: Quadratic, one: str) -> float:
+    """Posterior std of a term's coefficient, with the variance inflation of its own direction.
+
+    Args:
+        problem, fit: with the term.
+        quadratic: linearised at the fit.
+        one: full name of the coefficient.
+    """
+    names = problem.free_names(fit.active)
     variance = quadratic.covariance(names)[names.index(one), names.index(one)]
-    return float(np.sqrt(variance * quadratic.colour([one], names)))
+    return float(np.sqrt(variance * quadratic.variance_inflation([one], names)))
 
 
-def colours(
-    search: Search, state: State, quadratic: Quadratic, taken: Sequence[Candidate]
+def inflations(
+    problem: Problem, fit: Fit, quadratic: Quadratic, taken: Sequence[Candidate]
 ) -> dict[str, float]:
-    """Colour of the innovations in the direction of each axis' terms, by axis."""
-    free = search.free_names(state.active)
+    """Variance inflation in the direction of each axis' terms, by axis.
+
+    Args:
+        problem, fit: with the terms.
+        quadratic: linearised at the fit.
+        taken: the terms.
+    """
+    free = problem.free_names(fit.active)
     return {
-        axis: quadratic.colour([name(a, t) for a, g in taken if a == axis for t in g], free)
+        axis: quadratic.variance_inflation(
+            [name(a, t) for a, g in taken if a == axis for t in g], free
+        )
         for axis in dict.fromkeys(axis for axis, _ in taken)
     }
 
@@ -243,7 +249,7 @@ def name(axis: str, term: Term) -> str:
 def excitations() -> list[FreeParameter]:
     """Terms that stand for the rest when runs are chosen: no effect needs the heading to turn."""
     turning = [term for term in TERMS if term.key in ("sin_psi", "sin_3psi")]
-    return _parameters("unlisted_M", turning)
+    return parameters("unlisted_M", turning)
 
 
 # --- the search -----------------------------------------------------------------------------------
@@ -251,22 +257,27 @@ def excitations() -> list[FreeParameter]:
 
 def _coloured_axes(passes: Sequence[RunPass]) -> list[str]:
     coloured = {c for c, w in whiteness(passes, CHANNELS).items() if not w.white}
-    return [axis for axis, (_, family) in SPOKEN_FOR.items() if coloured & set(family)]
+    return [axis for axis, (_, family) in CHANNELS_OF.items() if coloured & set(family)]
 
 
-def _screen(along: Along, axis: str, known: Collection[str]) -> list[Candidate]:
-    """The candidates of an axis that explain most of its gust estimates, and at least SHARE."""
-    gust = along.gust(axis)
+def _screen(
+    problem: Problem, history: TermHistory, axis: str, known: Collection[str]
+) -> list[Candidate]:
+    """The candidates of an axis that explain most of its gust estimates, and enough of them."""
+    gust = history.gust(axis)
     ranked = []
     for terms in (*SINGLES, *PAIRS):
         if any(name(axis, t) in known for t in terms):
             continue
-        columns = along.columns(terms)
+        columns = history.columns(terms)
         if np.all(columns.std(0) > 1e-9):
             share = _share(columns, gust)
-            if share >= SHARE:
+            if share >= problem.settings.term_share:
                 ranked.append((share, (axis, terms)))
-    return [candidate for _, candidate in sorted(ranked, key=lambda r: -r[0])[:SCREENED]]
+    return [
+        candidate
+        for _, candidate in sorted(ranked, key=lambda r: -r[0])[: problem.settings.terms_screened]
+    ]
 
 
 def _share(columns: np.ndarray, y: np.ndarray) -> float:
@@ -276,78 +287,75 @@ def _share(columns: np.ndarray, y: np.ndarray) -> float:
     return 1.0 - float(np.var(left) / max(np.var(y), 1e-30))
 
 
-def _best(search: Search, state: State, needed: Mapping[Candidate, float]) -> Candidate | None:
-    """The candidate whose signature is worth most beyond the evidence it needs, if any is."""
+def _best(
+    problem: Problem, fit: Fit, needed: Mapping[Candidate, float]
+) -> tuple[Candidate, float] | None:
+    """The candidate whose signature gains most beyond the evidence it needs, if any does."""
     if not needed:
         return None
-    own = {f.name: f for axis, terms in needed for f in _parameters(axis, terms)}
-    rest = search.free_names(state.active)
-    search.loosen(list(own.values()))
-    _, quadratic = search.linearise(
-        replace(state, values={**state.values, **dict.fromkeys(own, 0.0)})
-    )
-    search.tighten(own)
+    own = {f.name: f for axis, terms in needed for f in parameters(axis, terms)}
+    rest = problem.free_names(fit.active)
+    _, _, quadratic = linearise(problem.with_free(own.values()), fit.at(dict.fromkeys(own, 0.0)))
     now, _ = quadratic.best(rest)
     ranked = []
     for axis, terms in needed:
         names = [name(axis, t) for t in terms]
         then, _ = quadratic.best(rest + names)
-        worth = now - then - quadratic.occam(names, rest)
-        ranked.append((worth - needed[axis, terms], (axis, terms)))
+        gain = now - then - quadratic.occam(names, rest)
+        ranked.append((gain - needed[axis, terms], (axis, terms)))
     margin, best = max(ranked, key=lambda r: r[0])
-    return best if margin > 0.0 else None
+    return (best, needed[best]) if margin > 0.0 else None
 
 
-def _with(search: Search, state: State, candidate: Candidate, needed: float) -> State | None:
-    """The state with a candidate in it, refitted; None where it does not hold or is too small.
-
-    The terms stay loose in `search` only where they hold.
-    """
-    own = _parameters(*candidate)
+def _with(
+    problem: Problem, fit: Fit, candidate: Candidate, needed: float
+) -> tuple[Problem, Fit] | None:
+    """Problem and fit with a candidate's terms free; None where they do not hold or are too small."""
+    own = parameters(*candidate)
     names = [f.name for f in own]
-    search.loosen(own)
-    values = {**state.values, **dict.fromkeys(names, 0.0)}
-    trial = search.refit_noise(search.settle(replace(state, values=values), steps=1))
-    trial = search.settle(trial, steps=1)
-    passes, quadratic = search.linearise(trial)
-    free = search.free_names(trial.active)
-    worth = (state.objective - trial.objective) / quadratic.colour(names, free)
-    worth -= quadratic.occam(names, [n for n in free if n not in names])
-    if worth > needed and _matters(Along.of(search, trial, passes), candidate, trial.values):
-        search.history.append((f"+ {_words(candidate)}", worth))
-        return trial
-    search.tighten(names)
+    wider = problem.with_free(own)
+    trial = fitted(wider, fit.at(dict.fromkeys(names, 0.0)), steps=1)
+    trial = fitted(wider, noise_fitted(wider, trial), steps=1)
+    trial, passes, quadratic = linearise(wider, trial)
+    free = wider.free_names(trial.active)
+    gain = (fit.objective - trial.objective) / quadratic.variance_inflation(names, free)
+    gain -= quadratic.occam(names, [n for n in free if n not in names])
+    history = TermHistory.of(wider, trial, passes)
+    if gain > needed and _matters(history, candidate, trial.values):
+        return wider, trial.noted(f"+ {_words(candidate)}", gain)
     return None
 
 
-def _matters(along: Along, candidate: Candidate, values: dict[str, float]) -> bool:
+def _matters(history: TermHistory, candidate: Candidate, values: Mapping[str, float]) -> bool:
     axis, terms = candidate
-    load = along.columns(terms) @ [values[name(axis, t)] for t in terms]
+    load = history.columns(terms) @ [values[name(axis, t)] for t in terms]
     return float(load.std()) > SMALLEST[AXES[axis][0]]
 
 
-def _prune(
-    search: Search, state: State, quadratic: Quadratic, taken: list[Candidate]
-) -> tuple[State, Quadratic]:
-    """Take out of `taken`, in place, what the causes found beside it have made worthless."""
-    for candidate in list(taken):
+def _pruned(
+    problem: Problem, fit: Fit, quadratic: Quadratic, taken: Sequence[Candidate]
+) -> tuple[Problem, Fit, Quadratic, list[Candidate]]:
+    """Without the terms that the causes found beside them have made worthless."""
+    kept = list(taken)
+    for candidate in taken:
         names = [name(candidate[0], t) for t in candidate[1]]
-        free = search.free_names(state.active)
+        free = problem.free_names(fit.active)
         rest = [n for n in free if n not in names]
         now, _ = quadratic.best(free)
         then, _ = quadratic.best(rest, dict.fromkeys(names, 0.0))
-        worth = (then - now) / quadratic.colour(names, free) - quadratic.occam(names, rest)
-        if worth < TERM_EVIDENCE:
-            search.say(f"dropped {_words(candidate)}: worth {worth:.1f} nats")
-            taken.remove(candidate)
-            search.tighten(names)
-            state.values |= dict.fromkeys(names, 0.0)
-            state = search.refit_noise(search.settle(state))
-            _, quadratic = search.linearise(state)
-    return state, quadratic
+        gain = (then - now) / quadratic.variance_inflation(names, free)
+        gain -= quadratic.occam(names, rest)
+        if gain < problem.settings.term_evidence:
+            problem.report(f"dropped {_words(candidate)}: worth {gain:.1f} nats")
+            kept.remove(candidate)
+            problem = problem.with_fixed(names)
+            fit = fitted(problem, fit.at(dict.fromkeys(names, 0.0)))
+            fit, _, quadratic = linearise(problem, noise_fitted(problem, fit))
+    return problem, fit, quadratic, kept
 
 
-def _parameters(axis: str, terms: Sequence[Term]) -> list[FreeParameter]:
+def parameters(axis: str, terms: Sequence[Term]) -> list[FreeParameter]:
+    """Coefficients of terms on an axis under their priors."""
     known = dict(zip(effects.GROUPS[axis].names(), effects.GROUPS[axis].parameters, strict=True))
     return [
         FreeParameter(full, 0.0, p.usual, -FARTHEST * p.usual, FARTHEST * p.usual)

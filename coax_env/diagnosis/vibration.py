@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coax_env.diagnosis.search import EVIDENCE
+from coax_env.diagnosis.settings import SETTINGS
 from coax_env.logs.flight import Flight, Run
 from coax_env.model.effects import CATALOGUE
 from coax_env.model.vehicle import Vehicle
@@ -54,7 +54,7 @@ def find(flight: Flight) -> Line | None:
     """The line at one of the two rotor speeds, where the flight has one that matters."""
     lines = [line for rotor in ROTORS if (line := _line(flight, rotor))]
     smallest = CATALOGUE["vibration"].parameters[0].smallest
-    lines = [x for x in lines if x.evidence > EVIDENCE and x.amplitude > smallest]
+    lines = [x for x in lines if x.evidence > SETTINGS.evidence and x.amplitude > smallest]
     return max(lines, key=lambda x: x.evidence, default=None)
 
 

@@ -34,8 +34,8 @@ UNUSUAL = 2.5
 GUST_LEVELS = ("force_xy", "force_z", "moment_xy", "moment_z")
 """Std of the gust states [N, N m]; x and y share one level."""
 
-BUFFET_LEVELS = ("buffet_xy", "buffet_z", "buffet_moment_xy", "buffet_moment_z")
-"""Intensity of what shakes too fast to have a memory [N s^1/2, N m s^1/2]: white force and moment.
+WHITE_LEVELS = ("white_force_xy", "white_force_z", "white_moment_xy", "white_moment_z")
+"""Intensity of the white process noise [N s^1/2, N m s^1/2]: force and moment without a memory.
 
 Without it, real flights buy damping that is not there: a damped rate driven by a gust with memory is
 how a likelihood with nothing else at hand writes a rate driven by white noise, and the gust states
@@ -57,7 +57,7 @@ LEAST_READING_STD = {
 """Where the card states no noise, readings are not believed more than this.
 
 A motion capture is far finer than any rigid-body model (vibration, jitter of the time stamps): with
-its true noise the likelihood would be spent on what no parameter can mend.
+its true noise the likelihood would be spent on what no parameter can correct.
 """
 
 
@@ -67,8 +67,8 @@ MEASURE = types.void(_A, _A, _A, _A, _A)
 
 
 @compiled()
-def _heed(u: Any, p: Any, x: Any) -> None:
-    """Correct a state (26,) in place by the news of the commands, u[5:9]; see closed_loop.py."""
+def _take_in_innovations(u: Any, p: Any, x: Any) -> None:
+    """Correct a state (26,) in place by the input innovations u[5:9]; see input_innovations.py."""
     if u.size == N_INPUTS:
         return
     gain = p[P.COMMAND_GAIN : P.N_FIXED]
@@ -88,10 +88,10 @@ def _heed(u: Any, p: Any, x: Any) -> None:
 
 @pointer(STEP)
 def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """`dynamics.step` after what the commands tell, in the engine's form."""
+    """`dynamics.step` after the input innovations are taken in, in the engine's form."""
     for i in range(N_FULL):
         out[i] = x[i]
-    _heed(u, p, out)
+    _take_in_innovations(u, p, out)
     dynamics.step(out, u, dt, p, work, out)
 
 
@@ -103,9 +103,9 @@ def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
 
 @pointer(STEP)
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """`dynamics.drift_and_readings` and what the commands tell, in the engine's form."""
+    """`dynamics.drift_and_readings` and the input innovations, in the engine's form."""
     dynamics.drift_and_readings(x, u, dt, p, work, out)
-    _heed(u, p, out)
+    _take_in_innovations(u, p, out)
 
 
 class HeliModel:
@@ -135,15 +135,17 @@ class HeliModel:
         return vector
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
-        """Commands and time since the run's start, (n, 5); and the commands' news, (n, 9)."""
+        """Commands and time since the run's start, (n, 5), or with input innovations, (n, 9)."""
         u = np.empty((record.t.size, N_INPUTS))
         u[:, :TIME] = record.command
         u[:, TIME] = record.t - record.origin
         delay = vector[_DELAY]
         if delay > 0.0:
             for column in (2, 3):
-                u[:, column] = _mean_of_late(record.t, record.command[:, column], delay)
-        return u if record.news is None else np.hstack([u, record.news])
+                u[:, column] = _delayed_mean(record.t, record.command[:, column], delay)
+        if record.input_innovations is None:
+            return u
+        return np.hstack([u, record.input_innovations])
 
     def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """First state from the medians of the first half second, with a wide covariance."""
@@ -190,11 +192,11 @@ class HeliModel:
         level = noise.process
         p = self.vehicle
         mass = p["mass"].value
-        q[0:2] += (level.get("buffet_xy", 0.0) / mass) ** 2
-        q[2] += (level.get("buffet_z", 0.0) / mass) ** 2
-        q[3] += (level.get("buffet_moment_xy", 0.0) / p["inertia_xx"].value) ** 2
-        q[4] += (level.get("buffet_moment_xy", 0.0) / p["inertia_yy"].value) ** 2
-        q[5] += (level.get("buffet_moment_z", 0.0) / p["inertia_zz"].value) ** 2
+        q[0:2] += (level.get("white_force_xy", 0.0) / mass) ** 2
+        q[2] += (level.get("white_force_z", 0.0) / mass) ** 2
+        q[3] += (level.get("white_moment_xy", 0.0) / p["inertia_xx"].value) ** 2
+        q[4] += (level.get("white_moment_xy", 0.0) / p["inertia_yy"].value) ** 2
+        q[5] += (level.get("white_moment_z", 0.0) / p["inertia_zz"].value) ** 2
         q[20:26] = 2.0 * _gust_levels(noise) ** 2 / noise.process["memory"]
         return q
 
@@ -242,7 +244,7 @@ def _gust_levels(noise: Noise) -> np.ndarray:
     )
 
 
-def _mean_of_late(t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
+def _delayed_mean(t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
     """Mean over each row's interval of a held command that arrives late."""
     area = np.concatenate([[0.0], np.cumsum(command[:-1] * np.diff(t))])
 
@@ -284,9 +286,9 @@ def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
         "moment_xy": 3e-4 * weight * arm,
         "moment_z": 1e-4 * weight * arm,
     }
-    for gust, buffet in zip(GUST_LEVELS, BUFFET_LEVELS, strict=True):
-        floor[buffet] = 0.1 * floor[gust]
-        process[buffet] = 0.1 * floor[gust]
+    for gust, white in zip(GUST_LEVELS, WHITE_LEVELS, strict=True):
+        floor[white] = 0.1 * floor[gust]
+        process[white] = 0.1 * floor[gust]
     shake = vehicle.values().get("vibration.amplitude", 0.0) / np.sqrt(2.0)
     reading = {
         c: float(np.hypot(flight.noise[c], shake if c in ("ax", "ay", "az") else 0.0))

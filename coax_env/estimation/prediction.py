@@ -7,7 +7,7 @@ the end itself, its last one within the final TAIL seconds is used, at its own t
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.estimation import kalman
-from coax_env.estimation.fit import Engine, Progress
+from coax_env.estimation.engine import Engine, Progress, RunPass
 from coax_env.estimation.helicopter import (
     GUST_LEVELS,
     HeliModel,
@@ -23,6 +23,7 @@ from coax_env.estimation.helicopter import (
     sensor_std,
     starting_noise,
 )
+from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import Noise
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.layout import CHANNEL_UNITS, CHANNELS, GUSTS, N_FULL
@@ -77,6 +78,8 @@ def fly_again(
     result = []
     for run, dt in zip(passes, engine.intervals, strict=True):
         record = run.record
+        # open loop: what a command shows of the state is no part of the prediction
+        inputs = engine.model.inputs(replace(record, input_innovations=None), p)
         present = np.isfinite(record.z)
         used = [i for i in range(len(CHANNELS)) if present[:, i].any()]
         rows = run.start_rows
@@ -92,7 +95,7 @@ def fly_again(
                 x = run.states[first].copy()
                 x[GUSTS] *= gust
                 ok = kalman.fly_open_loop(
-                    engine.model.step, engine.model.measure, dt, run.inputs, x, p,
+                    engine.model.step, engine.model.measure, dt, inputs, x, p,
                     engine.model.work_size, first, targets, out[s],
                 )  # fmt: skip
                 diverged |= not ok
@@ -108,7 +111,7 @@ def fly_again(
             if np.isfinite(turn):
                 measured[s, HEADING] += turn
             if floor and not diverged and s % 4 == 0:
-                variance[s] = _spread(engine, run, dt, p, first, targets, s)
+                variance[s] = _spread(engine, run, inputs, dt, p, first, targets, s)
         result.append(
             RunReplay(
                 record.name,
@@ -166,7 +169,8 @@ def _channel(
 
 def _spread(
     engine: Engine,
-    run: Any,
+    run: RunPass,
+    inputs: np.ndarray,
     dt: np.ndarray,
     p: np.ndarray,
     first: int,
@@ -182,7 +186,7 @@ def _spread(
 
     def fly(x: np.ndarray, out: np.ndarray) -> None:
         kalman.fly_open_loop(
-            engine.model.step, engine.model.measure, dt, run.inputs, x, p,
+            engine.model.step, engine.model.measure, dt, inputs, x, p,
             engine.model.work_size, first, targets, out,
         )  # fmt: skip
 
@@ -236,7 +240,7 @@ def replay(
     noise = starting_noise(flight, vehicle)
     if progress:
         progress("estimating gusts and noise")
-    noise = engine.fit_noise(model.bare_values, noise, GUST_LEVELS)
+    noise = fit_noise(engine, model.bare_values, noise, GUST_LEVELS)
     if progress:
         progress("flying again")
     runs = fly_again(engine, model.bare_values, noise, horizon)

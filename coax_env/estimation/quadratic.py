@@ -1,18 +1,48 @@
 """The log-posterior to second order in many parameters at once: scores and covariances."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import lsq_linear
 
-from coax_env.estimation.fit import Linearised, bounded_solve
 from coax_env.estimation.state_space import FreeParameter
 
 
 @dataclass(frozen=True)
+class Linearised:
+    """Likelihood to second order about a point, per run.
+
+    Attributes:
+        names: of the k parameters.
+        information: Gram matrices of the signatures, (runs, k, k).
+        slope: signatures times innovations, (runs, k).
+        by_channel: squared signatures summed per channel, (runs, k, m).
+        blocks: the slope again, by blocks of time, (blocks, k).
+    """
+
+    names: tuple[str, ...]
+    information: np.ndarray
+    slope: np.ndarray
+    by_channel: np.ndarray
+    blocks: np.ndarray
+
+
+@dataclass(frozen=True)
 class Quadratic:
-    """The objective to second order about `at`, over every parameter that might be free."""
+    """Minus the log-posterior to second order about `at`, over every parameter that might be free.
+
+    Attributes:
+        names: of the k parameters.
+        G: Gram matrix of the signatures, the information of the data, (k, k).
+        g: slope of minus the log-likelihood, (k,).
+        at: the point, (k,). mean, precision: of the independent normal priors, (k,).
+        lower, upper: bounds, (k,).
+        blocks: g by blocks of time, (blocks, k).
+        by_channel: squared signatures summed per channel, (k, m).
+    """
 
     names: tuple[str, ...]
     G: np.ndarray
@@ -22,12 +52,12 @@ class Quadratic:
     precision: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    stretches: np.ndarray
+    blocks: np.ndarray
     by_channel: np.ndarray
 
     @classmethod
     def of(
-        cls, lin: Linearised, free: Sequence[FreeParameter], values: dict[str, float]
+        cls, lin: Linearised, free: Sequence[FreeParameter], values: Mapping[str, float]
     ) -> "Quadratic":
         """The quadratic of a linearisation, summed over its runs."""
         return cls(
@@ -39,7 +69,7 @@ class Quadratic:
             np.array([1.0 / f.std**2 for f in free]),
             np.array([f.lower for f in free]),
             np.array([f.upper for f in free]),
-            lin.stretches,
+            lin.blocks,
             lin.by_channel.sum(0),
         )
 
@@ -47,29 +77,28 @@ class Quadratic:
         """Places of parameters."""
         return np.array([self.names.index(n) for n in names], dtype=int)
 
-    def best(
-        self, free: Collection[str], pinned: dict[str, float] | None = None
-    ) -> tuple[float, np.ndarray]:
-        """Least change of the objective with `free` loose and `pinned` moved to given values.
+    def moved(self, move: np.ndarray) -> dict[str, float]:
+        """Values of all parameters after a move (k,)."""
+        return dict(zip(self.names, (self.at + move).tolist(), strict=True))
 
-        Returns the change [nats] and the move of every parameter.
+    def best(
+        self, free: Collection[str], fixed: Mapping[str, float] | None = None
+    ) -> tuple[float, np.ndarray]:
+        """Least value of the quadratic with `free` free, `fixed` moved to given values, the rest held.
+
+        Returns:
+            the change of the objective [nats] and the move of every parameter (k,).
         """
         move = np.zeros(len(self.names))
-        pinned = pinned or {}
-        fixed = self.index(pinned.keys())
-        if fixed.size:
-            move[fixed] = np.array(list(pinned.values())) - self.at[fixed]
-        loose = self.index(free)
-        if loose.size:
-            A = self.G[np.ix_(loose, loose)] + np.diag(self.precision[loose])
-            b = -(
-                self.g[loose]
-                + self.G[loose] @ move
-                + self.precision[loose] * (self.at - self.mean)[loose]
-            )
-            move[loose] = bounded_solve(
-                A, b, (self.lower - self.at)[loose], (self.upper - self.at)[loose]
-            )
+        fixed = fixed or {}
+        given = self.index(fixed.keys())
+        if given.size:
+            move[given] = np.array(list(fixed.values())) - self.at[given]
+        i = self.index(free)
+        if i.size:
+            A = self.G[np.ix_(i, i)] + np.diag(self.precision[i])
+            b = -(self.g[i] + self.G[i] @ move + self.precision[i] * (self.at - self.mean)[i])
+            move[i] = bounded_solve(A, b, (self.lower - self.at)[i], (self.upper - self.at)[i])
         away = self.at - self.mean
         change = (
             0.5 * move @ self.G @ move
@@ -81,9 +110,9 @@ class Quadratic:
     def projected(
         self, own: Collection[str], rest: Collection[str]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Information of `own`, what `rest` could stand for taken out (priors on `rest`), (k, k).
+        """Information of `own` with `rest` projected out under its priors, (k, k).
 
-        And how `rest` answers each of `own`, (r, k).
+        And the regression of `own` on `rest`, (r, k).
         """
         c, r = self.index(own), self.index(rest)
         across = self.G[np.ix_(r, c)]
@@ -91,29 +120,26 @@ class Quadratic:
         return self.G[np.ix_(c, c)] - across.T @ weights, weights
 
     def covariance(self, free: Collection[str]) -> np.ndarray:
-        """Posterior covariance of the loose parameters, (k, k)."""
+        """Posterior covariance of the free parameters, (k, k)."""
         i = self.index(free)
         return np.linalg.inv(self.G[np.ix_(i, i)] + np.diag(self.precision[i]))
 
-    def colour(self, own: Collection[str], free: Collection[str]) -> float:
-        """How much more the slope of `own` scatters from stretch to stretch than white noise lets it.
+    def variance_inflation(self, own: Collection[str], free: Collection[str]) -> float:
+        """How much more the score of `own` scatters between blocks than white innovations allow.
 
-        At a fitted point the projected slopes of separate stretches are independent with covariance
-        equal to the information, where the innovations are white. What is above 1 is colour: the
-        evidence is that many times too large, the variance that many times too small (the sandwich
-        of Huber 1967, in the direction of one effect).
+        At a fitted point the projected scores of separate blocks are independent with covariance
+        equal to the information, where the innovations are white. What is above 1 comes of coloured
+        innovations: the evidence is that many times too large, the variance that many times too small
+        (the sandwich of Huber 1967, in the direction of one effect).
         """
         c = self.index(own)
         rest = [n for n in free if n not in set(own)]
         schur, weights = self.projected(own, rest)
-        scores = self.stretches[:, c] - self.stretches[:, self.index(rest)] @ weights
-        per_stretch = np.einsum(
-            "sc,sc->s", scores, np.linalg.lstsq(schur, scores.T, rcond=None)[0].T
-        )
-        kept = np.sort(per_stretch)[
-            : math.ceil(0.9 * per_stretch.size)
-        ]  # a bad second is no colour
-        value = kept.mean() * per_stretch.size / c.size
+        scores = self.blocks[:, c] - self.blocks[:, self.index(rest)] @ weights
+        per_block = np.einsum("sc,sc->s", scores, np.linalg.lstsq(schur, scores.T, rcond=None)[0].T)
+        # one bad second is no correlation: the largest tenth is left out
+        kept = np.sort(per_block)[: math.ceil(0.9 * per_block.size)]
+        value = kept.mean() * per_block.size / c.size
         return max(1.0, float(value)) if np.isfinite(value) else 1.0
 
     def occam(self, added: Collection[str], free: Collection[str]) -> float:
@@ -122,3 +148,23 @@ class Quadratic:
         posterior = self.projected(added, free)[0] + np.diag(precision)
         scaled = posterior / np.sqrt(np.outer(precision, precision))
         return 0.5 * float(np.linalg.slogdet(scaled)[1])
+
+
+def penalty(free: Sequence[FreeParameter], values: Mapping[str, float]) -> float:
+    """Half the squared distance to the priors, nats."""
+    return 0.5 * sum(((values[f.name] - f.value) / f.std) ** 2 for f in free)
+
+
+def bounded_solve(A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Minimise 1/2 x'A x - b'x within bounds (A positive definite), shape (k,).
+
+    Bounded least squares on the Cholesky factor, in units of A's diagonal (Stark and Parker 1995).
+    """
+    unit = 1.0 / np.sqrt(np.diag(A))
+    factor = cholesky(A * np.outer(unit, unit))
+    target = solve_triangular(factor, b * unit, trans="T")
+    x = solve_triangular(factor, target) * unit
+    if np.any(x < lower) or np.any(x > upper):
+        bounds = (np.minimum(lower, 0.0) / unit, np.maximum(upper, 0.0) / unit)
+        x = lsq_linear(factor, target, bounds, method="bvls", tol=1e-12).x * unit
+    return np.clip(x, lower, upper)

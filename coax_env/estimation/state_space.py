@@ -1,7 +1,7 @@
 """What the engine asks of a model, and the records it works on."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -31,7 +31,8 @@ class Record:
     t: (n,) seconds, increasing. command: (n, k), held from each row to the next.
     z: (n, m) readings in the order of the model's channels, NaN where there is no new sample.
     origin: time at which the run began, also where the record is a part of it.
-    news: (n, k) what each command gives away beyond the readings before it, or None (closed_loop.py).
+    input_innovations: (n, k) what each command shows beyond the readings before it, or None
+    (input_innovations.py).
     """
 
     name: str
@@ -39,7 +40,20 @@ class Record:
     command: np.ndarray
     z: np.ndarray
     origin: float = 0.0
-    news: np.ndarray | None = None
+    input_innovations: np.ndarray | None = None
+
+
+def part(record: Record, rows: np.ndarray) -> Record:
+    """Some rows of a record, its clock kept."""
+    return replace(
+        record,
+        t=record.t[rows],
+        command=record.command[rows],
+        z=record.z[rows],
+        input_innovations=None
+        if record.input_innovations is None
+        else record.input_innovations[rows],
+    )
 
 
 @dataclass(frozen=True)

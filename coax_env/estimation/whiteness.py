@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 from scipy.stats import chi2
 
-from coax_env.estimation.fit import RunPass
+from coax_env.estimation.engine import RunPass
 
 LAGS = 20
 SETTLING = 1.0  # s at the start of each run that are not counted

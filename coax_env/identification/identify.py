@@ -15,7 +15,7 @@ from typing import Literal, overload
 import numpy as np
 
 from coax_env.errors import InputError
-from coax_env.estimation.fit import Engine, Estimate, Linearised
+from coax_env.estimation.engine import Engine, Estimate
 from coax_env.estimation.fitted_vehicle import (
     double_counting,
     fitted_vehicle,
@@ -23,8 +23,9 @@ from coax_env.estimation.fitted_vehicle import (
     with_timing,
 )
 from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel, record_of, starting_noise
+from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import RunReplay, fly_again
-from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.whiteness import is_white
 from coax_env.identification.two_step.method import TwoStep, two_step
@@ -175,7 +176,7 @@ def identify(
     say("estimating gusts and noise")
     start = {f.name: f.value for f in free}
     bare = {**model.bare_values, **start}
-    first = engine.fit_noise(bare, starting_noise(flight, vehicle), GUST_LEVELS)
+    first = fit_noise(engine, bare, starting_noise(flight, vehicle), GUST_LEVELS)
     remarks = list(known)
     own = free
     free, estimate, noise, widened = _fitted(engine, own, bare, first, say)
@@ -195,8 +196,8 @@ def identify(
     _, lin = engine.linearise(values, noise, free)
     quadratic = Quadratic.of(lin, free, values)
     names = [f.name for f in free]
-    colour = np.array([quadratic.colour([name], names) for name in names])
-    covariance = estimate.covariance * np.sqrt(np.outer(colour, colour))
+    inflation = np.array([quadratic.variance_inflation([name], names) for name in names])
+    covariance = estimate.covariance * np.sqrt(np.outer(inflation, inflation))
     std = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     dt = median_step(engine.records)
     where = flight.path.name if flight.path else "flight"
@@ -222,7 +223,7 @@ def identify(
         fly_again(again, values, noise),
         tuple(remarks),
         *left_open(free, estimate.covariance),
-        _each_run(engine, free, lin, values, colour),
+        _each_run(engine, free, lin, values, inflation),
         widened,
     )
 
@@ -279,7 +280,7 @@ def _fitted(
             break
         else:
             best = estimate.objective
-        noise = engine.fit_noise(values, noise, GUST_LEVELS, 8, ENOUGH)
+        noise = fit_noise(engine, values, noise, GUST_LEVELS, 8, ENOUGH)
     return free, estimate, noise, widened
 
 
@@ -316,7 +317,7 @@ def _each_run(
     free: Sequence[FreeParameter],
     lin: Linearised,
     values: Mapping[str, float],
-    colour: np.ndarray,
+    inflation: np.ndarray,
 ) -> tuple[RunEstimate, ...]:
     """One Newton step of each run alone from the joint estimate, priors in."""
     names = [f.name for f in free]
@@ -328,9 +329,9 @@ def _each_run(
     for record, information, slope in zip(engine.records, lin.information, lin.slope, strict=True):
         alone = np.linalg.inv(information + np.diag(prior**-2.0))
         move = -alone @ (slope + pull)
-        spread = np.sqrt(np.diag(alone) * colour)
+        spread = np.sqrt(np.diag(alone) * inflation)
         # a run that is nearly all there is says what all say, up to how far the fit was taken
-        apart = np.sqrt(np.maximum(np.diag(alone - joint), 0.1 * np.diag(alone)) * colour)
+        apart = np.sqrt(np.maximum(np.diag(alone - joint), 0.1 * np.diag(alone)) * inflation)
         told = spread < 0.5 * prior
         found.append(
             RunEstimate(

@@ -69,7 +69,8 @@ COMMAND_GAINS = {
     "command_gain.speed_z": "m/s per rad/s",
     "command_gain.force_z": "N per rad/s",
 }
-"""How the filter's state answers what a command gives away (closed_loop.py); zero in a simulation."""
+"""Gains by which input innovations correct the filter's state (input_innovations.py); zero in a
+simulation."""
 COMMAND_GAIN = AIR_DOWN + 1
 
 N_FIXED = COMMAND_GAIN + len(COMMAND_GAINS)

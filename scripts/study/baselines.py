@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter, savgol_filter
 
-from coax_env.diagnosis.search import GLANCE, PROMISE
-from coax_env.estimation.fit import Engine, RunPass
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel, record_of, starting_noise
+from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.kernel.compilation import compiled
 from coax_env.logs.flight import Flight
@@ -86,7 +87,10 @@ def regression(flight: Flight) -> tuple[np.ndarray, np.ndarray, dict[str, list[i
     engine = Engine(model, [record_of(run) for run in flight.runs])
     noise = starting_noise(flight, vehicle)
     bare = {**model.bare_values, "gust_memory": noise.process["memory"]}
-    noise = engine.fit_noise(bare, noise, GUST_LEVELS, 10, tolerance=PROMISE, seconds=GLANCE)
+    noise = fit_noise(
+        engine, bare, noise, GUST_LEVELS, SETTINGS.first_noise_evaluations,
+        tolerance=SETTINGS.step_gain, seconds=SETTINGS.noise_fit_seconds,
+    )  # fmt: skip
     passes = engine.filter(bare, noise)
     free = [f for effect in CATALOGUE for f in model.effect_parameters(effect)]
     blocks, targets = [], []

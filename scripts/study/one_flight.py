@@ -14,10 +14,12 @@ from typing import Any
 import injector
 import numpy as np
 
-from coax_env.diagnosis.diagnose import HORIZON, Diagnosis, diagnose
+from coax_env.diagnosis.diagnose import Diagnosis, diagnose
+from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, start
 from coax_env.diagnosis.gain import gain_of
-from coax_env.diagnosis.search import EVIDENCE, Search, State
-from coax_env.estimation.fit import Engine
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
 from coax_env.estimation.prediction import fly_again
 from coax_env.estimation.quadratic import Quadratic
@@ -133,7 +135,7 @@ def showing(planned: PlannedFlight, place: Path) -> tuple[PlannedFlight, Path, d
         shown = {
             effect: sizes
             for effect, sizes in planned.effects.items()
-            if (expected[effect] or 0.0) > SURE * EVIDENCE
+            if (expected[effect] or 0.0) > SURE * SETTINGS.evidence
         }
         if len(shown) == len(planned.effects):
             return planned, folder, truth
@@ -179,25 +181,24 @@ def expected_evidence(
         levels["force_z"] /= heavier
         levels["moment_z"] /= 1.0 + values.get("yaw_inertia.scale", 0.0)
     noise = replace(noise, process=levels)
-    engine = Engine(model, _records(flight, held, within=False))
-    search = Search(engine, model, tuple(listed))
+    problem = Problem.of(model, _records(flight, held, within=False), listed)
     for effect in listed:
-        own = {name: 0.5 * values[name] for name in search.candidate_names(effect)}
+        own = {name: 0.5 * values[name] for name in problem.acting_names(effect)}
         at = {**model.bare_values, "gust_memory": levels["memory"], **values, **own}
-        _, quadratic = search.linearise(State(listed, at, noise))
-        result[effect] = _worth(search, quadratic, listed, effect, values)
+        _, _, quadratic = linearise(problem, Fit(tuple(listed), at, noise))
+        result[effect] = _worth(problem, quadratic, listed, effect, values)
     return result
 
 
 def _worth(
-    search: Search,
+    problem: Problem,
     quadratic: Quadratic,
     listed: Sequence[str],
     effect: str,
     values: Mapping[str, float],
 ) -> float:
-    own = search.candidate_names(effect)
-    rest = [n for n in search.free_names(listed) if not n.startswith(effect + ".")]
+    own = problem.acting_names(effect)
+    rest = [n for n in problem.free_names(listed) if not n.startswith(effect + ".")]
     S, _ = quadratic.projected(own, rest)
     theta = np.array([values[name] for name in own])
     return float(0.5 * theta @ S @ theta - quadratic.occam(own, rest))
@@ -207,25 +208,25 @@ def gain_of_the_truth(
     result: Diagnosis, hidden: list[str], values: Mapping[str, float], held: Collection[str]
 ) -> dict[str, Any]:
     """What the true structure removes on the same held-out runs, refitted on the same others."""
-    state, engine_held = forced(result.flight, hidden, values, held)
-    replayed = fly_again(engine_held, state.values, state.noise, HORIZON)
-    gain = gain_of(
-        result.replay_before, result.replay_refitted, replayed, result.noise, HORIZON
-    )  # fmt: skip
+    fit, engine_held = forced(result.flight, hidden, values, held)
+    horizon = SETTINGS.horizon
+    replayed = fly_again(engine_held, fit.values, fit.noise, horizon)
+    gain = gain_of(result.replay_before, result.replay_refitted, replayed, result.noise, horizon)
     return {key: gain[key] for key in ("error_removed_percent", "ci95")}
 
 
 def forced(
     flight: Flight, hidden: list[str], values: Mapping[str, float], held: Collection[str]
-) -> tuple[State, Engine]:
+) -> tuple[Fit, Engine]:
     """These effects fitted, from their true sizes on; and the engine of the held-out runs."""
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     model = HeliModel(vehicle)
-    search = Search(Engine(model, _records(flight, held, within=False)), model, tuple(hidden))
-    bare = search.begin(starting_noise(flight, vehicle))
-    state = State(hidden, {**bare.values, **catalogue_values(values)}, bare.noise)
-    state = search.settle(search.refit_noise(state))
-    return search.settle(search.refit_noise(state)), Engine(model, _records(flight, held, True))
+    problem = Problem.of(model, _records(flight, held, within=False), hidden)
+    fit = start(problem, starting_noise(flight, vehicle)).at(catalogue_values(values))
+    fit = replace(fit, active=tuple(hidden))
+    for _ in range(2):
+        fit = fitted(problem, noise_fitted(problem, fit))
+    return fit, Engine(model, _records(flight, held, True))
 
 
 def _records(flight: Flight, held: Collection[str], within: bool) -> list[Record]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.search import EVIDENCE
+from coax_env.diagnosis.settings import SETTINGS
 from coax_env.model.effects import CATALOGUE
 from coax_env.report import figures
 from study import judge
@@ -114,8 +114,8 @@ def _names(rows: Sequence[Row], method: str) -> list[Figure]:
 
 def _split(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
     """Rows whose effects were all expected to show, and the others."""
-    shown = [row for row in rows if judge.is_shown(row, EVIDENCE)]
-    return shown, [row for row in rows if not judge.is_shown(row, EVIDENCE)]
+    shown = [row for row in rows if judge.is_shown(row, SETTINGS.evidence)]
+    return shown, [row for row in rows if not judge.is_shown(row, SETTINGS.evidence)]
 
 
 def _anything_false(row: Row, method: str) -> bool:

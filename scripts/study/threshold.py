@@ -1,7 +1,6 @@
 """The evidence that a share of clean flights reaches: what the search's threshold is calibrated to.
 
-Each clean flight gives the evidence of the candidate that came nearest to being named (search.py,
-`Search.strongest`), all of them false. The tail above its upper quartile is taken as exponential,
+Each clean flight gives the evidence of the candidate that came nearest to being named (`Fit.strongest`), all of them false. The tail above its upper quartile is taken as exponential,
 which is what a likelihood ratio's tail is; the interval is a bootstrap's over flights.
 """
 
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.search import EVIDENCE
+from coax_env.diagnosis.settings import SETTINGS
 from study import judge
 from study.judge import Row
 
@@ -36,7 +35,7 @@ def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
     draws = [tail_quantile(rng.choice(evidence, evidence.size)) for _ in range(DRAWS)]
     low, high = np.nanpercentile(np.array(draws), [2.5, 97.5])
     alarms = sum(bool(judge.named(row)) for row in clean)
-    estimate = max(alarms / len(clean), share_beyond(evidence, EVIDENCE))
+    estimate = max(alarms / len(clean), share_beyond(evidence, SETTINGS.evidence))
     finite = np.sort(evidence[np.isfinite(evidence)])[::-1]
     return {
         "false_alarm_rate": round(max(estimate, FALSE_ALARMS), 4),  # less is not claimed
@@ -44,7 +43,7 @@ def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
         "threshold_nats_for_1_percent": _number(tail_quantile(evidence)),
         "ci95": [_number(low), _number(high)],
         "clean_flights": len(clean),
-        "threshold_used_nats": EVIDENCE,
+        "threshold_used_nats": SETTINGS.evidence,
         "false_alarms_at_it": alarms,
         "wilson95_at_it": list(judge.wilson(alarms, len(clean))),
         "largest_nats": [round(float(e), 2) for e in finite[:20]],

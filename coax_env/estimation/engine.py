@@ -1,4 +1,4 @@
-"""Fits on top of the passes: innovations, signatures, Gauss-Newton under priors, noise levels.
+"""Filter passes over records, and fits on top of them: signatures, Gauss-Newton under priors.
 
 One engine, three uses: every parameter fixed is the simulation check, base parameters free is
 identification, effects' parameters free is diagnosis.
@@ -9,21 +9,19 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import lsq_linear, minimize
 
 from coax_env.estimation import kalman
+from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
 
-GATE = 8.0  # sigmas
+GATE = 8.0  # std of an innovation
 REFRESH = 4  # rows between new Jacobians
-STRETCH = 2.0  # s
-STEP_OF_LOG = 1e-3  # of a noise level, for the slopes of the model's variances
-HUGE = 1e6  # whitened innovations that only a diverging mean has
+BLOCK = 2.0  # s of the blocks whose scores are taken as independent
+DIVERGED = 1e6  # whitened innovations [std] that only a diverging mean has
 Progress = Callable[[str], None]
 
 
@@ -51,8 +49,8 @@ class RunPass:
 
 
 @dataclass(frozen=True)
-class Along:
-    """What a filter pass linearised the model at.
+class PassJacobians:
+    """What a filter pass linearised the model at, for the signature and score passes.
 
     F: (<= n, nx, nx) Jacobians of the step, F_of: (n,) which of them a row has. predicted: (n, nx)
     states before each row's readings.
@@ -61,22 +59,6 @@ class Along:
     F: np.ndarray
     F_of: np.ndarray
     predicted: np.ndarray
-
-
-@dataclass(frozen=True)
-class Linearised:
-    """Likelihood to second order about a point, per run.
-
-    information: (runs, k, k) Gram matrices of the signatures. slope: (runs, k) signatures times
-    innovations. by_channel: (runs, k, m) squared signatures summed per channel. stretches: (s, k) the
-    slope again, by stretches of STRETCH seconds.
-    """
-
-    names: tuple[str, ...]
-    information: np.ndarray
-    slope: np.ndarray
-    by_channel: np.ndarray
-    stretches: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -100,7 +82,20 @@ class Estimate:
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
-class _Room:
+@dataclass(frozen=True)
+class _Moves:
+    """Each free parameter moved: vectors (np,) with one of them moved by steps (k,).
+
+    probed: (k,) where a finite step is needed. reading_only: (k,) which never move the state.
+    """
+
+    vectors: list[np.ndarray]
+    steps: np.ndarray
+    probed: np.ndarray
+    reading_only: np.ndarray
+
+
+class _Buffers:
     """Large arrays, filled anew by every pass: fresh memory would cost as much time as a pass."""
 
     def __init__(self) -> None:
@@ -122,12 +117,12 @@ class Engine:
 
     def __init__(self, model: Model, records: Sequence[Record], threads: int | None = None) -> None:
         self.model = model
-        self.records = list(records)
+        self.records = tuple(records)
         self.threads = threads or int(os.environ.get("COAX_THREADS", "2"))
         self.starts = [model.start(r) for r in self.records]
         self.intervals = [np.append(np.diff(r.t), 0.0) for r in self.records]
         self._readings = [int((~np.isnan(r.z)).sum()) for r in self.records]
-        self._rooms: list[_Room] = []  # that no thread works in
+        self._buffers: list[_Buffers] = []  # that no thread works with
 
     def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
         """Work done on every run (or those in `which`), the longest first so that no thread waits."""
@@ -140,15 +135,15 @@ class Engine:
             return [begun[i].result() for i in indices]
 
     @contextmanager
-    def _room(self) -> Iterator[_Room]:
+    def _borrowed_buffers(self) -> Iterator[_Buffers]:
         try:
-            room = self._rooms.pop()
+            buffers = self._buffers.pop()
         except IndexError:
-            room = _Room()
+            buffers = _Buffers()
         try:
-            yield room
+            yield buffers
         finally:
-            self._rooms.append(room)
+            self._buffers.append(buffers)
 
     def filter(
         self,
@@ -168,8 +163,8 @@ class Engine:
 
         def one(i: int) -> RunPass:
             starts = None if start_rows is None else start_rows[i]
-            room = _Room() if keep else None
-            return self._filter_run(i, p, q, R, noise, room, start_rows=starts)[0]
+            buffers = _Buffers() if keep else None
+            return self._filter_run(i, p, q, R, noise, buffers, start_rows=starts)[0]
 
         return self._each(one, which)
 
@@ -183,13 +178,15 @@ class Engine:
         q: np.ndarray,
         R: np.ndarray,
         noise: Noise,
-        keep: _Room | None,
-        along: _Room | None = None,
+        keep: _Buffers | None,
+        jacobians: _Buffers | None = None,
         start_rows: np.ndarray | None = None,
-    ) -> tuple[RunPass, Along]:
-        """The filter pass of a run, and what it went along.
+    ) -> tuple[RunPass, PassJacobians]:
+        """The filter pass of a run, and what it linearised the model at.
 
-        keep: room for what a mean pass needs, along: room for the rest; empty without one.
+        Args:
+            keep: buffers for what a mean pass needs (gains, H); nothing is stored without them.
+            jacobians: buffers for the rest (F, predicted states); nothing is stored without them.
         """
         record = self.records[i]
         n, m = record.z.shape
@@ -199,14 +196,14 @@ class Engine:
         P0 = P0 + np.diag(self.model.start_noise(noise))
         e = np.full((n, m), np.nan)
         states = np.zeros((n, nx))
-        count, rows, room = (0, 0, _Room()) if keep is None else (self._readings[i], n, keep)
-        K = room.array("K", (count, nx), np.float32)
-        per_sigma = room.array("per_sigma", (count,))
-        H = room.array("H", (math.ceil(rows / REFRESH), m, nx), np.float32)
-        rows, room = (0, _Room()) if along is None else (n, along)
-        F = room.array("F", (rows, nx, nx), np.float32)
-        F_of = room.array("F_of", (rows,), np.int64)
-        predicted = room.array("predicted", (rows, nx))
+        count, rows, buffers = (0, 0, _Buffers()) if keep is None else (self._readings[i], n, keep)
+        K = buffers.array("K", (count, nx), np.float32)
+        per_sigma = buffers.array("per_sigma", (count,))
+        H = buffers.array("H", (math.ceil(rows / REFRESH), m, nx), np.float32)
+        rows, buffers = (0, _Buffers()) if jacobians is None else (n, jacobians)
+        F = buffers.array("F", (rows, nx, nx), np.float32)
+        F_of = buffers.array("F_of", (rows,), np.int64)
+        predicted = buffers.array("predicted", (rows, nx))
         starts = np.empty(0, np.int64) if start_rows is None else start_rows
         slots = np.full(n, -1, np.int64)
         slots[starts] = np.arange(starts.size)
@@ -220,7 +217,7 @@ class Engine:
         if not np.isfinite(log_likelihood):
             K[:], per_sigma[:], H[:] = 0.0, 0.0, 0.0
         run = RunPass(record, u, log_likelihood, e, states, deweighted, K, per_sigma, H, starts, P)
-        return run, Along(F, F_of, predicted)
+        return run, PassJacobians(F, F_of, predicted)
 
     def log_likelihood(
         self, values: Mapping[str, float], noise: Noise, which: Sequence[int] | None = None
@@ -238,89 +235,89 @@ class Engine:
         """
         p, q = self.model.vector(values), self.model.process_noise(noise)
         R = self._reading_variances(noise)
-        far = np.array([f.probe > 0.0 and values[f.name] < 0.25 * f.probe for f in free], bool)
-        steps = np.array([f.probe if far[k] else 0.02 * f.std for k, f in enumerate(free)])
-        over = np.array([values[f.name] + steps[k] > f.upper for k, f in enumerate(free)], bool)
-        steps[over] *= -1.0
-        reading_only = np.array([f.reading_only for f in free], bool)
-        moved = [
-            self.model.vector({**values, f.name: values[f.name] + step})
-            for f, step in zip(free, steps, strict=True)
-        ]
+        moves = self._moves(values, free)
 
         def one(i: int) -> tuple[Any, ...]:
-            with self._room() as room:
-                run, along = self._filter_run(i, p, q, R, noise, _Room(), room)
-                there = np.isfinite(run.innovations)
-                e = run.innovations[there]
-                J = room.array("J", (e.size, len(free)))
-                by_channel = np.zeros((len(free), there.shape[1]))
-                near = np.flatnonzero(~far)
+            with self._borrowed_buffers() as buffers:
+                run, at = self._filter_run(i, p, q, R, noise, _Buffers(), buffers)
+                J = buffers.array("J", (int(np.isfinite(run.innovations).sum()), len(free)))
+                by_channel = np.zeros((len(free), run.innovations.shape[1]))
                 if np.isfinite(run.log_likelihood):
-                    self._signatures(
-                        i, run, along, p, [moved[k] for k in near], steps[near],
-                        reading_only[near], near, J, by_channel,
-                    )  # fmt: skip
+                    self._signatures(i, run, at, p, moves, J, by_channel)
+                    self._probed_signatures(i, run, moves, J, by_channel)
                 else:
                     J[:] = 0.0
-                probed = np.zeros(there.shape)
-                for k in np.flatnonzero(far):
-                    J[:, k] = 0.0
-                    if self._frozen(i, run, moved[k], probed):
-                        change = np.where(there, probed - run.innovations, 0.0)
-                        if np.abs(change).max(initial=0.0) < HUGE:
-                            J[:, k] = change[there] / steps[k]
-                            by_channel[k] = np.square(change / steps[k]).sum(0)
                 information = J.T @ J
                 wild = ~np.isfinite(np.diag(information))
                 if wild.any():
                     J[:, wild] = 0.0
                     information[wild] = information[:, wild] = 0.0
                     by_channel[wild] = 0.0
-                row = np.nonzero(there)[0]
-                t = run.record.t
-                edges = np.searchsorted(t, np.arange(t[0] + STRETCH, t[-1], STRETCH))
-                parts = np.split(np.arange(e.size), np.searchsorted(row, edges))
-                stretches = np.array([e[part] @ J[part] for part in parts])
-            return run, information, stretches.sum(0), by_channel, stretches
+                blocks = _block_scores(run, J)
+            return run, information, blocks.sum(0), by_channel, blocks
 
-        passes, *parts, stretches = zip(*self._each(one), strict=True)
+        passes, *parts, blocks = zip(*self._each(one), strict=True)
         information, slope, by_channel = (np.array(part) for part in parts)
         return list(passes), Linearised(
-            tuple(f.name for f in free), information, slope, by_channel, np.concatenate(stretches)
+            tuple(f.name for f in free), information, slope, by_channel, np.concatenate(blocks)
         )
+
+    def _moves(self, values: Mapping[str, float], free: Sequence[FreeParameter]) -> _Moves:
+        probed = np.array([f.probe > 0.0 and values[f.name] < 0.25 * f.probe for f in free], bool)
+        steps = np.array([f.probe if probed[k] else 0.02 * f.std for k, f in enumerate(free)])
+        over = np.array([values[f.name] + steps[k] > f.upper for k, f in enumerate(free)], bool)
+        steps[over] *= -1.0
+        vectors = [
+            self.model.vector({**values, f.name: values[f.name] + step})
+            for f, step in zip(free, steps, strict=True)
+        ]
+        reading_only = np.array([f.reading_only for f in free], bool)
+        return _Moves(vectors, steps, probed, reading_only)
 
     def _signatures(
         self,
         i: int,
         run: RunPass,
-        along: Along,
+        at: PassJacobians,
         p: np.ndarray,
-        moved: Sequence[np.ndarray],
-        steps: np.ndarray,
-        reading_only: np.ndarray,
-        columns: np.ndarray,
+        moves: _Moves,
         J: np.ndarray,
         by_channel: np.ndarray,
     ) -> None:
-        """Derivatives of a run's whitened innovations in the parameters moved, into columns of J.
+        """Derivatives of a run's whitened innovations where a small step does, into columns of J.
 
         And their squares, summed by channel, into rows of `by_channel`.
         """
-        if not moved:
+        columns = np.flatnonzero(~moves.probed)
+        if not columns.size:
             return
-        sets, which = [run.inputs], np.zeros(len(moved), np.int64)
-        for k, vector in enumerate(moved):
+        vectors = [moves.vectors[k] for k in columns]
+        sets, which = [run.inputs], np.zeros(columns.size, np.int64)
+        for k, vector in enumerate(vectors):
             inputs = self.model.inputs(run.record, vector)
             if not np.array_equal(inputs, run.inputs):
                 which[k] = len(sets)
                 sets.append(inputs)
         kalman.signature_pass(
             self.model.drift_and_readings, self.model.measure, self.intervals[i], np.array(sets), which,
-            along.predicted, run.states, run.innovations, p, np.array(moved), steps, reading_only,
-            self.model.exact, self.model.work_size, run.gains, run.per_sigma, run.H, along.F,
-            along.F_of, REFRESH, columns, J, by_channel,
+            at.predicted, run.states, run.innovations, p, np.array(vectors), moves.steps[columns],
+            moves.reading_only[columns], self.model.exact, self.model.work_size, run.gains,
+            run.per_sigma, run.H, at.F, at.F_of, REFRESH, columns, J, by_channel,
         )  # fmt: skip
+
+    def _probed_signatures(
+        self, i: int, run: RunPass, moves: _Moves, J: np.ndarray, by_channel: np.ndarray
+    ) -> None:
+        """The same where a finite step is needed, by a mean pass each."""
+        there = np.isfinite(run.innovations)
+        probed = np.zeros(there.shape)
+        for k in np.flatnonzero(moves.probed):
+            J[:, k] = 0.0
+            if self._frozen(i, run, moves.vectors[k], probed):
+                change = np.where(there, probed - run.innovations, 0.0)
+                if np.abs(change).max(initial=0.0) < DIVERGED:
+                    J[:, k] = change[there] / moves.steps[k]
+                    by_channel[k] = np.square(change / moves.steps[k]).sum(0)
 
     def descend(
         self,
@@ -386,15 +383,16 @@ class Engine:
         raises the cost at those gains is halved. The covariance is that of the last linearisation.
         """
         values = dict(values)
+        names = [f.name for f in free]
         passes, lin = self.linearise(values, noise, free)
         converged = False
         count = 0
         for count in range(1, iterations + 1):
-            step, promised = newton_step(lin, free, values)
-            if promised < tolerance:
+            change, step = Quadratic.of(lin, free, values).best(names)
+            if -change < tolerance:
                 converged = True
                 break
-            moves = {f.name: float(change) for f, change in zip(free, step, strict=True)}
+            moves = dict(zip(names, step.tolist(), strict=True))
             values, gained = self.descend(passes, free, values, noise, moves)
             if progress:
                 progress(f"fit: step {count}, gained {gained:.1f} nats")
@@ -402,13 +400,11 @@ class Engine:
                 passes = self.filter(values, noise)
                 break
             passes, lin = self.linearise(values, noise, free)
-        best = objective(passes, free, values)
-        information = lin.information.sum(0) + np.diag([1.0 / f.std**2 for f in free])
         return Estimate(
-            names=tuple(f.name for f in free),
-            values={f.name: values[f.name] for f in free},
-            covariance=np.linalg.inv(information),
-            objective=best,
+            names=tuple(names),
+            values={name: values[name] for name in names},
+            covariance=Quadratic.of(lin, free, values).covariance(names),
+            objective=objective(passes, free, values),
             log_likelihood=float(sum(p.log_likelihood for p in passes)),
             iterations=count,
             converged=converged,
@@ -419,9 +415,10 @@ class Engine:
     ) -> tuple[float, np.ndarray, np.ndarray]:
         """Log-likelihood and its slopes in the process noise.
 
-        Returns nats (-inf where a filter diverged), the slope in each state's growth of variance per
-        second, by stretches of STRETCH seconds (stretches, nx), and by record in each variance of the
-        first state, (records, nx).
+        Returns:
+            nats (-inf where a filter diverged), the slope in each state's growth of variance per
+            second, by blocks of BLOCK seconds (blocks, nx), and by record in each variance of the
+            first state, (records, nx).
         """
         p = self.model.vector(values)
         q = self.model.process_noise(noise)
@@ -429,106 +426,19 @@ class Engine:
 
         def one(i: int) -> tuple[float, np.ndarray, np.ndarray]:
             t = self.records[i].t
-            stretch = ((t - t[0]) / STRETCH).astype(np.int64)
-            by_noise, by_start = np.zeros((stretch[-1] + 1, q.size)), np.zeros(q.size)
-            with self._room() as room:
-                run, along = self._filter_run(i, p, q, R, noise, room, room)
+            block = ((t - t[0]) / BLOCK).astype(np.int64)
+            by_noise, by_start = np.zeros((block[-1] + 1, q.size)), np.zeros(q.size)
+            with self._borrowed_buffers() as buffers:
+                run, at = self._filter_run(i, p, q, R, noise, buffers, buffers)
                 if np.isfinite(run.log_likelihood):
                     kalman.score_pass(
                         self.intervals[i], run.innovations, run.gains, run.per_sigma, run.H,
-                        along.F, along.F_of, REFRESH, stretch, by_noise, by_start,
+                        at.F, at.F_of, REFRESH, block, by_noise, by_start,
                     )  # fmt: skip
             return run.log_likelihood, by_noise, by_start
 
         log_likelihood, by_noise, by_start = zip(*self._each(one), strict=True)
         return float(sum(log_likelihood)), np.concatenate(by_noise), np.array(by_start)
-
-    def fit_noise(
-        self,
-        values: Mapping[str, float],
-        noise: Noise,
-        process: Sequence[str],
-        evaluations: int = 16,
-        tolerance: float = 0.5,
-        seconds: float = np.inf,
-        progress: Progress | None = None,
-    ) -> Noise:
-        """Process-noise levels of largest likelihood, or the best seen in so many evaluations.
-
-        Quasi-Newton in log levels, scaled by the scatter of their slopes from stretch to stretch.
-        Nothing is done where that scatter promises less than `tolerance` nats.
-
-        Args:
-            process: names of the process-noise levels to fit.
-            seconds: of flight that are enough to look at: whole runs, evenly picked.
-        """
-        picked = Engine(self.model, _some(self.records, seconds), self.threads)
-
-        def changed(logs: np.ndarray) -> Noise:
-            levels = dict(noise.process)
-            for name, log in zip(process, logs, strict=True):
-                levels[name] = float(np.exp(log))
-            return replace(noise, process=levels)
-
-        def variances(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            here = changed(logs)
-            return self.model.process_noise(here), self.model.start_noise(here)
-
-        def slopes(logs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-            """Log-likelihood, its slope in each log level, and the scatter of that."""
-            log_likelihood, by_noise, by_start = picked.noise_score(values, changed(logs))
-            slope, scatter = np.empty(logs.size), np.empty(logs.size)
-            for i, unit in enumerate(STEP_OF_LOG * np.eye(logs.size)):
-                (q, start), (q_less, start_less) = variances(logs + unit), variances(logs - unit)
-                parts = by_noise @ (q - q_less) / (2.0 * STEP_OF_LOG)
-                first = float(np.sum(by_start * (start - start_less))) / (2.0 * STEP_OF_LOG)
-                slope[i] = parts.sum() + first
-                scatter[i] = np.sqrt(parts.size) * parts.std()
-            return log_likelihood, slope, scatter
-
-        start = np.array([np.log(noise.process[name]) for name in process])
-        lower = np.log([noise.floor.get(name, 1e-9) for name in process])
-        upper = lower + np.log(1e4)
-        first, slope, scatter = slopes(start)
-        scale = np.maximum(scatter, 1.0)
-        held = ((start <= lower) & (slope < 0.0)) | ((start >= upper) & (slope > 0.0))
-        if 0.5 * np.sum((slope / scale)[~held] ** 2) < tolerance:
-            return noise
-        seen = {tuple(start * scale): (first, slope)}
-
-        def cost(scaled: np.ndarray) -> tuple[float, np.ndarray]:
-            value, slope = seen.get(tuple(scaled)) or slopes(scaled / scale)[:2]
-            if not np.isfinite(value):
-                return 1e12, np.zeros(scaled.size)
-            seen[tuple(scaled)] = (value, slope)
-            return -value, -slope / scale
-
-        found = minimize(
-            cost, start * scale, jac=True, method="L-BFGS-B",
-            bounds=list(zip(lower * scale, upper * scale, strict=True)),
-            options={"maxfun": evaluations, "ftol": 0.5 * tolerance / max(abs(first), 1.0)},
-        )  # fmt: skip
-        if progress:
-            progress(f"noise levels: {found.nfev} evaluations")
-        return changed(np.array(max(seen, key=lambda scaled: seen[scaled][0])) / scale)
-
-
-def _some(records: Sequence[Record], seconds: float) -> list[Record]:
-    """Records of so many seconds in all, or just more, evenly picked."""
-    whole = sum(r.t[-1] - r.t[0] for r in records)
-    count = math.ceil(min(1.0, seconds / whole) * len(records))
-    return [records[i] for i in np.linspace(0, len(records) - 1, count).round().astype(int)]
-
-
-def part(record: Record, rows: np.ndarray) -> Record:
-    """Some rows of a record, its clock kept."""
-    return replace(
-        record,
-        t=record.t[rows],
-        command=record.command[rows],
-        z=record.z[rows],
-        news=None if record.news is None else record.news[rows],
-    )
 
 
 def objective(
@@ -538,36 +448,12 @@ def objective(
     return penalty(free, values) - float(sum(p.log_likelihood for p in passes))
 
 
-def penalty(free: Sequence[FreeParameter], values: Mapping[str, float]) -> float:
-    """Half the squared distance to the priors, nats."""
-    return 0.5 * sum(((values[f.name] - f.value) / f.std) ** 2 for f in free)
-
-
-def newton_step(
-    lin: Linearised, free: Sequence[FreeParameter], values: Mapping[str, float]
-) -> tuple[np.ndarray, float]:
-    """Gauss-Newton step within bounds, and the gain in nats it promises."""
-    prior = np.array([1.0 / f.std**2 for f in free])
-    away = np.array([values[f.name] - f.value for f in free])
-    A = lin.information.sum(0) + np.diag(prior)
-    g = lin.slope.sum(0) + prior * away
-    now = np.array([values[f.name] for f in free])
-    lower = np.array([f.lower for f in free]) - now
-    upper = np.array([f.upper for f in free]) - now
-    step = bounded_solve(A, -g, lower, upper)
-    return step, float(-(g @ step) - 0.5 * step @ A @ step)
-
-
-def bounded_solve(A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Minimise 1/2 x'A x - b'x within bounds (A positive definite), shape (k,).
-
-    Bounded least squares on the Cholesky factor, in units of A's diagonal (Stark and Parker 1995).
-    """
-    unit = 1.0 / np.sqrt(np.diag(A))
-    factor = cholesky(A * np.outer(unit, unit))
-    target = solve_triangular(factor, b * unit, trans="T")
-    x = solve_triangular(factor, target) * unit
-    if np.any(x < lower) or np.any(x > upper):
-        bounds = (np.minimum(lower, 0.0) / unit, np.maximum(upper, 0.0) / unit)
-        x = lsq_linear(factor, target, bounds, method="bvls", tol=1e-12).x * unit
-    return np.clip(x, lower, upper)
+def _block_scores(run: RunPass, J: np.ndarray) -> np.ndarray:
+    """Signatures (readings, k) times innovations, summed over blocks of BLOCK seconds, (blocks, k)."""
+    there = np.isfinite(run.innovations)
+    e = run.innovations[there]
+    row = np.nonzero(there)[0]
+    t = run.record.t
+    edges = np.searchsorted(t, np.arange(t[0] + BLOCK, t[-1], BLOCK))
+    parts = np.split(np.arange(e.size), np.searchsorted(row, edges))
+    return np.array([e[part] @ J[part] for part in parts])

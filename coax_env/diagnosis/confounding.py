@@ -1,0 +1,156 @@
+"""Which effects would do as well in a cause's place: its confounded alternatives, by refits."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from coax_env.design import next_maneuver
+from coax_env.diagnosis.evidence import Evidence
+from coax_env.diagnosis.fits import fitted
+from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
+from coax_env.diagnosis.scores import score, swap
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.whiteness import Whiteness
+from coax_env.logs.flight import Flight
+from coax_env.model.layout import CHANNELS
+
+CHANNEL_SHARE = 0.1
+"""Share of a signature above which a channel is said to show the effect; ours."""
+NEAR_TIES = 3.0
+"""Ties by the quadratic within which an alternative is refitted; ours."""
+TWIN_STEPS = 6
+"""Gauss-Newton steps from a lag to a delay of nothing, which is far; ours."""
+
+Alternatives = Mapping[str, Mapping[str, Fit]]
+"""Cause -> its confounded alternatives -> the fit with each in the cause's place."""
+
+
+def channels_of(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> list[str]:
+    """Channels that carry most of an active effect's signature, strongest first.
+
+    Args:
+        problem, fit: with the effect.
+        quadratic: linearised at the fit.
+        effect: its name.
+    """
+    own = problem.own[effect]
+    size = np.array([fit.values[f.name] - f.value for f in own])
+    strength = size**2 @ quadratic.by_channel[quadratic.index([f.name for f in own])]
+    order = np.argsort(-strength)
+    total = strength.sum()
+    return [CHANNELS[i] for i in order if total > 0.0 and strength[i] > CHANNEL_SHARE * total]
+
+
+def alternatives(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    evidence: Mapping[str, Evidence],
+    white: Mapping[str, Whiteness],
+) -> dict[str, dict[str, Fit]]:
+    """The confounded alternatives of every cause.
+
+    Args:
+        problem, fit: with the causes.
+        quadratic: linearised at the fit.
+        evidence: of each cause.
+        white: whiteness of the innovations, by channel.
+    """
+
+    def of_one(effect: str) -> dict[str, Fit]:
+        inflations = (white[c].inflation for c in channels_of(problem, fit, quadratic, effect))
+        factor = max([evidence[effect].inflation, *inflations])
+        return _of_one(problem, fit, quadratic, effect, factor, evidence[effect].lost)
+
+    return problem.for_each(of_one, fit.active)
+
+
+def _of_one(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    effect: str,
+    inflation: float,
+    lost: float,
+) -> dict[str, Fit]:
+    """Effects that would do as well in this one's place, by refitted likelihood, and those refits.
+
+    Coloured innovations carry less information than they seem to: the tie widens by their variance
+    inflation, up to half of what is `lost` (nats) with nothing in the effect's place.
+    """
+    chosen = problem.settings
+    tie = min(chosen.tie * inflation, max(0.5 * lost, chosen.tie))
+
+    def refit(other: str, move: np.ndarray, steps: int) -> Fit:
+        active = tuple(other if e == effect else e for e in fit.active)
+        return fitted(problem, replace(fit.at(quadratic.moved(move)), active=active), steps)
+
+    found = {}
+    for other, move in _near(problem, fit, quadratic, effect, NEAR_TIES * tie):
+        trial = refit(other, move, steps=2)
+        if trial.objective - fit.objective < tie:
+            found[other] = trial
+    # a lag is far from a delay of nothing: the quadratic does not reach there, and both may be there
+    for twin in sorted(exclusive_with(effect) & set(problem.candidates) - set(found)):
+        _, move = swap(problem, quadratic, fit.active, effect, twin)
+        trial = refit(twin, move, steps=TWIN_STEPS)
+        mixed = score(problem, quadratic, fit.active, twin).evidence > chosen.evidence
+        if mixed or trial.objective - fit.objective < tie:
+            found[twin] = trial
+    return found
+
+
+def _near(
+    problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, most: float
+) -> list[tuple[str, np.ndarray]]:
+    """Effects that lose less than `most` nats in this one's place by the quadratic, best first.
+
+    They must do something there: at least half of what the effect itself gains.
+    """
+    now, _ = quadratic.best(problem.free_names(fit.active))
+    nothing, _ = quadratic.best(problem.free_names(fit.rest(effect)), problem.off_values(effect))
+    near = []
+    for other in problem.candidates:
+        if other not in fit.active:
+            change, move = swap(problem, quadratic, fit.active, effect, other)
+            does_something = nothing - now - change > 0.5 * (nothing - now)
+            if change < most and does_something:
+                near.append((change, other, move))
+    best = sorted(near, key=lambda n: n[0])[: problem.settings.most_trials]
+    return [(other, move) for _, other, move in best]
+
+
+def separating_maneuver(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    found: Alternatives,
+    strongest_first: Sequence[str],
+    flight: Flight,
+) -> next_maneuver.Design | None:
+    """The maneuvers that separate the strongest confounded cause from its alternatives.
+
+    What the flights determine of the alternatives' numbers is taken from the final quadratic.
+
+    Args:
+        problem, fit: with the causes.
+        quadratic: linearised at the fit.
+        found: the confounded alternatives.
+        strongest_first: the causes.
+        flight: whose sensors' rates are assumed.
+    """
+    confounded = next((effect for effect in strongest_first if found[effect]), None)
+    if confounded is None:
+        return None
+    problem.report("designing the next maneuver")
+    designs = []
+    for name, refit in {confounded: fit, **found[confounded]}.items():
+        free = problem.free_of_vehicle(refit.active)
+        i = quadratic.index([f.name for f in free])
+        designs.append(
+            next_maneuver.Alternative.of(
+                name, problem.model.vehicle, free, refit.values, quadratic.G[np.ix_(i, i)]
+            )
+        )
+    return next_maneuver.design(designs, fit.noise, next_maneuver.logged_rates(flight))

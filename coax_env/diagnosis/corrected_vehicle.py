@@ -1,0 +1,101 @@
+"""The corrected vehicle: the causes in it, refitted on all runs, structure unchanged."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from coax_env.diagnosis.findings import stated_std
+from coax_env.diagnosis.input_innovations import has_command_gains, with_input_innovations
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.vibration import Line
+from coax_env.estimation.engine import Engine, objective
+from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import FreeParameter, Record
+from coax_env.logs.flight import Flight
+from coax_env.model.vehicle import Parameter, Vehicle
+
+
+def corrected_vehicle(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    held: Sequence[Record],
+    inflations: Mapping[str, float],
+    line: Line | None,
+    flight: Flight,
+) -> Vehicle:
+    """The vehicle with the causes in it.
+
+    Args:
+        problem, fit: with the causes.
+        quadratic: linearised at the fit.
+        held: runs that were held out; they are used now.
+        inflations: variance inflation, by effect.
+        line: of a vibration that the vehicle file does not have.
+        flight: what is recorded as the source.
+    """
+    free = problem.free(fit.active)
+    values, covariance = with_held_out(problem, fit, quadratic, held)
+    dt = median_step([*problem.engine.records, *held])
+    of_vehicle = problem.free_of_vehicle(fit.active)
+    own = [free.index(f) for f in of_vehicle]
+    spread = np.sqrt(np.diag(covariance))
+
+    def std(f: FreeParameter) -> float:
+        factor = inflations.get(f.name.partition(".")[0], 1.0)
+        return stated_std(fit, f, float(spread[free.index(f)]), factor, dt)
+
+    source = f"diagnosed from {flight.path.name if flight.path else 'flight'}"
+    vehicle = fitted_vehicle(
+        problem.model.vehicle,
+        of_vehicle,
+        values,
+        {f.name: std(f) for f in of_vehicle},
+        covariance[np.ix_(own, own)],
+        source,
+        flight,
+    )
+    if line:
+        amplitude = Parameter(line.amplitude, line.std, "m/s2", source)
+        vehicle = vehicle.with_parameters({"vibration.amplitude": amplitude})
+    return vehicle
+
+
+def with_held_out(
+    problem: Problem, fit: Fit, quadratic: Quadratic, held: Sequence[Record]
+) -> tuple[dict[str, float], np.ndarray]:
+    """Values of the free parameters, and their covariance, with the held-out runs taken in too.
+
+    The posterior of the other runs is the prior of one Gauss-Newton step, halved until the objective
+    of all runs falls (a one-step estimator; Le Cam 1956, van der Vaart 1998, sec. 5.7).
+
+    Args:
+        problem, fit: with the causes.
+        quadratic: linearised at the fit.
+        held: runs that were held out.
+    """
+    free = problem.free(fit.active)
+    names = [f.name for f in free]
+    values = {name: fit.values[name] for name in names}
+    if not held:
+        return values, quadratic.covariance(names)
+    engine = Engine(problem.model, held)
+    if has_command_gains(problem):
+        engine = with_input_innovations(engine, fit)
+    passes, lin = engine.linearise(fit.values, fit.noise, free)
+    taken_in = Quadratic.of(lin, free, fit.values)
+    known = quadratic.index(names)
+    # where they are fitted, the other runs and the priors have no slope
+    both = replace(taken_in, G=taken_in.G + quadratic.G[np.ix_(known, known)], mean=taken_in.at)
+    _, move = both.best(names)
+    before = fit.objective - sum(p.log_likelihood for p in passes)
+    for share in (1.0, 0.5, 0.25):
+        moved = both.moved(share * move)
+        there = {**fit.values, **moved}
+        after = objective(problem.engine.filter(there, fit.noise), free, there)
+        if after - engine.log_likelihood(there, fit.noise) < before:
+            values = moved
+            break
+    return values, both.covariance(names)

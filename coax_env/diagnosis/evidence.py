@@ -1,0 +1,62 @@
+"""What each cause is worth once everything else, noise levels too, is refitted without it."""
+
+from dataclasses import dataclass, replace
+
+from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, without
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.refinement import refined
+from coax_env.diagnosis.scores import inflation
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.model import effects
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a cause is worth. lost: nats without it. inflation: variance inflation in its direction."""
+
+    lost: float
+    inflation: float
+
+    @property
+    def nats(self) -> float:
+        """What coloured innovations leave of what is lost."""
+        return self.lost / self.inflation
+
+
+def weigh(problem: Problem, fit: Fit, quadratic: Quadratic) -> dict[str, Evidence]:
+    """Evidence of every active effect."""
+    chosen = problem.settings
+
+    def one(effect: str) -> Evidence:
+        held = effects.CATALOGUE[effect].replaces
+        factor = inflation(problem, quadratic, fit.active, effect)
+        rest = noise_fitted(problem, without(problem, fit, quadratic, effect))
+        rest = fitted(problem, rest, steps=1, held=held)
+        if rest.objective - fit.objective < chosen.clear_evidence * chosen.evidence * factor:
+            rest = converged(problem, rest, held)
+        return Evidence(float(rest.objective - fit.objective), factor)
+
+    return problem.for_each(one, fit.active)
+
+
+def prune(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic, dict[str, Evidence]]:
+    """Remove, one at a time, causes whose evidence is gone once the noise levels are fitted too.
+
+    Returns:
+        the refined fit, the quadratic at it, and the evidence of what is left.
+    """
+    while True:
+        fit = refined(problem, converged(problem, fit))
+        fit, _, quadratic = linearise(problem, fit)
+        evidence = weigh(problem, fit, quadratic)
+        weakest = min(evidence, key=lambda e: evidence[e].nats, default=None)
+        if weakest is None or evidence[weakest].nats >= problem.settings.evidence:
+            return fit, quadratic, evidence
+        nats = evidence[weakest].nats
+        problem.report(f"dropped {weakest}: worth {nats:.1f} nats in the end")
+        fit = _dropped(problem, fit, weakest).noted(f"- {weakest}", max(nats, 0.0))
+
+
+def _dropped(problem: Problem, fit: Fit, effect: str) -> Fit:
+    off = problem.off_values(effect) | problem.file_values(effect)
+    return replace(fit.at(off), active=fit.rest(effect))

@@ -1,0 +1,125 @@
+"""The entries of findings.json: causes, what is unexplained, the verdict."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from coax_env.diagnosis.confounding import Alternatives, channels_of
+from coax_env.diagnosis.evidence import Evidence
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.vibration import Line
+from coax_env.estimation.engine import RunPass
+from coax_env.estimation.fitted_vehicle import median_step, with_timing
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import FreeParameter
+from coax_env.estimation.whiteness import Whiteness
+from coax_env.model import effects
+from coax_env.model.layout import CHANNELS
+
+
+def causes(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    evidence: Mapping[str, Evidence],
+    found: Alternatives,
+    line: Line | None,
+) -> list[dict[str, Any]]:
+    """The causes, strongest first.
+
+    Args:
+        problem, fit: with the causes.
+        quadratic: linearised at the fit.
+        evidence: of each cause.
+        found: the confounded alternatives of each cause.
+        line: of a vibration that the vehicle file does not have.
+    """
+    free = problem.free_names(fit.active)
+    std = dict(zip(free, np.sqrt(np.diag(quadratic.covariance(free))), strict=True))
+    dt = median_step(problem.engine.records)
+    entries: list[dict[str, Any]] = []
+    for effect in fit.active:
+        own = zip(problem.own[effect], effects.CATALOGUE[effect].parameters, strict=True)
+        entries.append(
+            {
+                "effect": effect,
+                "parameters": {
+                    f.name: {
+                        "value": float(fit.values[f.name]),
+                        "std": stated_std(fit, f, std[f.name], evidence[effect].inflation, dt),
+                        "unit": p.unit,
+                    }
+                    for f, p in own
+                },
+                "evidence": evidence[effect].nats,
+                "confusable_with": list(found[effect]),
+                "channels": channels_of(problem, fit, quadratic, effect),
+            }
+        )
+    entries.sort(key=lambda c: -c["evidence"])
+    if line:
+        entries = sorted([*entries, _vibration(line)], key=lambda c: -c["evidence"])
+    return entries
+
+
+def stated_std(
+    fit: Fit, parameter: FreeParameter, std: float, inflation: float, dt: float
+) -> float:
+    """Std of a number that is reported.
+
+    Args:
+        fit: whose `std_ratio` corrects for what the signatures hold fixed.
+        parameter: the number.
+        std: by the signatures.
+        inflation: variance inflation by coloured innovations.
+        dt: seconds per row, for lags and delays.
+    """
+    ratio = fit.std_ratio.get(parameter.name, 1.0)
+    return with_timing(parameter, std * math.sqrt(inflation) * ratio, dt)
+
+
+def _vibration(line: Line) -> dict[str, Any]:
+    """The cause that is found by its line and not by a signature."""
+    value = {"value": line.amplitude, "std": line.std, "unit": "m/s2"}
+    return {
+        "effect": "vibration",
+        "parameters": {"vibration.amplitude": value},
+        "evidence": line.evidence,
+        "confusable_with": [],
+        "channels": list(line.channels),
+    }
+
+
+def unexplained(white: Mapping[str, Whiteness], described: Collection[str]) -> list[dict[str, Any]]:
+    """Channels that are not white, beside those that generic terms describe."""
+    return [
+        {
+            "channel": c,
+            "depends_on": [],
+            "share": round(w.coloured_share, 3),
+            "form": "not found",
+        }
+        for c, w in white.items()
+        if not w.white and c not in described
+    ]
+
+
+def verdict(causes: Collection[Any], unexplained: Collection[Any]) -> str:
+    """The verdict of the contract."""
+    if causes:
+        return "partly explained" if unexplained else "explained"
+    return "unexplained" if unexplained else "consistent"
+
+
+def innovations(passes: Sequence[RunPass]) -> dict[str, dict[str, np.ndarray]]:
+    """Run -> time "t" and whitened innovations by channel, (n,) each."""
+    result: dict[str, dict[str, np.ndarray]] = {}
+    for run in passes:
+        table = {"t": run.record.t}
+        for i, channel in enumerate(CHANNELS):
+            if np.isfinite(run.record.z[:, i]).any():
+                table[channel] = run.innovations[:, i]
+        result[run.record.name] = table
+    return result

@@ -1,0 +1,141 @@
+"""Fits of a problem: linearise, step, fit, noise levels. Each takes a fit and returns another one."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation.engine import RunPass, objective
+from coax_env.estimation.helicopter import GUST_LEVELS, WHITE_LEVELS
+from coax_env.estimation.noise_levels import fit_noise
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import Noise
+
+
+def start(problem: Problem, noise: Noise) -> Fit:
+    """The bare model with its own noise levels."""
+    values = {**problem.model.bare_values, "gust_memory": noise.process["memory"]}
+    for f in problem.parameters:
+        values.setdefault(f.name, f.value)
+    chosen = problem.settings
+    noise = fit_noise(
+        problem.engine, values, noise, GUST_LEVELS,
+        chosen.first_noise_evaluations, chosen.step_gain, chosen.noise_fit_seconds,
+    )  # fmt: skip
+    fit = Fit((), values, noise)
+    return with_white_noise(problem, fit) or fit
+
+
+def linearise(problem: Problem, fit: Fit) -> tuple[Fit, list[RunPass], Quadratic]:
+    """The quadratic at a fit, over all parameters that may be free; the fit with its objective."""
+    everything = problem.parameters
+    passes, lin = problem.engine.linearise(fit.values, fit.noise, everything)
+    nats = objective(passes, problem.free(fit.active), fit.values)
+    return replace(fit, objective=nats), passes, Quadratic.of(lin, everything, fit.values)
+
+
+def stepped(problem: Problem, fit: Fit, passes: Sequence[RunPass], quadratic: Quadratic) -> Fit:
+    """After a Newton step of what is free, halved until the cost falls."""
+    free = problem.free(fit.active)
+    _, move = quadratic.best([f.name for f in free])
+    moves = {n: float(m) for n, m in zip(quadratic.names, move, strict=True) if m != 0.0}
+    values, _ = problem.engine.descend(passes, free, fit.values, fit.noise, moves)
+    return replace(fit, values=values)
+
+
+def at_optimum(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    active: Sequence[str],
+    fixed: Mapping[str, float],
+) -> Fit:
+    """Where the quadratic has its least value with other effects active and some values fixed.
+
+    Args:
+        problem, fit: of the quadratic; noise levels stay.
+        quadratic: linearised at the fit.
+        active: effects that are active then.
+        fixed: values of parameters that are not free.
+    """
+    free = [n for n in problem.free_names(active) if n not in fixed]
+    _, move = quadratic.best(free, fixed)
+    return replace(fit.at({**quadratic.moved(move), **fixed}), active=tuple(active))
+
+
+def without(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> Fit:
+    """The fit without an effect, the rest at the quadratic's optimum."""
+    fixed = problem.off_values(effect) | problem.file_values(effect)
+    return at_optimum(problem, fit, quadratic, fit.rest(effect), fixed)
+
+
+def fitted(
+    problem: Problem,
+    fit: Fit,
+    steps: int = 3,
+    tolerance: float = 1.0,
+    held: Collection[str] = (),
+) -> Fit:
+    """What is free fitted by Gauss-Newton.
+
+    Args:
+        problem, fit: where to begin.
+        steps: at most.
+        tolerance: predicted gain that ends the fit [nats].
+        held: names of free parameters that stay.
+    """
+    free = [f for f in problem.free(fit.active) if f.name not in held]
+    estimate = problem.engine.fit(free, fit.values, fit.noise, steps, tolerance)
+    return replace(fit.at(estimate.values), objective=estimate.objective)
+
+
+def noise_fitted(problem: Problem, fit: Fit, seconds: float | None = None) -> Fit:
+    """Noise levels fitted from where they stand, on so many seconds of flight."""
+    chosen = problem.settings
+    noise = fit_noise(
+        problem.engine, fit.values, fit.noise, fit.levels,
+        evaluations=chosen.noise_evaluations, tolerance=chosen.step_gain,
+        seconds=chosen.noise_fit_seconds if seconds is None else seconds,
+    )  # fmt: skip
+    return replace(fit, noise=noise)
+
+
+def converged(problem: Problem, fit: Fit, held: Collection[str] = ()) -> Fit:
+    """Noise levels and free parameters by turns until neither gains, those in `held` fixed.
+
+    Evidence is a difference of two such fits: what one of them lacks in convergence would count for
+    the other.
+    """
+    for _ in range(problem.settings.most_turns):
+        before = fit.objective
+        fit = fitted(problem, noise_fitted(problem, fit, math.inf), steps=1, held=held)
+        if before - fit.objective < problem.settings.step_gain:
+            break
+    return fit
+
+
+def with_white_noise(problem: Problem, fit: Fit) -> Fit | None:
+    """With white force and moment as process noise, where that is worth more than a tie."""
+    if fit.levels != GUST_LEVELS:
+        return None
+    engine, chosen = problem.engine, problem.settings
+    _, by_noise, _ = engine.noise_score(fit.values, fit.noise)
+    scores = by_noise.sum(0) / (np.sqrt(len(by_noise)) * by_noise.std(0) + 1e-300)
+    if scores[:6].max() < chosen.white_noise_score:  # velocity and rates
+        return None
+    first = dict(fit.noise.process)
+    for gust, white in zip(GUST_LEVELS, WHITE_LEVELS, strict=True):
+        first[white] = chosen.white_noise_start * first[gust]
+    levels = GUST_LEVELS + WHITE_LEVELS
+    noise = fit_noise(
+        engine, fit.values, replace(fit.noise, process=first), levels,
+        chosen.first_noise_evaluations, chosen.step_gain, chosen.noise_fit_seconds,
+    )  # fmt: skip
+    gained = engine.log_likelihood(fit.values, noise)
+    gained -= engine.log_likelihood(fit.values, fit.noise)
+    if gained < chosen.tie:
+        return None
+    problem.report(f"white process noise beside the gusts: {gained:.1f} nats")
+    return replace(fit, noise=noise, levels=levels)

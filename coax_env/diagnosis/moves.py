@@ -1,0 +1,205 @@
+"""The moves of the search: propose by the quadratic, accept by a fit. Each returns a fit or None."""
+
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from coax_env.diagnosis.fits import at_optimum, fitted, stepped, without
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.scores import Score, damping_gain, inflation, is_large, loss, swap
+from coax_env.estimation.engine import RunPass
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.model import effects
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A model that may be better, to be fitted.
+
+    Attributes:
+        move: what it changes, for the history.
+        effect: the effect that comes.
+        begin: where its fit begins.
+        occam: Occam factor of what it adds [nats].
+        needed: nats that it must gain.
+        words: the progress line, with a place for the nats gained.
+    """
+
+    move: str
+    effect: str
+    begin: Fit
+    occam: float
+    needed: float
+    words: str
+
+
+def accepted(problem: Problem, fit: Fit, proposal: Proposal) -> Fit | None:
+    """The proposed model fitted, where it gains enough and its effect matters in prediction."""
+    trial = fitted(problem, proposal.begin)
+    gained = fit.objective - trial.objective - proposal.occam
+    if gained > proposal.needed and is_large(problem, proposal.effect, trial.values):
+        problem.report(proposal.words.format(gained))
+        return trial.noted(proposal.move, gained)
+    return None
+
+
+# --- forward ----------------------------------------------------------------------------------------
+
+
+def add(
+    problem: Problem,
+    fit: Fit,
+    passes: Sequence[RunPass],
+    quadratic: Quadratic,
+    strong: Sequence[Score],
+) -> Fit | None:
+    """Add the best effect that may be added.
+
+    Args:
+        problem, fit: what may be free, and where.
+        passes: of the filter at the fit.
+        quadratic: linearised at the fit.
+        strong: effects with enough evidence, the best first.
+    """
+    if not strong or len(fit.active) >= problem.settings.most_causes:
+        return None
+    effect, nats = strong[0].effect, strong[0].nats
+    problem.report(f"added {effect}: {nats:.1f} nats")
+    active = (*fit.active, effect)
+    fixed = problem.file_values(effect)
+    if fixed:  # takes the base parameter's place: the same model, not a better one
+        moved = at_optimum(problem, fit, quadratic, active, fixed)
+    else:
+        moved = stepped(problem, replace(fit, active=active), passes, quadratic)
+    return moved.noted(f"+ {effect}", nats)
+
+
+def trials(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    candidates: Sequence[Score],
+    banned: Collection[str],
+    tried: Collection[tuple[str, ...]],
+) -> tuple[list[Proposal], list[str]]:
+    """Effects that the quadratic nearly carries, and dampings by the likelihood's own slope.
+
+    The quadratic at nothing is not that at the effect's size: a damping changes what the filter makes
+    of gusts, and may be worth ten times what its slope predicted.
+
+    Args:
+        problem, fit: what may be free, and where.
+        quadratic: linearised at the fit.
+        candidates: scores of what may be added.
+        banned: effects that may not be added now.
+        tried: sets of effects that need no second trial.
+
+    Returns:
+        what is worth a fit, and the dampings that were evaluated.
+    """
+    chosen = problem.settings
+    least = chosen.trial_share * chosen.evidence
+
+    def untried(names: Iterable[str]) -> list[str]:
+        return [e for e in names if (*fit.active, e) not in tried]
+
+    weak = untried(
+        c.effect
+        for c in candidates
+        if least < c.evidence <= chosen.evidence and not effects.CATALOGUE[c.effect].replaces
+    )[: chosen.most_trials]
+    begin: dict[str, Mapping[str, float]] = {effect: {} for effect in weak}
+    dampings = untried(
+        e
+        for e in problem.candidates
+        if effects.CATALOGUE[e].damps and e not in {*fit.active, *banned, *weak}
+    )
+    gains = problem.for_each(lambda e: damping_gain(problem, fit, quadratic, e), dampings)
+    begin |= {e: at for e, (nats, at) in gains.items() if nats > least}
+    proposals = [
+        Proposal(
+            f"+ {effect}",
+            effect,
+            at_optimum(problem, fit, quadratic, (*fit.active, effect), at),
+            quadratic.occam(problem.acting_names(effect), problem.free_names(fit.active)),
+            chosen.evidence,
+            f"added {effect}: {{:.1f}} nats, once fitted",
+        )
+        for effect, at in begin.items()
+    ]
+    return proposals, dampings
+
+
+# --- swap -------------------------------------------------------------------------------------------
+
+
+def swaps(
+    problem: Problem, fit: Fit, quadratic: Quadratic, tried: Collection[tuple[str, ...]]
+) -> Iterator[Proposal]:
+    """Effects in the place of active ones that fit better by the quadratic, the best first.
+
+    Args:
+        problem, fit: what may be free, and where.
+        quadratic: linearised at the fit.
+        tried: sets of effects that need no second trial.
+    """
+    tie = problem.settings.tie
+    better = []
+    for old in fit.active:
+        for new in problem.candidates:
+            active = tuple(new if e == old else e for e in fit.active)
+            if new not in fit.active and active not in tried:
+                change, move = swap(problem, quadratic, fit.active, old, new)
+                if change < -tie:
+                    better.append((change, old, new, active, move))
+    for _, old, new, active, move in sorted(better, key=lambda c: c[0])[
+        : problem.settings.most_trials
+    ]:
+        begin = replace(fit.at(quadratic.moved(move)), active=active)
+        words = f"{new} explains it better than {old}, by {{:.1f}} nats"
+        yield Proposal(f"{old} -> {new}", new, begin, 0.0, tie, words)
+
+
+# --- backward ---------------------------------------------------------------------------------------
+
+
+def drop(problem: Problem, fit: Fit, quadratic: Quadratic, coloured: bool) -> Fit | None:
+    """Remove the effect that is worth least, if that is too little or it is too small.
+
+    Args:
+        problem, fit: what may be free, and where.
+        quadratic: linearised at the fit.
+        coloured: whether evidence is divided by the variance inflation of coloured innovations.
+    """
+    inflations = {
+        e: inflation(problem, quadratic, fit.active, e) if coloured else 1.0 for e in fit.active
+    }
+    worth = {
+        e: loss(problem, quadratic, fit.active, e, inflations[e])
+        if is_large(problem, e, fit.values)
+        else -math.inf
+        for e in fit.active
+    }
+    for effect in sorted(worth, key=lambda e: worth[e]):
+        if worth[effect] >= problem.settings.evidence:
+            return None
+        if not math.isfinite(worth[effect]) or _is_worthless(
+            problem, fit, quadratic, effect, inflations[effect]
+        ):
+            problem.report(f"dropped {effect}: worth {worth[effect]:.1f} nats")
+            rest = at_optimum(problem, fit, quadratic, fit.rest(effect), problem.off_values(effect))
+            return rest.noted(f"- {effect}", max(worth[effect], 0.0))
+    return None
+
+
+def _is_worthless(
+    problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, inflation: float
+) -> bool:
+    """Whether a refit without the effect confirms that it is worth too little.
+
+    The quadratic reaches from where the effect stands back to nothing, which is far for a lag.
+    """
+    held = effects.CATALOGUE[effect].replaces
+    rest = fitted(problem, without(problem, fit, quadratic, effect), held=held)
+    occam = quadratic.occam(problem.acting_names(effect), problem.free_names(rest.active))
+    return (rest.objective - fit.objective) / inflation - occam < problem.settings.evidence

@@ -1,0 +1,187 @@
+"""The estimation problem of a diagnosis, and a fit to it: both immutable.
+
+The search is a walk over fits. Every move is a function of a problem and a fit that returns another
+fit (fits.py, moves.py); what may be free is part of the problem, where the walk stands is the fit.
+"""
+
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+from coax_env.diagnosis.settings import SETTINGS, Settings
+from coax_env.estimation.engine import Engine, Progress
+from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel
+from coax_env.estimation.state_space import FreeParameter, Noise, Record
+from coax_env.model import effects
+from coax_env.model import parameters as P
+
+EXCLUSIVE = (frozenset({"servo_lag", "servo_delay"}),)
+"""Effects of which one at most is named: a real servo is a mixture of both."""
+
+T = TypeVar("T")
+
+
+def exclusive_with(effect: str) -> set[str]:
+    """The effects that are never named beside this one."""
+    return {e for group in EXCLUSIVE if effect in group for e in group} - {effect}
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is fitted to what: the model and records, and every parameter that may be free.
+
+    Attributes:
+        model: the helicopter as a state-space model.
+        engine: its filter over the records.
+        base: the vehicle's own numbers, free whatever effects are active.
+        own: candidate effect -> its parameters under their priors.
+        added: what is free as the vehicle's own numbers are, from some step on: generic terms
+            (unlisted.py) and command gains (input_innovations.py).
+        settings: what decides.
+        progress: called with a line of text.
+    """
+
+    model: HeliModel
+    engine: Engine
+    base: tuple[FreeParameter, ...]
+    own: Mapping[str, tuple[FreeParameter, ...]]
+    added: tuple[FreeParameter, ...] = ()
+    settings: Settings = SETTINGS
+    progress: Progress | None = None
+
+    @classmethod
+    def of(
+        cls,
+        model: HeliModel,
+        records: Sequence[Record],
+        candidates: Iterable[str] = (),
+        settings: Settings = SETTINGS,
+        progress: Progress | None = None,
+    ) -> "Problem":
+        """The problem of naming some of the candidates, the vehicle's own numbers free.
+
+        Args:
+            model: the helicopter as a state-space model.
+            records: the runs to fit.
+            candidates: effects of the catalogue.
+            settings: what decides.
+            progress: called with a line of text.
+        """
+        return cls(
+            model,
+            Engine(model, records),
+            tuple(model.base_parameters()),
+            {effect: tuple(model.effect_parameters(effect)) for effect in candidates},
+            settings=settings,
+            progress=progress,
+        )
+
+    # --- what may be free ---------------------------------------------------------------------------
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """Effects that may be named."""
+        return tuple(self.own)
+
+    @property
+    def parameters(self) -> list[FreeParameter]:
+        """Every parameter that may be free, in the order of the quadratic."""
+        return [*self.base, *(f for group in self.own.values() for f in group), *self.added]
+
+    def with_free(self, parameters: Iterable[FreeParameter]) -> "Problem":
+        """With more parameters that are free whatever effects are active."""
+        return replace(self, added=(*self.added, *parameters))
+
+    def with_fixed(self, names: Collection[str]) -> "Problem":
+        """Without some of those."""
+        return replace(self, added=tuple(f for f in self.added if f.name not in names))
+
+    def with_records(self, records: Sequence[Record]) -> "Problem":
+        """On other records."""
+        return replace(self, engine=Engine(self.model, records, self.engine.threads))
+
+    # --- what is free with some effects active --------------------------------------------------------
+
+    def base_names(self, active: Collection[str]) -> list[str]:
+        """Parameters that are free whatever is active, but for those that an active effect replaces."""
+        replaced = {b for e in active for b in effects.CATALOGUE[e].replaces}
+        return [f.name for f in (*self.base, *self.added) if f.name not in replaced]
+
+    def free_names(self, active: Collection[str]) -> list[str]:
+        """Those, and the active effects' own."""
+        return self.base_names(active) + [f.name for e in active for f in self.own[e]]
+
+    def free(self, active: Collection[str]) -> list[FreeParameter]:
+        """The free parameters themselves."""
+        names = set(self.free_names(active))
+        return [f for f in self.parameters if f.name in names]
+
+    def free_of_vehicle(self, active: Collection[str]) -> list[FreeParameter]:
+        """Those of them that a vehicle file can hold."""
+        return [f for f in self.free(active) if f.name not in P.COMMAND_GAINS]
+
+    def acting_names(self, effect: str) -> list[str]:
+        """An effect's parameters that act as soon as it does (no shapes)."""
+        shapes = {p.name for p in effects.CATALOGUE[effect].parameters if p.shape}
+        return [f.name for f in self.own[effect] if f.name.split(".")[1] not in shapes]
+
+    def file_values(self, effect: str) -> dict[str, float]:
+        """Values that the base parameters replaced by an effect go back to."""
+        return {b: self.model.bare_values[b] for b in effects.CATALOGUE[effect].replaces}
+
+    def off_values(self, effect: str) -> dict[str, float]:
+        """Values at which an effect is not there."""
+        return {f.name: f.value for f in self.own[effect]}
+
+    # --- work -----------------------------------------------------------------------------------------
+
+    def report(self, text: str) -> None:
+        """Report progress."""
+        if self.progress:
+            self.progress(text)
+
+    def for_each(self, work: Callable[[str], T], of: Sequence[str]) -> dict[str, T]:
+        """What is found for each effect, several at once, so that no core idles over a last run."""
+        with ThreadPoolExecutor(self.engine.threads) as pool:
+            return dict(zip(of, pool.map(work, of), strict=True))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model with some effects active, fitted or on its way there.
+
+    Attributes:
+        active: effects in the model, in the order in which they came.
+        values: of all parameters.
+        noise: levels of process and reading noise.
+        objective: minus the log-posterior at its last evaluation [nats].
+        levels: the process-noise levels that are fitted.
+        std_ratio: std of an effect's parameter by the likelihood's own curvature over that by the
+            signatures; 1 where it is not known (refinement.py).
+        history: (move, nats) of the search, in order.
+        strongest: evidence [nats] and name of the candidate that came nearest to being added, or was;
+            the threshold is calibrated on it (scripts/study_diagnosis.py --calibrate).
+    """
+
+    active: tuple[str, ...]
+    values: Mapping[str, float]
+    noise: Noise
+    objective: float = math.inf
+    levels: tuple[str, ...] = GUST_LEVELS
+    std_ratio: Mapping[str, float] = field(default_factory=dict)
+    history: tuple[tuple[str, float], ...] = ()
+    strongest: tuple[float, str] = (-math.inf, "")
+
+    def at(self, values: Mapping[str, float]) -> "Fit":
+        """With some values changed."""
+        return replace(self, values={**self.values, **values})
+
+    def noted(self, move: str, nats: float) -> "Fit":
+        """With a move in its history."""
+        return replace(self, history=(*self.history, (move, nats)))
+
+    def rest(self, effect: str) -> tuple[str, ...]:
+        """The active effects but for one."""
+        return tuple(e for e in self.active if e != effect)

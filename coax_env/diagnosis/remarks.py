@@ -1,0 +1,117 @@
+"""What a reader should know beside the findings: white process noise, unusual sizes, unseen effects."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from coax_env.diagnosis.confounding import Alternatives
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.vibration import Line
+from coax_env.estimation.helicopter import FARTHEST, UNUSUAL, WHITE_LEVELS
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import FreeParameter
+
+
+def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternatives) -> list[str]:
+    """Every remark on a finished diagnosis.
+
+    Args:
+        problem, fit: with the causes.
+        quadratic: linearised at the fit.
+        found: the confounded alternatives of each cause.
+    """
+    return [
+        *_white_noise(problem, fit),
+        *_unusual_sizes(problem, fit),
+        *_moved_base(problem, fit),
+        *_resting_on_unseen(problem, fit, quadratic, found),
+    ]
+
+
+def vibration_removed(line: Line) -> str:
+    """That a vibration was taken out of the accelerometers."""
+    return (
+        f"the accelerometers vibrate at the {line.rotor} rotor's speed by {line.amplitude:.2g} m/s2:"
+        " that line was taken out of their readings before anything else was looked for"
+    )
+
+
+def _white_noise(problem: Problem, fit: Fit) -> list[str]:
+    """The levels of white process noise, where they are well above their floor."""
+    process, floor = fit.noise.process, fit.noise.floor
+    least = problem.settings.white_noise_reported
+    if not any(process[level] > least * floor[level] for level in WHITE_LEVELS):
+        return []  # what seemed to shake the bare model has found its cause
+    xy, z, moment_xy, moment_z = (process[level] for level in WHITE_LEVELS)
+    return [
+        "white process noise beside the gusts, x and y, z:"
+        f" force {xy:.2g}, {z:.2g} N s^1/2, moment {moment_xy:.2g}, {moment_z:.2g} N m s^1/2"
+    ]
+
+
+def _unusual_sizes(problem: Problem, fit: Fit) -> list[str]:
+    texts = []
+    for f in (f for effect in fit.active for f in problem.own[effect]):
+        value = fit.values[f.name]
+        size = abs(value - f.value)
+        if size > 0.99 * FARTHEST * f.std:
+            texts.append(
+                f"{f.name} stands at the limit of what is believed, {value:.3g}:"
+                " something else hides behind this name"
+            )
+        elif size > UNUSUAL * f.std:
+            texts.append(
+                f"{f.name} = {value:.3g} is outside its usual range"
+                f" ({f.value:g} +- {f.std:g}): take the name with care"
+            )
+    return texts
+
+
+def _moved_base(problem: Problem, fit: Fit) -> list[str]:
+    texts = []
+    for f in problem.free(fit.active):
+        if "." not in f.name:
+            value = fit.values[f.name]
+            sigmas = (value - f.value) / f.std
+            if abs(sigmas) > 2.0:
+                texts.append(
+                    f"base parameter {f.name} moved {sigmas:+.1f} prior sigmas,"
+                    f" from {f.value:.4g} to {value:.4g}"
+                )
+    return texts
+
+
+def _resting_on_unseen(
+    problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternatives
+) -> list[str]:
+    """Causes' numbers that an effect which these flights cannot show would change.
+
+    An interval covers what is in the model. A usual accelerometer scale is worth nothing on flights
+    that never leave 1 g, and is then in the accelerometer's bias.
+    """
+    chosen = problem.settings
+    free = problem.free_names(fit.active)
+    std = np.sqrt(np.diag(quadratic.covariance(free)))
+    unseen = list(_not_named(problem, fit, found))
+    information, regression = quadratic.projected([f.name for f in unseen], free)
+    of_cause = np.array([name.partition(".")[0] in fit.active for name in free], bool)
+    worst: dict[str, tuple[float, str]] = {}
+    for f, known, weights in zip(unseen, np.diag(information), regression.T, strict=True):
+        if 0.5 * known * f.std**2 > chosen.evidence:
+            continue
+        moved = np.abs(weights) * f.std
+        for k in np.flatnonzero(of_cause & (moved > chosen.moved_by_unseen * std)):
+            name, effect = free[k], f.name.partition(".")[0]
+            text = (
+                f"{name} = {fit.values[name]:.3g} holds without {effect}: a usual {f.name}"
+                f" ({f.std:.2g}) cannot be seen here and would move it by {moved[k]:.2g}"
+            )
+            worst[name] = max(worst.get(name, (0.0, "")), (float(moved[k] / std[k]), text))
+    return [text for _, text in sorted(worst.values(), reverse=True)[: chosen.most_warnings]]
+
+
+def _not_named(problem: Problem, fit: Fit, found: Alternatives) -> Iterable[FreeParameter]:
+    named = {*fit.active}.union(*found.values())
+    for effect in problem.candidates:
+        if effect not in named:
+            yield from (f for f in problem.own[effect] if f.probe == 0.0)

@@ -1,0 +1,189 @@
+"""What adding, removing or swapping an effect is worth, by the quadratic alone.
+
+A set of effects is scored by minimising the quadratic over the base parameters, the effects already
+active and the candidate's, the base parameters always under their priors: no effect is credited with
+what a better thrust coefficient would have done. The score is a log Bayes factor in nats: the gain of
+the objective less the Laplace (Occam) factor of the added parameters, whose prior is their usual size.
+
+An effect that is the same column as a base parameter (`replaces`) takes that parameter's place: the
+base parameter goes back to its file value.
+"""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from coax_env.diagnosis.fits import at_optimum
+from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
+from coax_env.estimation.engine import objective
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.model import effects
+
+
+@dataclass(frozen=True)
+class Score:
+    """What an effect that is not active would bring.
+
+    Attributes:
+        effect: its name.
+        nats: log Bayes factor of adding it.
+        evidence: what the threshold is compared with: for an effect that replaces base parameters,
+            against those held at their file values.
+        large: whether it matters in prediction at the size that it would have.
+    """
+
+    effect: str
+    nats: float
+    evidence: float
+    large: bool
+
+
+def score(problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str) -> Score:
+    """Log Bayes factor of adding an effect.
+
+    Args:
+        problem: what may be free.
+        quadratic: linearised at the fit.
+        active: effects in the model.
+        effect: the candidate.
+    """
+    free = problem.free_names(active)
+    fixed = problem.file_values(effect)
+    rest = [n for n in free if n not in fixed]
+    own = problem.acting_names(effect)
+    now, _ = quadratic.best(free)
+    then, move = quadratic.best(rest + own, fixed)
+    occam = quadratic.occam(own, rest)
+    gain = now - then
+    large = is_large(problem, effect, quadratic.moved(move))
+    if not fixed:
+        return Score(effect, gain - occam, gain - occam, large)
+    held, _ = quadratic.best(rest, fixed)
+    return Score(effect, gain, held - then - occam, large)
+
+
+def scores(
+    problem: Problem, fit: Fit, quadratic: Quadratic, banned: Collection[str] = ()
+) -> list[Score]:
+    """Effects that are not active, may be, and gain something that matters; the best first.
+
+    Args:
+        problem, fit: what may be free, and where.
+        quadratic: linearised at the fit.
+        banned: effects that may not be added now.
+    """
+    found = []
+    for effect in problem.candidates:
+        if effect not in banned and not ({effect} | exclusive_with(effect)) & set(fit.active):
+            candidate = score(problem, quadratic, fit.active, effect)
+            if candidate.large and candidate.nats > 0.0:
+                found.append(candidate)
+    return sorted(found, key=lambda candidate: -candidate.nats)
+
+
+def is_large(problem: Problem, effect: str, values: Mapping[str, float]) -> bool:
+    """Whether an effect at these values matters in prediction.
+
+    One that replaces a base parameter must move it by more than twice its prior std (contract).
+    """
+    entry = effects.CATALOGUE[effect]
+    sizes = [
+        abs(values[full] - p.off) / p.smallest
+        for full, p in zip(entry.names(), entry.parameters, strict=True)
+        if p.smallest > 0.0
+    ]
+    for base in entry.replaces:
+        old = problem.model.vehicle.parameters[base]
+        relative = abs(values[entry.names()[0]])
+        relative /= 1.0 if entry.parameters[0].unit == "1" else old.value
+        if relative < 2.0 * old.std / old.value:
+            return False
+    return max(sizes) >= 1.0
+
+
+def loss(
+    problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str, inflation: float
+) -> float:
+    """Nats lost when an active effect leaves and the rest is refitted, Occam factor returned.
+
+    Args:
+        problem: what may be free.
+        quadratic: linearised at the fit.
+        active: effects in the model.
+        effect: that leaves.
+        inflation: variance inflation by which the loss is divided; 1 for white innovations.
+    """
+    free = problem.free_names(active)
+    now, _ = quadratic.best(free)
+    rest = [n for n in free if not n.startswith(effect + ".")]
+    fixed = problem.off_values(effect) | problem.file_values(effect)
+    then, _ = quadratic.best(rest, fixed)
+    return (then - now) / inflation - quadratic.occam(problem.acting_names(effect), rest)
+
+
+def inflation(problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str) -> float:
+    """Variance inflation by coloured innovations in an active effect's direction, at least 1."""
+    own, free = problem.acting_names(effect), problem.free_names(active)
+    return quadratic.variance_inflation(own, free)
+
+
+def swap(
+    problem: Problem, quadratic: Quadratic, active: Sequence[str], old: str, new: str
+) -> tuple[float, np.ndarray]:
+    """Change of the objective when one effect stands for another.
+
+    Args:
+        problem: what may be free.
+        quadratic: linearised at the fit.
+        active: effects in the model.
+        old: the one that leaves.
+        new: the one that comes.
+
+    Returns:
+        nats, Occam factors in, and the move of all parameters (k,).
+    """
+    now, _ = quadratic.best(problem.free_names(active))
+    others = [e for e in active if e != old]
+    rest = [n for n in problem.free_names(others) if n not in problem.file_values(new)]
+    fixed = problem.off_values(old) | problem.file_values(new)
+    then, move = quadratic.best(rest + problem.acting_names(new), fixed)
+
+    def occam(effect: str) -> float:
+        if problem.file_values(effect):
+            return 0.0
+        return quadratic.occam(problem.acting_names(effect), rest)
+
+    return then + occam(new) - now - occam(old), move
+
+
+def damping_gain(
+    problem: Problem, fit: Fit, quadratic: Quadratic, damping: str
+) -> tuple[float, dict[str, float]]:
+    """Predicted gain of a damping, by the slope of the likelihood itself, Occam factor deducted.
+
+    From one filter pass with a small damping. Signatures hold the gains fixed, so that their slope
+    lacks what the damping does to the gains.
+
+    Args:
+        problem, fit: what may be free, and where.
+        quadratic: linearised at the fit.
+        damping: an effect of the catalogue with `damps`.
+
+    Returns:
+        nats, and the damping's parameter at its optimum.
+    """
+    (f,) = (f for f in problem.own[damping] if f.name in problem.acting_names(damping))
+    rest = problem.free_names(fit.active)
+    information = float(quadratic.projected([f.name], rest)[0][0, 0])
+    if information <= 0.0:
+        return -math.inf, {}
+    step = min(f.std, problem.settings.damping_probe / math.sqrt(information))
+    there = at_optimum(problem, fit, quadratic, fit.active, {f.name: f.value + step})
+    passes = problem.engine.filter(there.values, there.noise)
+    gained = fit.objective - objective(passes, problem.free(fit.active), there.values)
+    gained += quadratic.best(rest)[0]  # what the others would gain without it
+    slope = gained / step + 0.5 * information * step
+    size = min(max(slope / (information + 1.0 / f.std**2), 0.0), f.upper - f.value)
+    return 0.5 * slope * size - quadratic.occam([f.name], rest), {f.name: f.value + size}

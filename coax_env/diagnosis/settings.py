@@ -1,0 +1,98 @@
+"""Every number by which the diagnosis decides, with its unit and where it comes from.
+
+Evidence is a log Bayes factor in nats. "Measured" means on synthetic flights by other code
+(tests/injector.py, scripts/study_diagnosis.py); "ours" is a choice that no figure is sensitive to.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Thresholds, tolerances and limits of the search, of the generic terms and of the report."""
+
+    # --- what a cause must be worth ----------------------------------------------------------------
+    evidence: float = 14.0
+    """nats; measured: 1 % of 200 clean flights reach 11.1 (8.9 to 13.5), calibration.json."""
+    tie: float = 6.0
+    """nats within which alternatives are confounded: odds of 400 to 1, ours."""
+    most_causes: int = 10
+    """Ours; a bound on time."""
+
+    # --- fits --------------------------------------------------------------------------------------
+    step_gain: float = 2.0
+    """nats: a Gauss-Newton step with a smaller predicted gain is not worth its time; ours."""
+    most_steps: int = 4
+    """Gauss-Newton steps of one fit during the search; ours."""
+    most_turns: int = 6
+    """Turns of noise levels and parameters until both have converged; ours."""
+    noise_fit_seconds: float = 60.0
+    """s of flight on which noise levels are fitted while the search goes on; ours."""
+    noise_evaluations: int = 5
+    """Likelihoods of a fit of the noise levels from where they stand; ours."""
+    first_noise_evaluations: int = 10
+    """The same from a guess; ours."""
+    refinement_gain: float = 0.02
+    """nats that the last step of a final fit may still predict: a fifth of a standard deviation.
+
+    step_gain would leave two, and always on the side that the search came from.
+    """
+    most_refinements: int = 4
+    """Newton steps of the final refinement; ours."""
+    difference_step: float = 0.3
+    """std: step of a difference of log-likelihoods; ours."""
+    std_ratio_bounds: tuple[float, float] = (0.5, 2.0)
+    """What the likelihood's own curvature may do to a standard deviation; ours."""
+
+    # --- moves of the search -----------------------------------------------------------------------
+    trial_share: float = 0.5
+    """Share of `evidence` from which an effect that the quadratic does not carry is fitted as a trial.
+
+    Measured: a damping worth 29 nats once fitted had a predicted gain of 11.
+    """
+    damping_probe: float = 4.0
+    """std by the signatures, at which a damping is given to the likelihood itself; ours."""
+    add_before_fitted: float = 10.0
+    """An effect with a score of so many times the predicted gain of another step is added at once."""
+    most_failures: int = 3
+    """Additions in a row that do not hold before the search ends; ours."""
+    most_trials: int = 3
+    """Swaps, additions and confounded alternatives that are fitted at once, best first; ours."""
+    clear_evidence: float = 10.0
+    """Thresholds that a cause is worth after a first refit without it, to need no closer one; ours."""
+
+    # --- white process noise -----------------------------------------------------------------------
+    white_noise_score: float = 2.0
+    """std of the score by which white noise must want to be more before its levels are fitted; ours."""
+    white_noise_start: float = 0.2
+    """s^1/2: level to start from, per gust level: a gust whose memory is 20 ms."""
+
+    # --- generic terms -----------------------------------------------------------------------------
+    term_evidence: float = 28.0
+    """nats a generic term must be worth: twice an effect, of which there are a tenth as many."""
+    term_evidence_white: float = 56.0
+    """nats, on an axis whose innovations are white. Measured: on a clean gusty flight of eight runs
+    the best of all terms on all axes reached 4, a moment a sin(3 psi) of the gusts' own rms 155."""
+    term_share: float = 0.4
+    """Share of an axis' estimated disturbance that a term must follow: on real flights everything is
+    a little coloured, and some term is always worth a few nats."""
+    terms_screened: int = 10
+    """Candidates of an axis that are looked at by their signatures; ours."""
+    most_terms: int = 4
+    """Taken in all; ours."""
+
+    # --- hold-out, gain and report -----------------------------------------------------------------
+    horizon: float = 1.0
+    """s flown open loop for the gain (contract)."""
+    fewest_runs: int = 4
+    """With fewer runs, the last third of each is held out (contract)."""
+    white_noise_reported: float = 5.0
+    """Times its floor above which a level of white process noise is reported; ours."""
+    moved_by_unseen: float = 5.0
+    """std that an effect which these flights cannot show must move a number to be reported; ours."""
+    most_warnings: int = 3
+    """Such remarks; ours."""
+
+
+SETTINGS = Settings()
+"""What the diagnosis uses, and what its calibration and studies were measured with."""

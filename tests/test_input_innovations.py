@@ -1,0 +1,145 @@
+"""Input innovations: the regression, the correction of the filter, and what it is good for."""
+
+from dataclasses import replace
+
+import injector
+import numpy as np
+import pytest
+
+from coax_env import read_flight
+from coax_env.diagnosis.fits import converged, fitted, linearise, start
+from coax_env.diagnosis.input_innovations import (
+    clipped_residual,
+    has_command_gains,
+    with_command_gains,
+    with_input_innovations,
+)
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation import kalman
+from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.prediction import fly_again
+from coax_env.model import parameters as P
+from coax_env.model.layout import CHANNELS, GUSTS
+from coax_env.model.vehicle import load_vehicle
+
+LAMA = load_vehicle("lama400d")
+
+
+def problem_on(folder, candidates=()) -> tuple[Problem, Fit]:
+    flight = read_flight(folder)
+    model = HeliModel(LAMA.in_air(flight.air))
+    problem = Problem.of(model, [record_of(run) for run in flight.runs], candidates)
+    return problem, start(problem, starting_noise(flight, model.vehicle))
+
+
+def test_the_residual_is_what_is_not_predicted():
+    """Planted: a linear pilot, white innovations, and a maneuver's steps, which are none."""
+    rng = np.random.default_rng(1)
+    known = rng.standard_normal((3000, 6)) * [1.0, 0.1, 10.0, 1e-3, 1.0, 1.0]
+    planted = 0.01 * rng.standard_normal(3000)
+    change = known @ [0.02, -0.5, 0.003, 20.0, 0.0, -0.01] + 0.3 + planted
+    steps = rng.choice(3000, 40, replace=False)
+    change[steps] += rng.choice([-0.5, 0.5], 40)
+    found = clipped_residual(known, change)
+    quiet = np.setdiff1d(np.flatnonzero(np.abs(planted) < 0.015), steps)
+    assert np.corrcoef(found[quiet], planted[quiet])[0, 1] > 0.98
+    assert np.abs(found).max() < 0.025  # two standard deviations and a little
+
+
+def test_a_command_that_is_held_has_no_innovation():
+    """A radio at a third of the log's rate says nothing in the rows between."""
+    rng = np.random.default_rng(2)
+    known = rng.standard_normal((900, 4))
+    change = np.zeros(900)
+    change[::3] = (known @ [0.1, 0.2, 0.0, 0.0] + 0.05 * rng.standard_normal(900))[::3]
+    found = clipped_residual(known, change)
+    assert not found[change == 0.0].any()
+    assert np.std(found[::3]) > 0.03
+    assert not clipped_residual(known, np.zeros(900)).any()
+
+
+@pytest.mark.slow
+def test_without_gains_innovations_change_nothing_and_a_gain_moves_its_state(tmp_path):
+    injector.fly(tmp_path, {}, gusts=True, sensors="onboard", seed=5, runs=("hover",))
+    problem, fit = problem_on(tmp_path)
+    before = problem.engine.log_likelihood(fit.values, fit.noise)
+    engine = with_input_innovations(problem.engine, fit)
+    record = engine.records[0]
+    assert record.input_innovations.shape == (record.t.size, 4)
+    assert problem.engine.records[0].input_innovations is None, "the problem stays as it was"
+    assert engine.log_likelihood(fit.values, fit.noise) == pytest.approx(before)
+    for name in P.COMMAND_GAINS:
+        moved = engine.log_likelihood({**fit.values, name: 1e-3}, fit.noise)
+        assert moved != pytest.approx(before, abs=1e-9), name
+
+
+@pytest.mark.slow
+def test_a_replay_has_no_innovations_in_its_open_loop(tmp_path):
+    """They correct the state that a replay starts from, and nothing after: the future is not seen."""
+    injector.fly(tmp_path, {}, gusts=True, sensors="onboard", seed=5, runs=("hover",))
+    problem, fit = problem_on(tmp_path)
+    engine = with_input_innovations(problem.engine, fit)
+    plain, same = (fly_again(e, fit.values, fit.noise)[0] for e in (problem.engine, engine))
+    gains = {**fit.values, "command_gain.moment_xy": 5e-3}
+    moved = fly_again(engine, gains, fit.noise)[0]
+    (run,) = engine.filter(gains, fit.noise)
+    for channel in ("phi", "h"):
+        np.testing.assert_array_equal(plain.channels[channel].predicted,
+                                      same.channels[channel].predicted)  # fmt: skip
+    assert not np.array_equal(plain.channels["phi"].predicted, moved.channels["phi"].predicted)
+    # the last start's prediction by hand, from the filtered state with the bare inputs
+    first = moved_start(engine.records[0].t)
+    out = np.full(len(CHANNELS), np.nan)
+    x = run.states[first].copy()
+    x[GUSTS] = 0.0
+    inputs = engine.model.inputs(problem.engine.records[0], engine.model.vector(gains))
+    targets = np.full(len(CHANNELS), -1, np.int64)
+    phi = CHANNELS.index("phi")
+    t_end = moved.channels["phi"].t[-1]
+    targets[phi] = int(np.argmin(np.abs(engine.records[0].t - t_end)))
+    kalman.fly_open_loop(
+        engine.model.step, engine.model.measure, engine.intervals[0], inputs, x,
+        engine.model.vector(gains), engine.model.work_size, first, targets, out,
+    )  # fmt: skip
+    assert out[phi] == pytest.approx(moved.channels["phi"].predicted[-1], abs=1e-12)
+
+
+def moved_start(t: np.ndarray, horizon: float = 1.0) -> int:
+    """Row of a replay's last start: every 0.25 s after 1 s (contract.md)."""
+    times = np.arange(t[0] + 1.0, t[-1] - horizon + 1e-9, 0.25)
+    return int(np.searchsorted(t, times[-1] - 1e-6))
+
+
+def test_in_still_air_the_commands_carry_no_information(tmp_path):
+    injector.fly(tmp_path, {}, gusts=False, sensors="full", seed=3, runs=("lon_3211", "hover"))
+    problem, fit = problem_on(tmp_path)
+    fit = fitted(problem, fit)
+    after, same = with_command_gains(problem, fit)
+    assert after is problem and same is fit
+    assert not has_command_gains(after)
+
+
+@pytest.mark.slow
+def test_a_pilot_who_sees_the_gusts_is_not_taken_for_a_late_servo(tmp_path):
+    """The generator's pilot flies on the true state. There is no delay and the inertias are right."""
+    injector.fly(tmp_path, {}, gusts=True, sensors="onboard", seed=11)
+    problem, fit = problem_on(tmp_path, ("servo_delay",))
+
+    def sigmas(problem: Problem, fit: Fit) -> dict[str, float]:
+        with_delay = replace(fit.at({"servo_delay.time": 0.01}), active=("servo_delay",))
+        found, _, quadratic = linearise(problem, converged(problem, with_delay))
+        names = problem.free_names(["servo_delay"])
+        std = np.sqrt(np.diag(quadratic.covariance(names)))
+        return {
+            f.name: (found.values[f.name] - f.value) / std[names.index(f.name)]
+            for f in problem.free(["servo_delay"])
+        }
+
+    fit = converged(problem, fit)
+    without = sigmas(problem, fit)
+    wider, fit = with_command_gains(problem, fit)
+    assert has_command_gains(wider)
+    with_gains = sigmas(wider, converged(wider, fit))
+    assert without["servo_delay.time"] > 3.0 and without["inertia_zz"] > 1.0
+    assert with_gains["servo_delay.time"] < 3.0 and abs(with_gains["inertia_zz"]) < 2.0
+    assert with_gains["command_gain.rate_xy"] < -3.0  # the pilot steers against what he sees
