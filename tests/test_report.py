@@ -16,7 +16,7 @@ from coax_env.diagnosis.diagnose import Diagnosis
 from coax_env.estimation.prediction import ChannelReplay, RunReplay
 from coax_env.estimation.trajectories import RESTART, trajectories
 from coax_env.estimation.whiteness import Whiteness
-from coax_env.identification.identify import RunEstimate
+from coax_env.identification.maximum_likelihood import RunEstimate
 from coax_env.model import effects
 from coax_env.model.layout import STATES
 from coax_env.model.vehicle import Parameter

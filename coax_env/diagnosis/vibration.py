@@ -152,7 +152,7 @@ def _line(flight: Flight, rotor: str) -> Line | None:
     }  # power over the neighbours' mean
     squares: list[float] = []  # amplitude squared, by segment and axis
     for run in flight.runs:
-        for channel in set(ACCELEROMETERS) & set(run.measured):
+        for channel in (c for c in ACCELEROMETERS if c in run.measured):
             segments = list(_segments(run, channel, rotor))
             powers, beside = (
                 [],

@@ -16,7 +16,7 @@ from coax_env.diagnosis.fits import start
 from coax_env.diagnosis.problem import Problem
 from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.identification.identify import left_open
+from coax_env.identification.undetermined import left_open
 from coax_env.logs.flight import Flight
 from coax_env.model import effects
 from coax_env.model.vehicle import Vehicle

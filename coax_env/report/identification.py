@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from scipy.stats import chi2
 
 from coax_env.estimation.prediction import RunReplay
-from coax_env.identification.identify import RunEstimate
+from coax_env.identification.maximum_likelihood import RunEstimate
 from coax_env.logs.flight import Flight
 from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import and_list, capital, channel_name, number, plain, with_std

@@ -1,7 +1,8 @@
 """The evidence that a share of clean flights reaches: what the search's threshold is calibrated to.
 
-Each clean flight gives the evidence of the candidate that came nearest to being named (`Fit.strongest`), all of them false. The tail above its upper quartile is taken as exponential,
-which is what a likelihood ratio's tail is; the interval is a bootstrap's over flights.
+Each clean flight gives the evidence of the candidate that came nearest to being named
+(`Fit.strongest`), all of them false. The tail above its upper quartile is taken as exponential, which
+is what a likelihood ratio's tail is; the interval is a bootstrap's over flights.
 """
 
 import math
