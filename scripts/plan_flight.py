@@ -4,8 +4,8 @@ from dataclasses import fields
 
 import command_line
 
+from coax_env.design.candidates import Envelope
 from coax_env.design.flight_plan import plan_flight, write_plan
-from coax_env.design.next_maneuver import Envelope
 from coax_env.model.sensors import SUITES
 from coax_env.simulation.simulate import Gusts
 

@@ -19,7 +19,7 @@ from shared_flights import shared_flight
 
 import coax_env
 from coax_env import diagnose, identify, load_vehicle, read_flight, replay
-from coax_env.design.next_maneuver import candidates
+from coax_env.design.candidates import candidates
 from coax_env.diagnosis.corrected_vehicle import with_held_out
 from coax_env.diagnosis.diagnose import Diagnosis
 from coax_env.diagnosis.fits import at_optimum, converged, fitted, linearise, noise_fitted, start

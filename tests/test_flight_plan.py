@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from coax_env import identify, load_vehicle, read_flight, simulate
+from coax_env.design.candidates import Envelope
 from coax_env.design.flight_plan import plan_flight, stirring, write_plan
-from coax_env.design.next_maneuver import Envelope
 from coax_env.errors import InputError
 from coax_env.simulation.multisine import UPDATE, harmonics, multisines, relative_peak_factor
 from coax_env.simulation.simulate import fly
@@ -76,7 +76,7 @@ def test_the_expected_std_is_what_identification_then_reports(tmp_path):
 
 @pytest.mark.slow
 def test_the_envelope_is_kept_by_every_vehicle_of_the_spread():
-    tight = Envelope(tilt=np.radians(6.0), room=3.0)
+    tight = Envelope(tilt=np.radians(6.0), distance=3.0)
     plan = plan_flight(LAMA, runs=2, envelope=tight)
     assert len(plan.refused) > 5
     for run in plan.runs:

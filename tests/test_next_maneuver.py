@@ -7,16 +7,10 @@ import numpy as np
 import pytest
 
 from coax_env import load_vehicle, read_flight
-from coax_env.design.next_maneuver import (
-    ROW,
-    Alternative,
-    Envelope,
-    advise,
-    candidates,
-    design,
-    distance,
-    write_flight_card,
-)
+from coax_env.design.candidates import Envelope, candidates
+from coax_env.design.discrimination import ROW, Alternative, distance
+from coax_env.design.flight_card import write_flight_card
+from coax_env.design.next_maneuver import advise, design
 from coax_env.diagnosis.fits import fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import Engine
@@ -194,7 +188,7 @@ def test_every_candidate_but_few_is_safe_with_the_bare_vehicle():
         (Envelope(ceiling=1.6), HEAVE),
         (Envelope(lowest=1.45), HEAVE),
         (Envelope(speed=1.0), maneuver("forward_run")),
-        (Envelope(room=3.0), maneuver("forward_run")),
+        (Envelope(distance=3.0), maneuver("forward_run")),
         (Envelope(tilt=math.radians(3.0)), maneuver("lon_3211")),
         (Envelope(turning=math.radians(5.0)), maneuver("yaw_3211")),
     ],

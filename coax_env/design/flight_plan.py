@@ -17,14 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from coax_env.design.next_maneuver import (
-    ROW,
-    Envelope,
-    asked_csv,
-    candidates,
-    expected_information,
-    instruction,
-)
+from coax_env.design.candidates import Envelope, candidates
+from coax_env.design.discrimination import ROW, expected_information
+from coax_env.design.flight_card import asked_csv, instruction
 from coax_env.errors import InputError
 from coax_env.estimation.helicopter import LEAST_READING_STD, HeliModel, starting_noise
 from coax_env.estimation.state_space import FreeParameter, Noise

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from coax_env.design import next_maneuver
+from coax_env.design.discrimination import Alternative, logged_rates
+from coax_env.design.next_maneuver import Design, design
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.fits import fitted
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
@@ -128,7 +129,7 @@ def separating_maneuver(
     found: Alternatives,
     strongest_first: Sequence[str],
     flight: Flight,
-) -> next_maneuver.Design | None:
+) -> Design | None:
     """The maneuvers that separate the strongest confounded cause from its alternatives.
 
     What the flights determine of the alternatives' numbers is taken from the final quadratic.
@@ -144,13 +145,13 @@ def separating_maneuver(
     if confounded is None:
         return None
     problem.report("designing the next maneuver")
-    designs = []
+    described = []
     for name, refit in {confounded: fit, **found[confounded]}.items():
         free = problem.free_of_vehicle(refit.active)
         i = quadratic.index([f.name for f in free])
-        designs.append(
-            next_maneuver.Alternative.of(
+        described.append(
+            Alternative.of(
                 name, problem.model.vehicle, free, refit.values, quadratic.G[np.ix_(i, i)]
             )
         )
-    return next_maneuver.design(designs, fit.noise, next_maneuver.logged_rates(flight))
+    return design(described, fit.noise, logged_rates(flight))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coax_env.design.next_maneuver import logged_rates
+from coax_env.design.discrimination import logged_rates
 from coax_env.estimation.helicopter import sensor_std
 from coax_env.logs.flight import GAP, Flight, Run
 from coax_env.model.layout import CHANNEL_UNITS
