@@ -18,6 +18,11 @@ def write_flight_card(result: Design, flight: Flight, folder: str | Path) -> Pat
     ``card.toml`` and the run's CSV are a flight folder that `read_flight` reads: the commands that
     the simulated pilot gave on the first description. ``asked.csv`` is for a pilot or an autopilot:
     what to hold, and what to add to his own commands.
+
+    Args:
+        result: the design.
+        flight: whose vehicle, air and noise go onto the card.
+        folder: where it is written.
     """
     plan = result.ranked[0].maneuver
     flown = fly(result.alternatives[0].vehicle, plan)

@@ -77,24 +77,24 @@ def plan_flight(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> FlightPlan:
-    """The maneuvers that are expected to tell most of a vehicle's numbers.
+    """The maneuvers that are expected to determine a vehicle's numbers best.
 
     Args:
+        vehicle: a Vehicle, name or path.
         learn: names of base parameters, of effects (all their parameters), or ``effect.parameter``;
             none: every base parameter with a std.
-        runs: how many maneuvers. sensors: suite of `sensors.SUITES`, as it will be logged.
+        runs: how many maneuvers.
+        sensors: suite of `sensors.SUITES`, as it will be logged.
         gusts: of the air on the day; None: still.
         envelope: that every maneuver must stay in, whichever vehicle of the spread is true.
         seed: of the draws.
+        progress: called with a line of text.
 
     Raises:
         InputError: nothing of that name to learn, or no maneuver stays inside the envelope.
     """
 
-    def say(text: str) -> None:
-        if progress:
-            progress(text)
-
+    report = progress or (lambda text: None)
     if runs < 1:
         raise InputError(f"a plan needs one run at least, found {runs}")
     vehicle = load_vehicle(vehicle)
@@ -108,25 +108,25 @@ def plan_flight(
     rng = np.random.default_rng(seed)
     spread = [vehicle.draw(rng) for _ in range(DRAWS)]
     known = np.diag([f.std**-2 for f in free])
-    told: list[tuple[Maneuver, Track, np.ndarray]] = []
+    safe: list[tuple[Maneuver, Track, np.ndarray]] = []
     refused = []
     options = (*candidates(), *stirring())
     for k, option in enumerate(options):
-        say(f"flying {option.name} ({k + 1} of {len(options)})")
+        report(f"flying {option.name} ({k + 1} of {len(options)})")
         flown, why = _safe(vehicle, spread, option, envelope)
         if flown is None:
             refused.append((option, why))
         else:
-            told.append((option, flown, expected_information(flown, vehicle, free, noise, rates)))
-    if not told:
+            safe.append((option, flown, expected_information(flown, vehicle, free, noise, rates)))
+    if not safe:
         raise InputError(f"no maneuver stays inside the envelope: {refused[0][1]}")
     index = np.array([k for k, f in enumerate(free) if f.name in wanted])
     picked = []
     for _ in range(runs):
         before = _uncertainty(known, index)
-        gains = [before - _uncertainty(known + information, index) for *_, information in told]
+        gains = [before - _uncertainty(known + information, index) for *_, information in safe]
         best = int(np.argmax(gains))
-        option, flown, information = told[best]
+        option, flown, information = safe[best]
         known = known + information
         picked.append(PlannedRun(option, flown, float(gains[best])))
     after = np.sqrt(np.diag(np.linalg.inv(known)))

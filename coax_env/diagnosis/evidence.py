@@ -24,7 +24,12 @@ class Evidence:
 
 
 def weigh(problem: Problem, fit: Fit, quadratic: Quadratic) -> dict[str, Evidence]:
-    """Evidence of every active effect."""
+    """Evidence of every active effect.
+
+    Args:
+        problem, fit: what may be free, and where.
+        quadratic: linearised at the fit.
+    """
     chosen = problem.settings
 
     def one(effect: str) -> Evidence:

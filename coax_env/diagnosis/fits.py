@@ -37,7 +37,13 @@ def linearise(problem: Problem, fit: Fit) -> tuple[Fit, list[RunPass], Quadratic
 
 
 def stepped(problem: Problem, fit: Fit, passes: Sequence[RunPass], quadratic: Quadratic) -> Fit:
-    """After a Newton step of what is free, halved until the cost falls."""
+    """After a Newton step of what is free, halved until the cost falls.
+
+    Args:
+        problem, fit: what may be free, and where.
+        passes: of the filter at the fit, whose gains the cost is taken with.
+        quadratic: linearised at the fit.
+    """
     free = problem.free(fit.active)
     _, move = quadratic.best([f.name for f in free])
     moves = {n: float(m) for n, m in zip(quadratic.names, move, strict=True) if m != 0.0}
@@ -66,7 +72,13 @@ def at_optimum(
 
 
 def without(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> Fit:
-    """The fit without an effect, the rest at the quadratic's optimum."""
+    """The fit without an effect, the rest at the quadratic's optimum.
+
+    Args:
+        problem, fit: what may be free, and where.
+        quadratic: linearised at the fit.
+        effect: an active one.
+    """
     fixed = problem.off_values(effect) | problem.file_values(effect)
     return at_optimum(problem, fit, quadratic, fit.rest(effect), fixed)
 
@@ -92,7 +104,12 @@ def fitted(
 
 
 def noise_fitted(problem: Problem, fit: Fit, seconds: float | None = None) -> Fit:
-    """Noise levels fitted from where they stand, on so many seconds of flight."""
+    """Noise levels fitted from where they stand.
+
+    Args:
+        problem, fit: where to begin; parameters stay.
+        seconds: of flight that are enough; default the settings'.
+    """
     chosen = problem.settings
     noise = fit_noise(
         problem.engine, fit.values, fit.noise, fit.levels,
@@ -107,6 +124,10 @@ def converged(problem: Problem, fit: Fit, held: Collection[str] = ()) -> Fit:
 
     Evidence is a difference of two such fits: what one of them lacks in convergence would count for
     the other.
+
+    Args:
+        problem, fit: where to begin.
+        held: names of free parameters that stay.
     """
     for _ in range(problem.settings.most_turns):
         before = fit.objective

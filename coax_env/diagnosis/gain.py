@@ -1,7 +1,7 @@
-"""What mending the model is worth: prediction error before and after, on runs it has not seen.
+"""What correcting the model gains: prediction error before and after, on runs it has not seen.
 
 Per channel e^2 = max(rms^2 - noise_rms^2, 0); the share removed is one minus the mean of
-e_after/e_before (contract.md). Intervals by a block bootstrap over runs and stretches of starts.
+e_after/e_before (contract.md). Intervals by a block bootstrap over runs and blocks of starts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,11 @@ def gain_of(
 ) -> dict[str, Any]:
     """The `gain` of findings.json, without the names of the held-out runs.
 
-    noise: the sensors' std by channel. black_box: the same runs flown by a flexible model.
+    Args:
+        before, refitted, after: the held-out runs flown by the bare, refitted and corrected model.
+        noise: the sensors' std by channel.
+        horizon: seconds flown.
+        black_box: the same runs flown by a flexible model.
     """
     sums = [_block_sums(runs) for runs in (before, refitted, after)]
     channels = [c for c in COMPARED if all(c in s for s in sums)]
@@ -71,7 +75,12 @@ def gain_of(
 
 
 def removed(before: Mapping[str, Any], after: Mapping[str, Any], noise: Mapping[str, float]) -> Any:
-    """Percent of the error removed, averaged over channels that had any."""
+    """Percent of the error removed, averaged over channels that had any.
+
+    Args:
+        before, after: rms by channel, numbers or arrays of draws.
+        noise: the sensors' rms by channel.
+    """
     ratios = []
     for channel, level in noise.items():
         e_before = np.sqrt(np.maximum(np.square(before[channel]) - level**2, 0.0))

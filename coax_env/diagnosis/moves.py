@@ -34,7 +34,12 @@ class Proposal:
 
 
 def accepted(problem: Problem, fit: Fit, proposal: Proposal) -> Fit | None:
-    """The proposed model fitted, where it gains enough and its effect matters in prediction."""
+    """The proposed model fitted, where it gains enough and its effect matters in prediction.
+
+    Args:
+        problem, fit: what may be free, and the fit that must be beaten.
+        proposal: the model.
+    """
     trial = fitted(problem, proposal.begin)
     gained = fit.objective - trial.objective - proposal.occam
     if gained > proposal.needed and is_large(problem, proposal.effect, trial.values):

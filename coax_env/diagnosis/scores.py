@@ -87,6 +87,11 @@ def is_large(problem: Problem, effect: str, values: Mapping[str, float]) -> bool
     """Whether an effect at these values matters in prediction.
 
     One that replaces a base parameter must move it by more than twice its prior std (contract).
+
+    Args:
+        problem: whose vehicle file the base parameter stands in.
+        effect: of the catalogue.
+        values: of all parameters.
     """
     entry = effects.CATALOGUE[effect]
     sizes = [
@@ -124,7 +129,14 @@ def loss(
 
 
 def inflation(problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str) -> float:
-    """Variance inflation by coloured innovations in an active effect's direction, at least 1."""
+    """Variance inflation by coloured innovations in an active effect's direction, at least 1.
+
+    Args:
+        problem: what may be free.
+        quadratic: linearised at the fit.
+        active: effects in the model.
+        effect: one of them.
+    """
     own, free = problem.acting_names(effect), problem.free_names(active)
     return quadratic.variance_inflation(own, free)
 

@@ -72,7 +72,12 @@ class TermHistory:
 
     @classmethod
     def of(cls, problem: Problem, fit: Fit, passes: Sequence[RunPass]) -> "TermHistory":
-        """Evaluated at the filtered states, the first second of each run left out."""
+        """Evaluated at the filtered states, the first second of each run left out.
+
+        Args:
+            problem, fit: whose parameters the terms are evaluated with.
+            passes: of the filter at the fit.
+        """
         p = problem.model.vector(fit.values)
         values, gusts = [], []
         for run in passes:

@@ -155,7 +155,12 @@ class Engine:
     ) -> list[RunPass]:
         """Filter every run (or those in `which`) with these parameter values and noise levels.
 
-        start_rows: per record, rows at which to keep the filtered covariance.
+        Args:
+            values: of the parameters, by name.
+            noise: levels of process and reading noise.
+            keep: store gains and Jacobians of the readings.
+            which: indices of records; None: all.
+            start_rows: per record, rows at which to keep the filtered covariance.
         """
         p = self.model.vector(values)
         q = self.model.process_noise(noise)
@@ -222,7 +227,13 @@ class Engine:
     def log_likelihood(
         self, values: Mapping[str, float], noise: Noise, which: Sequence[int] | None = None
     ) -> float:
-        """Log-likelihood of the records, nats; -inf where a filter diverged."""
+        """Log-likelihood of the records, nats; -inf where a filter diverged.
+
+        Args:
+            values: of the parameters, by name.
+            noise: levels of process and reading noise.
+            which: indices of records; None: all.
+        """
         return float(sum(p.log_likelihood for p in self.filter(values, noise, which=which)))
 
     def linearise(
@@ -232,6 +243,11 @@ class Engine:
 
         A parameter without a slope at its off-value (`probe`) is moved that far in a mean pass of its
         own.
+
+        Args:
+            values: of all parameters, by name.
+            noise: levels of process and reading noise.
+            free: the parameters to differentiate in.
         """
         p, q = self.model.vector(values), self.model.process_noise(noise)
         R = self._reading_variances(noise)
@@ -329,7 +345,15 @@ class Engine:
     ) -> tuple[dict[str, float], float]:
         """Move along a step, halved until the cost at frozen gains falls.
 
-        Returns the new values and the gain, nats (0 and the old values where no shortening helped).
+        Args:
+            passes: of the filter at `values`, whose gains are used.
+            free: parameters with their priors and bounds.
+            values: of all parameters, by name.
+            noise: levels of process and reading noise.
+            moves: change of each parameter that moves.
+
+        Returns:
+            the new values and the gain, nats (0 and the old values where no shortening helped).
         """
         before = self.frozen_cost(passes, free, values, noise)
         limits = {f.name: (f.lower, f.upper) for f in free}
@@ -350,7 +374,14 @@ class Engine:
         values: Mapping[str, float],
         noise: Noise,
     ) -> float:
-        """Half the squared innovations at frozen gains, plus the priors' penalty, nats."""
+        """Half the squared innovations at frozen gains, plus the priors' penalty, nats.
+
+        Args:
+            passes: of a filter, whose gains are used.
+            free: parameters with their priors.
+            values: of all parameters, by name.
+            noise: levels of process and reading noise.
+        """
         p = self.model.vector(values)
 
         def one(i: int) -> float:
@@ -379,8 +410,17 @@ class Engine:
         """Gauss-Newton for the free parameters under their priors, damped and within bounds.
 
         Each step keeps the gains of its own linearisation, then filters anew (iteratively reweighted
-        least squares). Stops when a step promises or gains less than `tolerance` nats. A step that
-        raises the cost at those gains is halved. The covariance is that of the last linearisation.
+        least squares). Stops when the predicted or the actual gain of a step is less than `tolerance`.
+        A step that raises the cost at those gains is halved. The covariance is that of the last
+        linearisation.
+
+        Args:
+            free: the parameters, with priors and bounds.
+            values: of all parameters, by name: where to begin.
+            noise: levels of process and reading noise.
+            iterations: steps at most.
+            tolerance: gain that ends the fit [nats].
+            progress: called with a line of text.
         """
         values = dict(values)
         names = [f.name for f in free]
@@ -444,7 +484,13 @@ class Engine:
 def objective(
     passes: Sequence[RunPass], free: Sequence[FreeParameter], values: Mapping[str, float]
 ) -> float:
-    """Minus log-likelihood plus half the squared distance to the priors, nats."""
+    """Minus log-likelihood plus half the squared distance to the priors, nats.
+
+    Args:
+        passes: of the filter at `values`.
+        free: parameters with their priors.
+        values: of all parameters, by name.
+    """
     return penalty(free, values) - float(sum(p.log_likelihood for p in passes))
 
 

@@ -28,7 +28,12 @@ def with_timing(parameter: FreeParameter, std: float, dt: float) -> float:
     """Std of a lag or delay with the half sample that a log cannot show.
 
     Within a row it is not known when the machine takes a command over (zero-order hold against the
-    simulator's or autopilot's own loop): uniform over a row, std dt/sqrt(12) (numerics.md, timing).
+    simulator's or autopilot's own loop): uniform over a row, std dt/sqrt(12).
+
+    Args:
+        parameter: the number.
+        std: of the fit.
+        dt: seconds per row.
     """
     group, _, own = parameter.name.rpartition(".")
     known = effects.GROUPS[group].parameters if group else ()
@@ -46,7 +51,16 @@ def fitted_vehicle(
     source: str,
     flight: Flight,
 ) -> Vehicle:
-    """A vehicle with fitted values, their std and correlation, and what they were fitted on."""
+    """A vehicle with fitted values, their std and correlation, and what they were fitted on.
+
+    Args:
+        vehicle: as given.
+        free: the k parameters that were fitted.
+        values, std: of those, by name.
+        covariance: whose correlation is recorded, (k, k).
+        source: recorded with every value.
+        flight: whose hashes are recorded.
+    """
     changed = {}
     for f in free:
         group, _, own = f.name.rpartition(".")

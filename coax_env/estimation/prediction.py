@@ -71,7 +71,15 @@ def fly_again(
     horizon: float = 1.0,
     floor: bool = False,
 ) -> list[RunReplay]:
-    """Replay every record of an engine. `floor` adds the error of a perfect model."""
+    """Replay every record of an engine.
+
+    Args:
+        engine: model and records.
+        values: of all parameters, by name.
+        noise: levels of process and reading noise.
+        horizon: seconds flown open loop.
+        floor: also the error of a perfect model from the same starts.
+    """
     starts = [_starts(r.t, horizon) for r in engine.records]
     passes = engine.filter(values, noise, start_rows=starts)
     p = engine.model.vector(values)
@@ -224,8 +232,10 @@ def replay(
     """What the simulation of this vehicle gets wrong on this flight, per run and channel.
 
     Args:
-        flight: a Flight or its folder. vehicle: a Vehicle, name or path; default the card's.
+        flight: a Flight or its folder.
+        vehicle: a Vehicle, name or path; default the card's.
         horizon: seconds flown open loop.
+        progress: called with a line of text.
     """
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)

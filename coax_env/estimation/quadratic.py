@@ -59,7 +59,13 @@ class Quadratic:
     def of(
         cls, lin: Linearised, free: Sequence[FreeParameter], values: Mapping[str, float]
     ) -> "Quadratic":
-        """The quadratic of a linearisation, summed over its runs."""
+        """The quadratic of a linearisation, summed over its runs.
+
+        Args:
+            lin: the linearisation.
+            free: its parameters, with priors and bounds.
+            values: where it was taken.
+        """
         return cls(
             lin.names,
             lin.information.sum(0),
@@ -159,6 +165,10 @@ def bounded_solve(A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.nda
     """Minimise 1/2 x'A x - b'x within bounds (A positive definite), shape (k,).
 
     Bounded least squares on the Cholesky factor, in units of A's diagonal (Stark and Parker 1995).
+
+    Args:
+        A: (k, k). b: (k,).
+        lower, upper: bounds of x, (k,), infinite where there is none.
     """
     unit = 1.0 / np.sqrt(np.diag(A))
     factor = cholesky(A * np.outer(unit, unit))

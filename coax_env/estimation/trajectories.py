@@ -53,7 +53,10 @@ def trajectories(
     """Every run of a flight, measured and as each of `models` flies it.
 
     Args:
-        estimator: whose model the filter uses, the best there is. restart: seconds.
+        flight: the runs.
+        estimator: whose model the filter uses, the best there is.
+        models: name -> vehicle that is simulated.
+        restart: seconds after which each simulation is put onto the measured path again.
     """
     records = [record_of(run) for run in flight.runs]
     model = HeliModel(estimator)
