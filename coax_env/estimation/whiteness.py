@@ -1,6 +1,7 @@
 """Are innovations white? A Ljung-Box statistic per channel, with an effect size beside it.
 
-Ljung and Box, Biometrika 65, 1978. On long records the test alone finds correlations that matter to
+Ljung and Box, Biometrika 65, 1978; not statsmodels' acorr_ljungbox, which takes the mean out first and
+so lets a constant innovation pass for white, and gives NaN where one is missing. On long records the test alone finds correlations that matter to
 nobody, so a channel counts as coloured only where the correlation is also large, against the noise
 that was assumed.
 """
@@ -41,13 +42,16 @@ class Whiteness:
 
 
 def whiteness(passes: Sequence[RunPass], channels: Sequence[str]) -> dict[str, Whiteness]:
-    """Whiteness by channel, for channels with readings."""
+    """Whiteness by channel, for channels with readings.
+
+    Missing innovations (NaN) are left out, the lags counted over what remains.
+    """
     result = {}
     for i, channel in enumerate(channels):
         parts = []
         for run in passes:
-            late = run.record.t > run.record.t[0] + SETTLING
-            e = run.innovations[late, i]
+            settled = run.record.t > run.record.t[0] + SETTLING
+            e = run.innovations[settled, i]
             e = e[np.isfinite(e)]
             if e.size > 3 * LAGS:
                 parts.append((run.record.name, e))
