@@ -6,7 +6,7 @@ rest of the quick ones. What is known is not tried again: a mutation that was ca
 stays as it is, one that survived while no source and no test has changed.
 
 Own, because mutmut passes over decorated functions, which all of the compiled kernel is, and neither it
-nor cosmic-ray swaps sin and cos or axes, or keeps numba's machine code of what a mutation did not touch.
+nor cosmic-ray swaps sin and cos or axes, or keeps the machine code of what a mutation did not touch.
 """
 
 import json
