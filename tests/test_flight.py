@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from shared_flights import shared_flight
 
 from coax_env.errors import InputError
-from coax_env.logs.flight import Flight, Run, hold_last, read_flight, write_flight
+from coax_env.logs.flight import Flight, Run, read_flight, write_flight
 from coax_env.logs.outliers import find_outliers
+from coax_env.logs.repairs import hold_last
 from coax_env.model.layout import RPM_PER_RAD_S
 
 CARD = """

@@ -26,7 +26,8 @@ from coax_env.estimation.fit import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of, sensor_std, starting_noise
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.identification.identify import left_open
-from coax_env.logs.flight import GAP, Flight, Run, read_flight
+from coax_env.logs.flight import Flight, Run, read_flight
+from coax_env.logs.repairs import GAP
 from coax_env.logs.units import LOG_UNITS, ROTOR_COMMANDS, unit_that_makes
 from coax_env.model import effects
 from coax_env.model.dynamics import hover_trim

@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 
 from coax_env.errors import InputError, require
-from coax_env.logs.flight import LONGEST_RUN, SHORTEST_RUN, Flight, Run, hold_last
+from coax_env.logs.flight import Flight, Run
+from coax_env.logs.repairs import LONGEST_RUN, SHORTEST_RUN, hold_last
 from coax_env.logs.units import ROTOR_COMMANDS, SWASH_COMMANDS
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coax_env.errors import InputError
-from coax_env.logs.flight import SHORTEST_RUN, Flight, Run
+from coax_env.logs.flight import Flight, Run
+from coax_env.logs.repairs import SHORTEST_RUN
 from coax_env.model import dynamics, effects
 from coax_env.model import parameters as P
 from coax_env.model.actuators import limit, limits
