@@ -16,15 +16,19 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+READERS = (
+    "autopilot_logs", "card", "columns", "csv_log", "dataflash", "flight", "outliers", "repairs",
+    "signals", "ulog", "units",
+)  # fmt: skip
+
 if __name__ == "__main__" and sys.argv[1:2] == [
     "--target"
 ]:  # instrument before anything is imported
     import atheris
 
     with atheris.instrument_imports(
-        include=["coax_env.logs.flight", "coax_env.model.vehicle", "coax_env.logs.units",
-                 "coax_env.logs.outliers", "coax_env.logs.columns", "coax_env.logs.autopilot_logs",
-                 "pyulog.core", "pymavlink.DFReader"],
+        include=[*(f"coax_env.logs.{name}" for name in READERS), "coax_env.model.vehicle",
+                 "coax_env.model.vehicle_file", "pyulog.core", "pymavlink.DFReader"],
     ):  # fmt: skip
         import pyulog.core  # noqa: F401
 

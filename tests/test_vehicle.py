@@ -1,4 +1,4 @@
-"""Vehicle files: the paper's tables, an exact round trip, every bad field told in one line."""
+"""Vehicle files: the paper's tables, an exact round trip, every bad field named in one line."""
 
 import math
 import tomllib
