@@ -4,9 +4,6 @@ Signs, terms, products, sines, constants, indices and comparisons of the model, 
 regression, drawn by seed; each in a copy of the tree, tested by the tests of its file and then by the
 rest of the quick ones. What is known is not tried again: a mutation that was caught while its file
 stays as it is, one that survived while no source and no test has changed.
-
-Own, because mutmut passes over decorated functions, which all of the compiled kernel is, and neither it
-nor cosmic-ray swaps sin and cos or axes, or keeps the machine code of what a mutation did not touch.
 """
 
 import json

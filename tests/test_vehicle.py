@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from coax_env import InputError, load_vehicle
 from coax_env.model import effects, parameters
-from coax_env.model.vehicle import Parameter, shipped_vehicles, vehicle_toml
+from coax_env.model.vehicle import Parameter
+from coax_env.model.vehicle_file import shipped_vehicles, vehicle_toml
 
 LAMA = load_vehicle("lama400d")
 

@@ -144,7 +144,7 @@ def the_verbs_work(coax: Callable[..., Done]) -> None:
 def vehicles_flight_and_policy_have_come(coax: Callable[..., Done]) -> None:
     found = coax(
         text="import json, coax_env; from pathlib import Path\n"
-        "from coax_env.model.vehicle import shipped_vehicles\n"
+        "from coax_env.model.vehicle_file import shipped_vehicles\n"
         "from controllers.loading import make_controller\n"
         "here = Path(coax_env.__file__).parent\n"
         "flight = coax_env.read_flight(here / 'logs' / 'flights' / 'windy')\n"

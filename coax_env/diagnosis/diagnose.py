@@ -49,7 +49,8 @@ from coax_env.estimation.whiteness import Whiteness, whiteness
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model import effects
 from coax_env.model.layout import CHANNELS
-from coax_env.model.vehicle import Parameter, Vehicle, load_vehicle
+from coax_env.model.vehicle import Parameter, Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 HORIZON = 1.0  # s
 CALM = 5.0  # times the floor of a white level under which it is not worth a word

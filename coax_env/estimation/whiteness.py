@@ -1,9 +1,9 @@
 """Are innovations white? A Ljung-Box statistic per channel, with an effect size beside it.
 
-Ljung and Box, Biometrika 65, 1978; own, because statsmodels' acorr_ljungbox takes the mean out first, so
-that constant innovations pass for white. On long records the test alone finds correlations that matter
-to nobody, so a channel counts as coloured only where the correlation is also large, against the noise
-that was assumed.
+Ljung and Box, Biometrika 65, 1978; own, because statsmodels' acorr_ljungbox takes the mean out first,
+so that constant innovations pass for white. On long records the test alone finds correlations that
+matter to nobody, so a channel counts as coloured only where the correlation is also large, against the
+noise that was assumed.
 """
 
 from collections.abc import Sequence

@@ -30,7 +30,8 @@ from coax_env.estimation.whiteness import is_white
 from coax_env.identification.two_step.method import TwoStep, two_step
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.effects import CATALOGUE
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.plain_words import and_list, plain
 
 METHODS = ("ml", "paper")

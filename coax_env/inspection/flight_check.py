@@ -32,7 +32,8 @@ from coax_env.logs.units import LOG_UNITS, ROTOR_COMMANDS, unit_that_makes
 from coax_env.model import effects
 from coax_env.model.dynamics import hover_trim
 from coax_env.model.layout import ANGLES, CHANNEL_UNITS, CHANNELS, RPM_PER_RAD_S
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 SURE = 2.0
 """Times EVIDENCE that an effect of usual size must be worth to be expected to show."""

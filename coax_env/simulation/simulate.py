@@ -26,7 +26,8 @@ from coax_env.model.layout import (
     STATES,
 )
 from coax_env.model.sensors import Sensor, log_readings, log_suite, shake
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.simulation.maneuvers import Maneuver, maneuver
 from coax_env.simulation.pilot import CORNER, Pilot, rounded
 
