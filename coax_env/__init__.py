@@ -23,14 +23,15 @@ if TYPE_CHECKING:
     from coax_env.model.dynamics import derivative, hover_trim
     from coax_env.model.linear import linearize
     from coax_env.model.user_effects import load_effect
-    from coax_env.model.vehicle import Vehicle, load_vehicle
+    from coax_env.model.vehicle import Vehicle
+    from coax_env.model.vehicle_file import load_vehicle
     from coax_env.simulation.simulate import simulate
 
 __version__ = "0.1.0"
 
 _HOME = {
     "Vehicle": "model.vehicle",
-    "load_vehicle": "model.vehicle",
+    "load_vehicle": "model.vehicle_file",
     "load_effect": "model.user_effects",
     "derivative": "model.dynamics",
     "hover_trim": "model.dynamics",

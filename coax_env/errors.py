@@ -1,8 +1,12 @@
-"""Errors a user can mend: one clear line that names the file, line, field or package."""
+"""Errors a user can correct: one clear line that names the file, line, field or package."""
 
 import importlib
+import re
+from importlib import metadata
 from types import ModuleType
 
+DISTRIBUTION = "coaxheli"
+"""Name under which this project is installed; `coax` is another one on PyPI."""
 LONGEST = 900
 """Characters of a message; a longer one loses its middle."""
 
@@ -38,11 +42,27 @@ def require(module: str, extra: str) -> ModuleType:
     Args:
         module: name to import, for instance ``"plotly.graph_objects"``.
         extra: the extra of this project that brings it, for instance ``"report"``.
+
+    Raises:
+        InputError: it is not installed.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         package = module.split(".")[0]
         raise InputError(
-            f"this needs {package}, which is not installed: pip install 'coax[{extra}]'"
+            f"this needs {package}, which is not installed:"
+            f" pip install '{DISTRIBUTION}[{extra}]'{_packages_of(extra)}"
         ) from error
+
+
+def _packages_of(extra: str) -> str:
+    """What an extra consists of, for whoever would rather install that; empty where not known."""
+    try:
+        declared = metadata.requires(DISTRIBUTION) or []
+    except metadata.PackageNotFoundError:  # a checkout that is on the path, not installed
+        return ""
+    wanted = re.compile(rf"""(.+?)\s*;\s*extra == ["']{re.escape(extra)}["']""")
+    packages = [match[1] for text in declared if (match := wanted.fullmatch(text))]
+    words = " ".join(f"'{package}'" for package in packages)
+    return f", or what it consists of: pip install {words}" if packages else ""

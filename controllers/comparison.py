@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from coax_env.env.fleet import Nominal
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.report import figures
 from coax_env.report.page import Section, command, figure, page, prose, table
 from controllers import lqr, pid, policy, state_feedback

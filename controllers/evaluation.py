@@ -12,7 +12,8 @@ from coax_env.env import hover, tasks
 from coax_env.env.gym_env import CoaxVectorEnv
 from coax_env.errors import InputError
 from coax_env.model.layout import PLACE
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.workers import each
 from controllers.loading import Controller
 

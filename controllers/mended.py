@@ -13,7 +13,8 @@ from typing import Any
 from coax_env.diagnosis.diagnose import Diagnosis, diagnose
 from coax_env.errors import InputError
 from coax_env.logs.flight import Flight, read_flight
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.report import figures
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from coax_env.report.worth import FlownControllers

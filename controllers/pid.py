@@ -19,7 +19,8 @@ from coax_env.env import hover
 from coax_env.env.fleet import DT, Nominal, action_map
 from coax_env.errors import InputError
 from coax_env.model.sensors import suite
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from controllers.feedback import Designed, Feedback
 from controllers.target import TargetView, turned
 

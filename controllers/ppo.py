@@ -18,7 +18,8 @@ from coax_env.env import hover
 from coax_env.env.fleet import DT, Nominal
 from coax_env.errors import InputError, require
 from coax_env.files import make_folder, write_bytes
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.workers import each
 from controllers.estimator import EstimatorDesign, Tracker, design_estimator
 from controllers.policy import (

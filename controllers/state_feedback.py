@@ -18,7 +18,8 @@ import numpy as np
 from coax_env.env import hover
 from coax_env.env.fleet import DT, Nominal
 from coax_env.model.layout import ACTUATOR_STATES, STATES
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from controllers.estimator import design_estimator, integrated_readings
 from controllers.feedback import Designed, Feedback
 from controllers.lqr import regulator_problem

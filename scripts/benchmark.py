@@ -33,7 +33,7 @@ TIMER = """
 import json, time
 import numba, numpy as np
 from coax_env.model import dynamics
-from coax_env.model.vehicle import load_vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 def many_of(step):
     @numba.njit

@@ -8,7 +8,7 @@ import command_line
 
 from coax_env.files import write_json
 from coax_env.logs.columns import draft_card
-from coax_env.model.vehicle import load_vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 if TYPE_CHECKING:
     from coax_env.inspection.flight_check import FlightCheck

@@ -8,7 +8,7 @@ from pathlib import Path
 import command_line
 
 from coax_env.files import make_folder, write_json, write_text
-from coax_env.model.vehicle import load_vehicle, vehicle_toml
+from coax_env.model.vehicle_file import load_vehicle, vehicle_toml
 from controllers import mended
 
 

@@ -17,7 +17,8 @@ from coax_env import plain_words
 from coax_env.diagnosis.diagnose import Diagnosis, diagnose
 from coax_env.files import write_json
 from coax_env.logs.flight import read_flight
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.report import FlownControllers
 from controllers import mended
 

@@ -7,7 +7,7 @@ import command_line
 
 from coax_env.files import make_folder, write_text
 from coax_env.model.sensors import SUITES
-from coax_env.model.vehicle import load_vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from controllers import lqr
 from controllers.design_report import (
     MARGIN_HEADER,

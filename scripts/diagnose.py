@@ -80,7 +80,7 @@ def save(
     """findings.json, vehicle.toml and report.html, all or none; then the next flight's card."""
     from coax_env import report
     from coax_env.design.flight_card import write_flight_card
-    from coax_env.model.vehicle import vehicle_toml
+    from coax_env.model.vehicle_file import vehicle_toml
 
     page = report.diagnosis_page(result, command, flown)
     with staged_folder(out) as folder:

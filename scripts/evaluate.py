@@ -11,7 +11,8 @@ from tqdm import tqdm
 from coax_env.env.hover import CONTROL_PERIOD
 from coax_env.env.tasks import TASKS
 from coax_env.files import make_folder, write_json, write_text
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from controllers import comparison, load_controller
 from controllers.evaluation import evaluate, evaluate_spread
 from controllers.loading import KINDS, Controller, make_controller

@@ -11,7 +11,7 @@ from coax_env.estimation.prediction import pooled_rms
 from coax_env.files import staged_folder, write_text
 from coax_env.identification.identify import METHODS, identify
 from coax_env.identification.two_step.method import TwoStep
-from coax_env.model.vehicle import vehicle_toml
+from coax_env.model.vehicle_file import vehicle_toml
 
 
 def main() -> None:

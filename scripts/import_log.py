@@ -5,8 +5,9 @@ from pathlib import Path
 import command_line
 
 from coax_env.errors import InputError
-from coax_env.logs.autopilot_logs import Taken, import_log
+from coax_env.logs.autopilot_logs import import_log
 from coax_env.logs.flight import read_flight, write_flight
+from coax_env.logs.signals import Taken
 
 
 def main() -> None:

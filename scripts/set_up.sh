@@ -35,7 +35,7 @@ install_packages() {
     "$PYTHON" -c 'import pip' 2>/dev/null || return 1
     touch "$UNFINISHED"
     local pip=("$PYTHON" -m pip install -qq --disable-pip-version-check -c "$CONSTRAINTS")
-    # torch first and pinned, so that nothing else chooses a build of it
+    # torch first, at the pin of the constraints, so that nothing else chooses a build of it
     "${pip[@]}" setuptools torch &&
         "${pip[@]}" --no-build-isolation -e "$ROOT[rl,report,render,dev]"
 }

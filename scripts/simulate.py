@@ -11,7 +11,7 @@ from coax_env import report
 from coax_env.files import make_folder, write_text
 from coax_env.logs.flight import write_flight
 from coax_env.model.sensors import SUITES, log_suite
-from coax_env.model.vehicle import load_vehicle, shipped_vehicles
+from coax_env.model.vehicle_file import load_vehicle, shipped_vehicles
 from coax_env.simulation.maneuvers import MANEUVERS
 from coax_env.simulation.simulate import Gusts, doublet_remarks, doublet_table, fly_all, log_flight
 

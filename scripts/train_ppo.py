@@ -14,7 +14,8 @@ from tqdm import tqdm
 from coax_env.errors import InputError
 from coax_env.files import write_bytes, write_json
 from coax_env.model.sensors import SUITES
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from controllers import load_controller, ppo
 from controllers.evaluation import evaluate
 

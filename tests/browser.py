@@ -1,6 +1,6 @@
 """A headless Chromium for tests: opens a page, and says what is wrong with it.
 
-Through choreographer (kaleido brings it) over the DevTools protocol.
+Through choreographer over the DevTools protocol.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ def missing() -> str:
     try:
         from choreographer.browsers.chromium import Chromium
     except ImportError:
-        return "choreographer is not installed (pip install kaleido)"
+        return "choreographer is not installed (pip install choreographer)"
     if not Chromium.find_browser(skip_local=False):
         return "no Chromium or Chrome found (.ci/run installs one where it can)"
     return ""

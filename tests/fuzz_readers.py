@@ -21,15 +21,18 @@ if __name__ == "__main__" and sys.argv[1:2] == [
 ]:  # instrument before anything is imported
     import atheris
 
+    LOGS = (
+        "autopilot_logs", "card", "columns", "csv_log", "dataflash", "flight", "outliers",
+        "repairs", "signals", "ulog", "units",
+    )  # fmt: skip
     with atheris.instrument_imports(
-        include=["coax_env.logs.flight", "coax_env.model.vehicle", "coax_env.logs.units",
-                 "coax_env.logs.outliers", "coax_env.logs.columns", "coax_env.logs.autopilot_logs",
-                 "pyulog.core", "pymavlink.DFReader"],
+        include=[*(f"coax_env.logs.{name}" for name in LOGS), "coax_env.model.vehicle",
+                 "coax_env.model.vehicle_file", "pyulog.core", "pymavlink.DFReader"],
     ):  # fmt: skip
         import pyulog.core  # noqa: F401
 
         import coax_env.logs.autopilot_logs
-        import coax_env.model.vehicle  # noqa: F401
+        import coax_env.model.vehicle_file  # noqa: F401
 
 import numpy as np
 from autopilot_files import dataflash, px4_flight
@@ -37,7 +40,7 @@ from autopilot_files import dataflash, px4_flight
 from coax_env.errors import InputError
 from coax_env.logs.autopilot_logs import import_log
 from coax_env.logs.flight import read_flight
-from coax_env.model.vehicle import SHIPPED, load_vehicle, vehicle_toml
+from coax_env.model.vehicle_file import SHIPPED, load_vehicle, vehicle_toml
 
 CARD = """[vehicle]
 name = "lama400d"

@@ -9,8 +9,10 @@ from autopilot_files import dataflash, px4_flight, ulog
 
 from coax_env import read_flight
 from coax_env.errors import InputError
-from coax_env.logs.autopilot_logs import Taken, euler_angles, import_log
+from coax_env.logs.autopilot_logs import import_log
 from coax_env.logs.flight import write_flight
+from coax_env.logs.signals import Taken
+from coax_env.logs.ulog import euler_angles
 from coax_env.model.layout import RPM_PER_RAD_S
 
 TAKE = {"delta_lon": Taken("actuator_servos.control[0]", 0.2)}

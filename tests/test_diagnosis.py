@@ -36,7 +36,7 @@ from coax_env.files import write_text
 from coax_env.logs.flight import Flight
 from coax_env.model import effects
 from coax_env.model.layout import CHANNELS
-from coax_env.model.vehicle import vehicle_toml
+from coax_env.model.vehicle_file import vehicle_toml
 
 ON_AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
 LAMA = load_vehicle("lama400d")

@@ -1,4 +1,4 @@
-"""The flight folder: what is read, what is mended and counted, what is refused and how."""
+"""The flight folder: what is read, what is repaired and counted, what is refused and how."""
 
 import math
 from pathlib import Path
@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from shared_flights import shared_flight
 
 from coax_env.errors import InputError
-from coax_env.logs.flight import Flight, Run, hold_last, read_flight, write_flight
+from coax_env.logs.flight import Flight, Run, read_flight, write_flight
 from coax_env.logs.outliers import find_outliers
+from coax_env.logs.repairs import hold_last
 from coax_env.model.layout import RPM_PER_RAD_S
 
 CARD = """
@@ -156,7 +157,7 @@ def test_hold_last() -> None:
     np.testing.assert_array_equal(hold_last(np.array([nan, 1, nan, 2, nan])), [1, 1, 1, 2, 2])
 
 
-# --- what is mended and counted ------------------------------------------------------------------
+# --- what is repaired and counted ------------------------------------------------------------------
 
 
 def test_repeated_time_stamps_are_merged(tmp_path: Path) -> None:

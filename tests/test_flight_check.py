@@ -23,7 +23,7 @@ from coax_env.inspection.units_and_signs import unit_and_sign_faults
 from coax_env.logs.columns import draft_card, guesses
 from coax_env.logs.flight import Flight, read_flight, write_flight
 from coax_env.model.sensors import log_suite
-from coax_env.model.vehicle import load_vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.simulation.simulate import fly_all, log_flight
 
 LAMA = load_vehicle("lama400d")

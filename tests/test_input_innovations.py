@@ -20,7 +20,7 @@ from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
 from coax_env.estimation.prediction import fly_again
 from coax_env.model import parameters as P
 from coax_env.model.layout import CHANNELS, GUSTS
-from coax_env.model.vehicle import load_vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 LAMA = load_vehicle("lama400d")
 

@@ -21,7 +21,7 @@ import tomlkit
 
 from coax_env import load_vehicle, read_flight
 from coax_env.model.effects import CATALOGUE
-from coax_env.model.vehicle import vehicle_toml
+from coax_env.model.vehicle_file import vehicle_toml
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON_SCRIPTS = sorted(

@@ -67,7 +67,7 @@ from coax_env.identification.two_step.regression import (
 )
 from coax_env.logs.flight import Run
 from coax_env.model import dynamics
-from coax_env.model.vehicle import vehicle_toml
+from coax_env.model.vehicle_file import vehicle_toml
 from coax_env.simulation.simulate import Gusts, fly_all
 
 LAMA = load_vehicle("lama400d")

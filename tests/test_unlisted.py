@@ -21,7 +21,8 @@ from coax_env.model import effects
 from coax_env.model.dynamics import hover_trim
 from coax_env.model.generic_terms import AXES, TERMS, hover_speeds
 from coax_env.model.layout import N_STATES, STATES
-from coax_env.model.vehicle import Vehicle, vehicle_toml
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import vehicle_toml
 from coax_env.simulation.simulate import Gusts, simulate
 
 ROOT = Path(__file__).resolve().parents[1]

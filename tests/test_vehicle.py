@@ -1,4 +1,4 @@
-"""Vehicle files: the paper's tables, an exact round trip, every bad field told in one line."""
+"""Vehicle files: the paper's tables, an exact round trip, every bad field named in one line."""
 
 import math
 import tomllib
@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from coax_env import InputError, load_vehicle
 from coax_env.model import effects, parameters
-from coax_env.model.vehicle import Parameter, shipped_vehicles, vehicle_toml
+from coax_env.model.vehicle import Parameter
+from coax_env.model.vehicle_file import shipped_vehicles, vehicle_toml
 
 LAMA = load_vehicle("lama400d")
 

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import venv
 import zipfile
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from pathlib import Path
 import pytest
 
 import coax_env
+from coax_env.errors import DISTRIBUTION
 
 Done = subprocess.CompletedProcess
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,6 +46,24 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(folder.glob("*.whl"))
 
 
+def test_every_package_is_declared() -> None:
+    """A new folder with an __init__.py would be left out of the wheel, and nobody would notice here."""
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
+        "packages"
+    ]
+    there = {
+        ".".join(init.parent.relative_to(ROOT).parts)
+        for top in ("coax_env", "controllers")
+        for init in (ROOT / top).rglob("__init__.py")
+    }
+    assert there <= set(declared), there - set(declared)
+    gone = [
+        p for p in declared if p != "coax_commands" and not (ROOT / p.replace(".", "/")).is_dir()
+    ]
+    assert not gone, gone
+    assert len(declared) == len(set(declared))
+
+
 @pytest.mark.slow
 def test_the_wheel_has_every_file_of_the_packages(wheel):
     """All that lies in the packages, data too: an editable install would hide what is missing."""
@@ -58,7 +78,7 @@ def test_the_wheel_has_every_file_of_the_packages(wheel):
     assert wanted <= found, wanted - found
     assert {f"coax_commands/{p.name}" for p in (src / "scripts").glob("*.py")} <= found
     assert not [name for name in found if name.startswith(("tests/", "scripts/", "study/"))]
-    assert wheel.name.startswith(f"coax-{coax_env.__version__}-")
+    assert wheel.name.startswith(f"{DISTRIBUTION}-{coax_env.__version__}-")
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +116,7 @@ def test_it_works_where_there_is_no_checkout(coax):
     """One test: apart, two workers would each compile the kernel for an environment of its own."""
     the_verbs_work(coax)
     vehicles_flight_and_policy_have_come(coax)
+    what_is_missing_is_named_with_its_extra(coax)
     the_readmes_lines_run(coax)
 
 
@@ -123,16 +144,24 @@ def the_verbs_work(coax: Callable[..., Done]) -> None:
 def vehicles_flight_and_policy_have_come(coax: Callable[..., Done]) -> None:
     found = coax(
         text="import json, coax_env; from pathlib import Path\n"
-        "from coax_env.model.vehicle import shipped_vehicles\n"
+        "from coax_env.model.vehicle_file import shipped_vehicles\n"
         "from controllers.loading import make_controller\n"
         "here = Path(coax_env.__file__).parent\n"
-        "flight = coax_env.read_flight(here / 'flights' / 'windy')\n"
+        "flight = coax_env.read_flight(here / 'logs' / 'flights' / 'windy')\n"
         "print(json.dumps([str(here), len(flight.runs), list(shipped_vehicles()),"
         " make_controller('ppo').kind]))"
     )
     here, runs, vehicles, kind = json.loads(found.stdout)
     assert not Path(here).is_relative_to(ROOT) and "site-packages" in here
     assert (runs, kind) == (12, "ppo") and {"lama400d", "skybotix_coax"} <= set(vehicles)
+
+
+def what_is_missing_is_named_with_its_extra(coax: Callable[..., Done]) -> None:
+    refused = coax(code=1, text="from coax_env.errors import require; require('pigame', 'render')")
+    assert refused.stderr.splitlines()[-1] == (
+        "coax_env.errors.InputError: this needs pigame, which is not installed: pip install"
+        " 'coaxheli[render]', or what it consists of: pip install 'pygame>=2.6'"
+    )
 
 
 def the_readmes_lines_run(coax: Callable[..., Done]) -> None:

@@ -19,7 +19,7 @@ from coax_env.model import dynamics, effects
 from coax_env.model.actuators import limit, limits
 from coax_env.model.layout import CHANNELS
 from coax_env.model.sensors import SUITES, log_suite, suite
-from coax_env.model.vehicle import load_vehicle, vehicle_toml
+from coax_env.model.vehicle_file import load_vehicle, vehicle_toml
 from coax_env.simulation.simulate import _SwashDelay, fly
 
 LAMA = load_vehicle("lama400d")

@@ -27,7 +27,8 @@ from coax_env.files import write_text
 from coax_env.logs.flight import Flight, Run, write_flight
 from coax_env.model.effects import CATALOGUE
 from coax_env.model.sensors import log_suite
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.simulation.maneuvers import AXES, DEGREE, Maneuver
 from coax_env.simulation.multisine import multisines, steps
 from coax_env.simulation.simulate import Gusts, Track, fly

@@ -48,7 +48,8 @@ from coax_env.estimation.whiteness import Whiteness, whiteness
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model import effects
 from coax_env.model.layout import CHANNELS
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 
 @dataclass(frozen=True)

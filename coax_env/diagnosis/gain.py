@@ -35,6 +35,7 @@ def gain_of(
     sums = [_block_sums(runs) for runs in (before, refitted, after)]
     channels = [c for c in COMPARED if all(c in s for s in sums)]
     rng = np.random.default_rng(0)
+    # own: arch's block bootstrap needs one evenly sampled series, and pandas; these are runs of blocks
     blocks = len(next(iter(sums[0].values())))
     draws = rng.integers(0, blocks, (DRAWS, blocks))
     noise_rms = {c: noise[c] for c in channels}

@@ -32,7 +32,8 @@ from coax_env.model.actuators import limit, limits
 from coax_env.model.dynamics import WORK_SIZE, hover_trim, measure, step
 from coax_env.model.layout import N_CHANNELS, N_FULL, N_INPUTS, TIME
 from coax_env.model.sensors import Sensor, shake, slow_instruments, suite
-from coax_env.model.vehicle import SHIPPED, Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import SHIPPED, load_vehicle
 
 ROTOR_RANGE = 0.15  # of the nominal hover speed
 SWASH_RANGE = 0.2  # [rad]

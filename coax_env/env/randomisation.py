@@ -15,7 +15,8 @@ from coax_env.errors import InputError
 from coax_env.kernel.compilation import compiled
 from coax_env.kernel.random_streams import COUNTER, uniform
 from coax_env.model import effects, parameters
-from coax_env.model.vehicle import POSITIVE, Vehicle, load_vehicle
+from coax_env.model.vehicle import POSITIVE, Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 Randomize = str | Mapping[str, Sequence[float]] | Sequence[str | Path | Vehicle] | None
 """None; ``"posterior"``; parameter -> (low, high); or a list of vehicles."""

@@ -27,7 +27,8 @@ from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import Noise
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.layout import CHANNEL_UNITS, CHANNELS, GUSTS, N_FULL
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 HEADING = CHANNELS.index("psi")
 WARM_UP = 1.0  # s of filtering before the first start

@@ -1,8 +1,9 @@
 """Are innovations white? A Ljung-Box statistic per channel, with an effect size beside it.
 
-Ljung and Box, Biometrika 65, 1978. On long records the test alone finds correlations that matter to
-nobody, so a channel counts as coloured only where the correlation is also large, against the noise
-that was assumed.
+Ljung and Box, Biometrika 65, 1978; own, because statsmodels' acorr_ljungbox takes the mean out first,
+so that constant innovations pass for white. On long records the test alone finds correlations that
+matter to nobody, so a channel counts as coloured only where the correlation is also large, against the
+noise that was assumed.
 """
 
 from collections.abc import Sequence
@@ -41,13 +42,16 @@ class Whiteness:
 
 
 def whiteness(passes: Sequence[RunPass], channels: Sequence[str]) -> dict[str, Whiteness]:
-    """Whiteness by channel, for channels with readings."""
+    """Whiteness by channel, for channels with readings.
+
+    Missing innovations (NaN) are left out, the lags counted over what remains.
+    """
     result = {}
     for i, channel in enumerate(channels):
         parts = []
         for run in passes:
-            late = run.record.t > run.record.t[0] + SETTLING
-            e = run.innovations[late, i]
+            settled = run.record.t > run.record.t[0] + SETTLING
+            e = run.innovations[settled, i]
             e = e[np.isfinite(e)]
             if e.size > 3 * LAGS:
                 parts.append((run.record.name, e))

@@ -35,7 +35,8 @@ from coax_env.identification.maximum_likelihood import (
 from coax_env.identification.two_step.method import TwoStep, two_step
 from coax_env.identification.undetermined import left_open
 from coax_env.logs.flight import Flight, read_flight
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 METHODS = ("ml", "paper")
 Progress = Callable[[str], None]

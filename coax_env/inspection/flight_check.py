@@ -25,7 +25,8 @@ from coax_env.inspection.readings import (
 from coax_env.inspection.units_and_signs import unit_and_sign_faults
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.layout import CHANNELS
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 NOT_BELIEVED = 0.02
 """Share of readings that no filter of this vehicle believes, above which something is wrong."""

@@ -51,7 +51,7 @@ _SHORT_UNITS = {
 
 @dataclass(frozen=True)
 class Guess:
-    """A column that may be a channel. unit: as its name says, else the channel's own."""
+    """A column that may be a channel. unit: the one in its name, else the channel's own."""
 
     channel: str
     name: str
@@ -76,7 +76,7 @@ def guesses(header: Iterable[str]) -> dict[str, Guess]:
 
 
 def _unit_of(name: str, channel: str, usual: list[str]) -> str:
-    """Unit that a column's name tells where it is one of a channel's; empty where it is not."""
+    """Unit in a column's name where it is one of a channel's; empty where it is not."""
     words, bracket = name[:LONGEST_NAME].strip(), ""
     if words.endswith((")", "]")):
         words, _, bracket = words[:-1].replace("[", "(").rpartition("(")
@@ -107,7 +107,7 @@ def advice(header: Iterable[str], wanted: Iterable[str]) -> str:
     first = next((guessed[c] for c in wanted if c in guessed), None)
     example = first or Guess(wanted[0], "the column's name", LOG_UNITS[wanted[0]])
     return (
-        f"found the columns {shown}{more}; if it has another name, say so in card.toml,"
+        f"found the columns {shown}{more}; if it has another name, put it into card.toml,"
         f" under [columns]: {example.line()}" + ("" if first else ", and likewise for the others")
     )
 
@@ -117,7 +117,7 @@ def time_advice(name: str, step: float) -> str:
     for unit in ("ms", "us", "ns"):
         if step * factor_to_canonical("t", unit) < SLOW_ROWS < step:
             line = Guess("t", name, unit).line()
-            return f"if its time is in {unit}, say so in card.toml, under [columns]: {line}"
+            return f"if its time is in {unit}, put that into card.toml, under [columns]: {line}"
     return "does its time jump? cut the log there into two files, a [[run]] each"
 
 
@@ -144,7 +144,7 @@ def draft_card(folder: str | Path, vehicle: str) -> tuple[Path, list[Guess]]:
     folder = Path(folder)
     card = folder / "card.toml"
     if card.exists():
-        raise InputError(f"{card} is there already; mend it, or move it away")
+        raise InputError(f"{card} is there already; edit it, or move it away")
     files = sorted(p for p in folder.glob("*") if p.suffix.lower() in (".csv", ".tsv", ".txt"))
     if not files:
         raise InputError(f"no CSV in {folder}: put one in for every run, then draft its card")

@@ -75,7 +75,9 @@ def unit_that_makes(channel: str, factor: float, within: tuple[float, float]) ->
     """A unit of a channel, other than its own, by which numbers are off by about a factor; "" if none.
 
     Args:
-        factor: what the numbers should be multiplied by. within: ratios that are about 1.
+        channel: whose unit; its own is ``LOG_UNITS[channel]``.
+        factor: what the numbers should be multiplied by.
+        within: ratios that are about 1, from and to.
     """
     canonical = LOG_UNITS[channel]
     for unit, own in _FACTORS[canonical].items():

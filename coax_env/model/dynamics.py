@@ -29,7 +29,8 @@ from coax_env.model import effects
 from coax_env.model import parameters as P
 from coax_env.model import workspace as F
 from coax_env.model.layout import CHANNELS, N_CHANNELS, N_COMMANDS, N_FULL, N_INPUTS, N_STATES, TIME
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 READING_DELAY = 1e-4  # [s] after the command of the same row
 LONGEST_STEP = 0.02  # [s] a longer row is split

@@ -21,7 +21,8 @@ from coax_env.model.layout import (
     N_STATES,
     STATES,
 )
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 
 if TYPE_CHECKING:
     import control

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coax_env.errors import InputError
-from coax_env.logs.flight import SHORTEST_RUN, Flight, Run
+from coax_env.logs.flight import Flight, Run
+from coax_env.logs.repairs import SHORTEST_RUN
 from coax_env.model import dynamics, effects
 from coax_env.model import parameters as P
 from coax_env.model.actuators import limit, limits
@@ -25,7 +26,8 @@ from coax_env.model.layout import (
     STATES,
 )
 from coax_env.model.sensors import Sensor, log_readings, log_suite, shake
-from coax_env.model.vehicle import Vehicle, load_vehicle
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.simulation.maneuvers import Maneuver, maneuver
 from coax_env.simulation.pilot import CORNER, Pilot, rounded
 

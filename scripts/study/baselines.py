@@ -39,7 +39,7 @@ from coax_env.model.layout import (
     ROTOR_SPEED,
     SWASH,
 )
-from coax_env.model.vehicle import load_vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from study.judge import tied
 
 SETTLING = 1.0  # s of each run that the filter needs

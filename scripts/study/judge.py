@@ -1,13 +1,14 @@
 """Right or wrong: what was named against what was hidden, on one stored flight.
 
 A row is what one_flight.py stores; a method ("coax" or a baseline) has named `causes` in it, each with
-its effect and the effects it says it cannot be told from.
+its effect and the confounded alternatives that it reports.
 """
 
-import math
 from collections.abc import Collection, Iterable, Mapping
 from itertools import permutations
 from typing import Any
+
+from scipy.stats import binomtest
 
 TIES: tuple[frozenset[str], ...] = (
     # first-order lag and pure delay differ above 3 Hz only, where gusts and gyro noise are (effects.md)
@@ -57,7 +58,7 @@ def group_with_truth(row: Row, method: str = OWN) -> int:
 
 
 def is_wrongly_certain(row: Row, method: str = OWN) -> bool:
-    """One cause, no look-alikes, and it is wrong."""
+    """One cause, no confounded alternative, and it is wrong."""
     causes = row["methods"][method]["causes"]
     if len(causes) != 1 or causes[0].get("confusable_with"):
         return False
@@ -82,23 +83,19 @@ def intervals(row: Row) -> list[tuple[str, bool]]:
     """(parameter, its 95 % interval holds the truth) of named, truly hidden, same-form effects."""
     result = []
     for cause in row["methods"][OWN]["causes"]:
-        for name, said in cause["parameters"].items():
+        for name, estimate in cause["parameters"].items():
             if cause["effect"] in row["hidden"] and name in row["comparable"]:
-                error = said["value"] - row["comparable"][name]
-                result.append((name, abs(error) <= 1.96 * said["std"]))
+                error = estimate["value"] - row["comparable"][name]
+                result.append((name, abs(error) <= 1.96 * estimate["std"]))
     return result
 
 
-def wilson(successes: int, count: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share (J. Am. Stat. Assoc. 22, 1927)."""
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share; of none, which SciPy refuses: anything."""
     if count == 0:
         return 0.0, 1.0
-    share = successes / count
-    centre = (share + z * z / (2 * count)) / (1 + z * z / count)
-    half = z / (1 + z * z / count) * math.sqrt(
-        share * (1 - share) / count + z * z / (4 * count * count)
-    )  # fmt: skip
-    return max(0.0, centre - half), min(1.0, centre + half)
+    interval = binomtest(successes, count).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def finished(rows: Iterable[Row]) -> list[Row]:

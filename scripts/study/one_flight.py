@@ -26,7 +26,7 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.effects import CATALOGUE
-from coax_env.model.vehicle import load_vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from study import baselines
 from study.judge import OWN
 from study.plan import PlannedFlight

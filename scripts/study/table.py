@@ -260,7 +260,9 @@ def table_text(rows: Sequence[Row], command: str) -> str:
         title = "This package" if method == OWN else f"Baseline: {method}"
         parts.append(f"\n## {title}\n\n{_markdown(all_figures(done, method))}\n")
     if done and "STLSQ" not in methods:
-        parts.append("\nNo sparse regression: PySINDy is not installed (`pip install .[study]`).\n")
+        parts.append(
+            "\nNo sparse regression: PySINDy is not installed (`pip install 'coaxheli[study]'`).\n"
+        )
     parts.append(f"\n## Not exact, one effect that should show\n\n{_misses(done)}\n")
     parts.append(f"\n## Alarms on clean flights\n\n{_alarms(done)}\n")
     failed = [row for row in rows if "error" in row]

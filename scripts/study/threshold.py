@@ -32,7 +32,7 @@ def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
             for r in clean
         ]
     )
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0)  # scipy.stats.bootstrap gives up where one resample is NaN
     draws = [tail_quantile(rng.choice(evidence, evidence.size)) for _ in range(DRAWS)]
     low, high = np.nanpercentile(np.array(draws), [2.5, 97.5])
     alarms = sum(bool(judge.named(row)) for row in clean)

@@ -1,0 +1,165 @@
+"""One run's CSV as arrays by channel, in canonical units; what is in no cell is NaN."""
+
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coax_env.errors import InputError
+from coax_env.files import read_text
+from coax_env.logs.card import Column
+from coax_env.logs.columns import advice, header_of
+from coax_env.logs.units import LOG_UNITS
+
+BEYOND_ALL = 1e20
+"""No reading in any unit is larger; what is, is a bit error and dropped."""
+
+
+@dataclass(frozen=True)
+class CsvLog:
+    """A CSV, read.
+
+    Attributes:
+        data: channel or command, ``t`` among them -> (n,) in its canonical unit (units.py).
+        lines: the line of the file that each row ends on, n of them.
+        header: names of all columns.
+        time_column: the name of the one with the time.
+        renamed: channels that were found under the name that the card gives.
+        unknown: columns that are no channel.
+        beyond: readings dropped because no reading is so large.
+    """
+
+    path: Path
+    data: Mapping[str, np.ndarray]
+    lines: Sequence[int]
+    header: Sequence[str]
+    time_column: str
+    renamed: frozenset[str]
+    unknown: Sequence[str]
+    beyond: int
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """A CSV as text: the header, the rows that hold anything, and the line each of them ends on."""
+
+    path: Path
+    header: list[str]
+    rows: list[list[str]]
+    lines: list[int]
+
+
+def read_csv(path: Path, columns: Mapping[str, Column]) -> CsvLog:
+    """Read one run's CSV.
+
+    Args:
+        path: the file; comma, semicolon or tab between cells, names in the first row.
+        columns: channel -> its column, where that has another name or unit than the channel.
+
+    Raises:
+        InputError: one line naming the file, and the line or column at fault.
+    """
+    cells = _split(path, read_text(path))
+    index = {name: k for k, name in enumerate(cells.header) if name}
+    asked = {c: columns.get(c, Column(c, 1.0)) for c in LOG_UNITS}
+    found = {channel: column for channel, column in asked.items() if column.name in index}
+    if "t" not in found:
+        raise InputError(f"{path}: no time column {asked['t'].name!r}; {advice(index, ['t'])}")
+    data: dict[str, np.ndarray] = {}
+    beyond = 0
+    for channel, column in found.items():
+        values = _numbers(cells, index[column.name], column.name)
+        far = np.abs(values) > BEYOND_ALL
+        if channel == "t" and far.any():
+            row = int(np.argmax(far))
+            raise InputError(f"{path}, line {cells.lines[row]}: {values[row]:.3g} is no time")
+        values[far] = np.nan
+        beyond += int(np.count_nonzero(far))
+        data[channel] = column.factor * values
+    taken = {column.name for column in found.values()}
+    return CsvLog(
+        path=path,
+        data=data,
+        lines=cells.lines,
+        header=cells.header,
+        time_column=found["t"].name,
+        renamed=frozenset(found.keys() & columns.keys()),
+        unknown=[name for name in index if name not in taken],
+        beyond=beyond,
+    )
+
+
+def _split(path: Path, text: str) -> _Cells:
+    first, delimiter = header_of(text)
+    if any(first) and all(_is_finite_number(cell) for cell in first if cell):
+        raise InputError(f"{path}, line 1: numbers, no header: the first row must name the columns")
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
+    header: list[str] = []
+    rows, lines = [], []
+    try:
+        for row in reader:
+            cells = [cell.strip() for cell in row]
+            if not any(cells):
+                continue
+            if not header:
+                header = cells
+                continue
+            if len(cells) != len(header):
+                raise InputError(
+                    f"{path}, line {reader.line_num}: {len(cells)} cells"
+                    f" where the header has {len(header)} (cells parted by {delimiter!r})"
+                )
+            rows.append(cells)
+            lines.append(reader.line_num)
+    except csv.Error as error:
+        raise InputError(f"{path}, line {reader.line_num}: {error}") from error
+    if not header:
+        raise InputError(f"{path}: the file is empty")
+    for name, times in Counter(header).items():
+        if name and times > 1:
+            raise InputError(f"{path}: {times} columns are named {name!r}")
+    if not rows:
+        raise InputError(f"{path}: a header and no rows")
+    return _Cells(path, header, rows, lines)
+
+
+def _numbers(cells: _Cells, column: int, name: str) -> np.ndarray:
+    """A column's numbers (n,), NaN where a cell is empty."""
+    texts = [row[column] for row in cells.rows]
+    try:
+        values = np.array([float(text) if text else np.nan for text in texts])
+        if not np.isinf(values).any() and "_" not in "".join(texts):
+            return values
+    except ValueError:
+        pass
+    bad = next(k for k, text in enumerate(texts) if text and not _is_finite_number(text))
+    where, text = f"{cells.path}, line {cells.lines[bad]}", texts[bad]
+    if bad == 0 and not any(map(_is_finite_number, cells.rows[0])):
+        raise InputError(
+            f"{where}: {text[:40]!r} and no number in the row: if"
+            " it holds the units, delete it, and name them in card.toml under [columns]"
+        )
+    raise InputError(f"{where}, column {name!r}: {text[:40]!r} is not a finite number{_hint(text)}")
+
+
+def _hint(cell: str) -> str:
+    """What to do about a cell that is no number, where that is known."""
+    if re.fullmatch(r"[-+]?\d+,\d+", cell):
+        return ": write numbers with a decimal point"
+    if cell.strip().lower() in ("na", "n/a", "null", "none", "-", "--", "?"):
+        return ": leave the cell empty where there is no reading"
+    if re.match(r"\d+[-/:.]\d+[-/:.]\d+", cell):
+        return ": time is needed in seconds, from any beginning"
+    return ""
+
+
+def _is_finite_number(cell: str) -> bool:
+    try:
+        return "_" not in cell and not np.isinf(float(cell))
+    except ValueError:
+        return False
