@@ -60,6 +60,6 @@ def check_causes(
 
 
 def truth_of(folder: Path) -> tuple[list[str], dict[str, float]]:
-    """What is hidden in an injector's flight: effects, and all their numbers as the catalogue has them."""
+    """What is hidden in a flight of the injector: effects, and their numbers as the catalogue has them."""
     truth = json.loads((folder / "truth.json").read_text())
     return truth["hidden"], catalogue_values(truth["values"])
