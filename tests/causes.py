@@ -60,6 +60,6 @@ def check_causes(
 
 
 def truth_of(folder: Path) -> tuple[list[str], dict[str, float]]:
-    """What is hidden in a flight of the injector: effects, and their numbers as the catalogue has them."""
+    """What the injector hid in a flight: effects, and all their numbers in the catalogue's form."""
     truth = json.loads((folder / "truth.json").read_text())
     return truth["hidden"], catalogue_values(truth["values"])

@@ -58,7 +58,7 @@ OWN: dict[str, tuple[str, ...]] = {
         "tests/test_gain.py",
     ),
 }  # fmt: skip
-"""Pattern of files -> the tests that belong to them, tried first, in this order; the first that fits."""
+"""Pattern of files -> the tests that belong to them, tried first, in this order; the first fit."""
 
 WHOLE_FLIGHTS = ("coax_env/diagnosis/*", "coax_env/identification/identify.py")
 """Files that are judged by whole flights: their own tests are tried with the slow ones among them."""
