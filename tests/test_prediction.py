@@ -127,6 +127,18 @@ def test_headings_are_compared_in_whole_turns():
     assert abs(trace.error).max() < 0.02
 
 
+def test_a_turn_that_the_compass_did_not_see_is_still_a_turn():
+    """Four seconds without a heading, the gyro turning on: readings alone would count one turn less."""
+    rate = 1.3
+    t = 0.01 * np.arange(901)
+    psi = (rate * t + math.pi) % (2.0 * math.pi) - math.pi
+    psi[(t > 1.5) & (t < 5.5)] = np.nan
+    trace = flown(hover(seconds=9.0, psi=psi, r=rate)).channels["psi"]
+    after = np.isfinite(trace.error) & (trace.t > 6.6)
+    assert after.sum() > 5 and abs(trace.error[after]).max() < 0.02
+    assert trace.measured[after] == pytest.approx(rate * trace.t[after], abs=1e-6)
+
+
 def test_the_floor_is_the_start_flown_forward():
     """In hover height is h - w t: its variance follows from the covariance of the first state."""
     record, horizon = hover(), 1.0
