@@ -33,7 +33,7 @@ def test_links_and_scripts_are_there(path):
             assert (path.parent / target).exists(), target
     for script in re.findall(r"scripts/[a-z_]+\.py", text):
         assert (ROOT / script).exists(), script
-    for name in re.findall(r"`((?:coax_env|controllers|tests|scripts)/[\w/.]+)`", text):
+    for name in re.findall(r"`((?:coax_env|controllers|tests|scripts)/[a-z0-9_/.]+)`", text):
         assert (ROOT / name).exists(), name
 
 
