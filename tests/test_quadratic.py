@@ -51,27 +51,27 @@ def objective(q: Quadratic, x: np.ndarray) -> float:
 @pytest.mark.parametrize("free", [("a", "c", "d"), NAMES, ("e",), ()])
 @pytest.mark.parametrize("pinned", [{}, {"b": 0.7}])
 def test_the_best_is_scipys(bound, free, pinned):
-    """Free parameters at their best within bounds, pinned ones where they are told, others held."""
+    """Free parameters at their best within bounds, pinned ones where they are put, others held."""
     free = [name for name in free if name not in pinned]
     for seed in range(3):
         q = quadratic(seed, bound)
         x0 = q.at.copy()
         for name, value in pinned.items():
             x0[NAMES.index(name)] = value
-        loose = [NAMES.index(name) for name in free]
+        freed = [NAMES.index(name) for name in free]
 
-        def cost(y, q=q, x0=x0, loose=loose):
+        def cost(y, q=q, x0=x0, freed=freed):
             x = x0.copy()
-            x[loose] = y
+            x[freed] = y
             return objective(q, x)
 
-        least = cost(x0[loose])
+        least = cost(x0[freed])
         expected = x0.copy()
-        if loose:
-            bounds = list(zip(q.lower[loose], q.upper[loose], strict=True))
-            found = minimize(cost, x0[loose], method="L-BFGS-B", bounds=bounds,
+        if freed:
+            bounds = list(zip(q.lower[freed], q.upper[freed], strict=True))
+            found = minimize(cost, x0[freed], method="L-BFGS-B", bounds=bounds,
                              options={"ftol": 1e-15, "gtol": 1e-10})  # fmt: skip
-            least, expected[loose] = found.fun, found.x
+            least, expected[freed] = found.fun, found.x
         change, move = q.best(free, pinned)
         assert change == pytest.approx(least - objective(q, q.at), abs=1e-7)
         np.testing.assert_allclose(q.at + move, expected, atol=1e-4)
