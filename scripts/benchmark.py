@@ -150,7 +150,13 @@ def find_peers(options: Any, report_progress: Any) -> tuple[list[Contender], dic
 def in_turns(
     contenders: Sequence[Contender], row: Row, options: Any, report_progress: Any
 ) -> dict[str, dict[str, Any]]:
-    """The best of all rounds of each contender, who take turns; or why one has no number."""
+    """The best of all rounds of each contender, who take turns; or why one has no number.
+
+    Args:
+        contenders: who takes part. row: what is compared.
+        options: the command line's: envs, seconds of a turn, rounds.
+        report_progress: called with a line before each turn.
+    """
     best: dict[str, dict[str, Any]] = {}
     for k in range(options.rounds):
         for contender in contenders:
@@ -165,7 +171,12 @@ def in_turns(
 
 
 def fly(contender: Contender, mode: str, envs: int, seconds: float) -> dict[str, Any]:
-    """What a program of speed/ prints, from a fresh interpreter."""
+    """What a program of speed/ prints, from a fresh interpreter.
+
+    Args:
+        contender: whose program. mode: as in speed/timing.py.
+        envs: in a vector env. seconds: that are flown [s].
+    """
     environment = peers.clean_environment()
     if contender.name == OURS:
         environment["PYTHONPATH"] = str(PACKAGE.parent)

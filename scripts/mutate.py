@@ -113,7 +113,15 @@ def trials(waiting: Sequence[Mutation], options: Any) -> Iterator[dict[str, Any]
 
 
 def check_whole(tree: Tree, waiting: Sequence[Mutation], options: Any) -> None:
-    """Make sure that the tests pass while nothing is broken; what has passed is not run again."""
+    """Make sure that the tests pass while nothing is broken; what has passed is not run again.
+
+    Args:
+        tree: a copy to test in. waiting: the mutations whose tests are needed.
+        options: the command line's.
+
+    Raises:
+        InputError: a test fails as the tree stands.
+    """
     needed = dict.fromkeys(t for m in waiting for t in own_tests(m.file))
     sources = [
         p for folder in ("coax_env", "controllers") for p in (options.root / folder).rglob("*.py")

@@ -49,7 +49,11 @@ def all_sites(root: Path) -> list[Mutation]:
 
 
 def draw(found: Sequence[Mutation], count: int, seed: int) -> list[Mutation]:
-    """`count` of them, the parts in turns; a change elsewhere in the code leaves the order alone."""
+    """So many of them, the parts in turns; a change elsewhere in the code leaves the order alone.
+
+    Args:
+        found: all there are. count: how many at most. seed: of their order within each part.
+    """
 
     def place(mutation: Mutation) -> bytes:
         return hashlib.sha256(f"{seed} {mutation.name}".encode()).digest()

@@ -16,7 +16,12 @@ def share(rows: Sequence[Mapping[str, Any]]) -> float:
 def table_text(
     rows: Sequence[Mapping[str, Any]], equivalent: Sequence[Mapping[str, str]], command: str
 ) -> str:
-    """The table as Markdown: score by part, what survived, what was passed over, every trial."""
+    """The table as Markdown: score by part, what survived, what was passed over, every trial.
+
+    Args:
+        rows: a result each, as mutate.py stores them. equivalent: file, before, after and reason of
+            what was drawn and passed over. command: that made them.
+    """
     lines = [f"`{command}`", "", "| part | mutations | caught | |", "|---|---|---|---|"]
     for part in PARTS:
         own = [row for row in rows if part_of(row["file"]) == part]

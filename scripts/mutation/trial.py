@@ -104,7 +104,7 @@ class Tree:
             os.killpg(running.pid, signal.SIGKILL)
 
     def try_out(self, mutation: Mutation, rest: bool) -> dict[str, Any]:
-        """Break the code, test it (and by the `rest` of the tests), and restore it: the row's result."""
+        """Break the code, test it (by the `rest` of the tests too), restore it: the row's result."""
         path = self.place / mutation.file
         kept = self._machine_code()
         whole, stamp = path.read_text(encoding="utf-8"), path.stat().st_mtime_ns
