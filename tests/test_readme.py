@@ -71,13 +71,19 @@ def test_the_demo_prints_what_readme_says(tmp_path):
     assert re.search(pattern, folded(done.stdout)), done.stdout
 
 
-@pytest.mark.slow
-def test_the_ten_lines_print_what_readme_says(tmp_path):
+def ten_lines() -> tuple[str, str]:
+    """README's lines of Python, and what it says they print."""
     found = re.search(r"```python\n(.*?)```\s+prints\s+(.*?)\n\n(?=\S)", README, re.DOTALL)
     assert found
+    return found[1], folded(found[2])
+
+
+@pytest.mark.slow
+def test_the_ten_lines_print_what_readme_says(tmp_path):
+    lines, printed = ten_lines()
     done = subprocess.run(
-        [sys.executable, "-c", found[1]], cwd=tmp_path, capture_output=True, text=True,
-        check=False, timeout=600,
+        [sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, check=False,
+        timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-1500:]
-    assert folded(done.stdout) == folded(found[2])
+    assert folded(done.stdout) == printed

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 import sysconfig
@@ -12,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from test_readme import folded, ten_lines
 
 import coax_env
 
@@ -137,9 +137,5 @@ def vehicles_flight_and_policy_have_come(coax: Callable[..., Done]) -> None:
 
 def the_readmes_lines_run(coax: Callable[..., Done]) -> None:
     """From a log to a better hover, as README has it."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    lines = re.search(r"```python\n(.*?)```", readme, re.DOTALL)
-    printed = readme[lines.end() :].split("\n\n")[1]
-    assert coax(text=lines[1]).stdout.splitlines() == [
-        line.strip() for line in printed.splitlines()
-    ]
+    lines, printed = ten_lines()
+    assert folded(coax(text=lines).stdout) == printed
