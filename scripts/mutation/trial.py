@@ -70,8 +70,8 @@ def own_tests(file: str) -> tuple[str, ...]:
 
 
 APART = (
-    "tests/test_house.py", "tests/test_wheel.py", "tests/test_mutation.py", "tests/test_killed.py",
-    "tests/test_fuzz.py",
+    "tests/test_house.py", "tests/test_readme.py", "tests/test_wheel.py", "tests/test_mutation.py",
+    "tests/test_killed.py", "tests/test_fuzz.py",
 )  # fmt: skip
 """Tests of the house and not of its numbers: what they catch is not counted."""
 
