@@ -107,17 +107,17 @@ def main() -> None:
         raise InputError("--envs, --rounds and --seconds must be positive")
     load = os.getloadavg()[0]
     ours = Contender(OURS, Path(sys.executable), "fly_coax.py")
-    with command_line.progress("benchmark") as say:
-        others, absent = find_peers(options, say) if options.peers else ([], {})
+    with command_line.progress("benchmark") as report_progress:
+        others, absent = find_peers(options, report_progress) if options.peers else ([], {})
         rows: dict[str, Any] = {}
         for row in ROWS:
             flown = [ours, *(c for c in others if row.mode in c.plays)]
-            rows[row.title] = in_turns(flown, row, options, say)
-        say("the kernel alone, a cold start, effects off")
-        kernel = in_turns([ours], Row("kernel", "kernel"), options, say)[OURS]
+            rows[row.title] = in_turns(flown, row, options, report_progress)
+        report_progress("the kernel alone, a cold start, effects off")
+        kernel = in_turns([ours], Row("kernel", "kernel"), options, report_progress)[OURS]
         cold = cold_start()
         steps = effects_off()
-        diagnoses = diagnosis_times.measure(say) if options.diagnosis else []
+        diagnoses = diagnosis_times.measure(report_progress) if options.diagnosis else []
     result = {
         "load_average": load, "processors": os.cpu_count(), "envs": options.envs, "rows": rows,
         "kernel": kernel, "cold_start_s": cold, "absent": absent,
@@ -129,7 +129,7 @@ def main() -> None:
         print(f"{name}: not measured: {why}")
 
 
-def find_peers(options: Any, say: Any) -> tuple[list[Contender], dict[str, str]]:
+def find_peers(options: Any, report_progress: Any) -> tuple[list[Contender], dict[str, str]]:
     """Install what can be installed; the rest with the reason why not."""
     names = [peer.name for peer in peers.PEERS]
     if unknown := set(options.only or ()) - set(names):
@@ -138,7 +138,7 @@ def find_peers(options: Any, say: Any) -> tuple[list[Contender], dict[str, str]]
     for peer in peers.PEERS:
         if options.only and peer.name not in options.only:
             continue
-        say(f"installing {peer.name}")
+        report_progress(f"installing {peer.name}")
         try:
             python = peers.install(peer, options.venvs.resolve(), options.sources)
             found.append(Contender(peer.name, python, peer.program, peer.plays))
@@ -148,13 +148,19 @@ def find_peers(options: Any, say: Any) -> tuple[list[Contender], dict[str, str]]
 
 
 def in_turns(
-    contenders: Sequence[Contender], row: Row, options: Any, say: Any
+    contenders: Sequence[Contender], row: Row, options: Any, report_progress: Any
 ) -> dict[str, dict[str, Any]]:
-    """The best of all rounds of each contender, who take turns; or why one has no number."""
+    """The best of all rounds of each contender, who take turns; or why one has no number.
+
+    Args:
+        contenders: who takes part. row: what is compared.
+        options: the command line's: envs, seconds of a turn, rounds.
+        report_progress: called with a line before each turn.
+    """
     best: dict[str, dict[str, Any]] = {}
     for k in range(options.rounds):
         for contender in contenders:
-            say(f"{row.title}: {contender.name}, round {k + 1} of {options.rounds}")
+            report_progress(f"{row.title}: {contender.name}, round {k + 1} of {options.rounds}")
             if "failed" in best.get(contender.name, {}):
                 continue
             found = fly(contender, row.mode, options.envs, options.seconds)
@@ -165,7 +171,12 @@ def in_turns(
 
 
 def fly(contender: Contender, mode: str, envs: int, seconds: float) -> dict[str, Any]:
-    """What a program of speed/ prints, from a fresh interpreter."""
+    """What a program of speed/ prints, from a fresh interpreter.
+
+    Args:
+        contender: whose program. mode: as in speed/timing.py.
+        envs: in a vector env. seconds: that are flown [s].
+    """
     environment = peers.clean_environment()
     if contender.name == OURS:
         environment["PYTHONPATH"] = str(PACKAGE.parent)

@@ -23,7 +23,7 @@ from coax_env.report import FlownControllers
 from controllers import mended
 
 PACKAGE = Path(coax_env.__file__).resolve().parent
-BUNDLED = PACKAGE / "flights" / "windy"
+BUNDLED = PACKAGE / "logs" / "flights" / "windy"
 REAL = PACKAGE.parent.parent / "shared" / "flights" / "skybotix_coax"
 
 

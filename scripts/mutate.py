@@ -1,9 +1,9 @@
 """Is every test able to fail? Breaks the code in one place at a time, and counts what a test notices.
 
-Signs, terms, products, sines, constants, indices and comparisons of the model, sensors, estimator and
-regression, drawn by seed; each in a copy of the tree, tested by the tests of its file and then by the
-rest of the quick ones. What is known is not tried again: a mutation that was caught while its file
-stays as it is, one that survived while no source and no test has changed.
+Signs, terms, products, sines, constants, indices and comparisons of the model, env, estimation,
+identification and diagnosis, drawn by seed; each in a copy of the tree, tested by the tests of its file
+and then by the rest of the quick ones. What is known is not tried again: a mutation that was caught
+while its file stays as it is, one that survived while no source and no test has changed.
 """
 
 import json
@@ -18,7 +18,7 @@ from typing import Any
 import command_line
 from mutation import draw, score
 from mutation.sites import Mutation
-from mutation.trial import OWN, Tree, fingerprint
+from mutation.trial import Tree, fingerprint, own_tests
 from tqdm import tqdm
 
 from coax_env.errors import InputError
@@ -113,15 +113,27 @@ def trials(waiting: Sequence[Mutation], options: Any) -> Iterator[dict[str, Any]
 
 
 def check_whole(tree: Tree, waiting: Sequence[Mutation], options: Any) -> None:
-    """Make sure that the tests pass while nothing is broken; what has passed is not run again."""
-    needed = dict.fromkeys(t for m in waiting for t in OWN[m.file] if (options.root / t).exists())
+    """Make sure that the tests pass while nothing is broken; what has passed is not run again.
+
+    Args:
+        tree: a copy to test in. waiting: the mutations whose tests are needed.
+        options: the command line's.
+
+    Raises:
+        InputError: a test fails as the tree stands.
+    """
+    needed = dict.fromkeys(t for m in waiting for t in own_tests(m.file))
     sources = [
         p for folder in ("coax_env", "controllers") for p in (options.root / folder).rglob("*.py")
     ]
-    state = {name: fingerprint(*sources, options.root / name) for name in needed}
+    state = {
+        name: fingerprint(*sources, options.root / name)
+        for name in needed
+        if (options.root / name).exists()
+    }
     path = options.out / "whole.json"
     passed: dict[str, str] = json.loads(path.read_text()) if path.exists() else {}
-    for name in needed:
+    for name in state:
         if passed.get(name) != state[name]:
             if by := tree.test([name]):
                 raise InputError(f"{by} fails before anything is broken")

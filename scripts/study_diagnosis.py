@@ -100,7 +100,11 @@ def adopt(out: Path) -> None:
 
 
 def write_results(out: Path, rows: list[dict[str, Any]], command: str) -> None:
-    """table.md, summary.json, the confusion matrix, and the threshold where there is enough."""
+    """table.md, summary.json, the confusion matrix, and the threshold where there is enough.
+
+    Args:
+        out: the study's folder. rows: results of flights, failures included. command: that made them.
+    """
     write_text(out / "table.md", table.table_text(rows, command))
     methods = sorted({m for row in rows for m in row.get("methods", ())})
     write_json(

@@ -359,7 +359,7 @@ def _fly(n, settle, target, trust, extra, tremor, shake, gust_std, gust_memory, 
     """Fly ``settle + n`` rows; returns the commands and true readings of the last n.
 
     Readings: 0-1 rotor speeds, 2-4 rates, 5-7 accelerometers, 8-10 attitude, 11-13 position,
-    14-16 velocity, 17 heights per row in slant and late as the sonar would (height).
+    14-16 velocity, 17 heights per row in slant and delayed as the sonar would (height).
     ``tremor``: (rows, 4) added to the commands; ``shake``: (rows, SUBSTEPS, 6) white, unit.
     """
     commands = np.empty((n, 4))
@@ -401,7 +401,7 @@ def _fly(n, settle, target, trust, extra, tremor, shake, gust_std, gust_memory, 
         command[3] = round(min(max(command[3], -0.25), 0.25) * 1e5) / 1e5
         flown[k] = command
         rates = s[10:13].copy()  # a gyro does not see the jump of this very instant
-        actual = _late(flown, k, 0, hidden)
+        actual = _delayed(flown, k, 0, hidden)
         sag = math.exp(-hidden.sag * max(k - settle, 0) * STEP)
         actual[0] *= sag
         actual[1] *= sag
@@ -424,8 +424,8 @@ def _fly(n, settle, target, trust, extra, tremor, shake, gust_std, gust_memory, 
             readings[row, 17] = sunk[max(past, 0)] * slant
         for j in range(SUBSTEPS):
             if hidden.servo_delay > 0.0:
-                late = _late(flown, k, j, hidden)
-                actual[2:4] = late[2:4]
+                delayed = _delayed(flown, k, j, hidden)
+                actual[2:4] = delayed[2:4]
                 _follow_at_once(s, actual, hidden)
             ds = _derivative(s, actual, gust, hidden, out2)
             middle = s + h * ds
@@ -438,8 +438,8 @@ def _fly(n, settle, target, trust, extra, tremor, shake, gust_std, gust_memory, 
 
 
 @njit(cache=True)
-def _late(flown, k, j, hidden):
-    """The command that acts now: swash commands come late by the pure delay."""
+def _delayed(flown, k, j, hidden):
+    """The command that acts now: swash commands are shifted by the pure delay."""
     actual = flown[k].copy()
     behind = hidden.servo_delay / STEP - j / SUBSTEPS
     back = max(int(math.ceil(behind - 1e-9)), 0)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 import sysconfig
@@ -13,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from test_readme import folded, ten_lines
 
 import coax_env
 from coax_env.errors import DISTRIBUTION
@@ -73,7 +73,7 @@ def test_the_wheel_has_every_file_of_the_packages(wheel):
         path.relative_to(src).as_posix()
         for package in ("coax_env", "controllers")
         for path in (src / package).rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
+        if path.is_file() and "__pycache__" not in path.parts and path.name != "README.md"
     }
     assert wanted <= found, wanted - found
     assert {f"coax_commands/{p.name}" for p in (src / "scripts").glob("*.py")} <= found
@@ -165,10 +165,6 @@ def what_is_missing_is_named_with_its_extra(coax: Callable[..., Done]) -> None:
 
 
 def the_readmes_lines_run(coax: Callable[..., Done]) -> None:
-    """From a log to a better hover, as README has it, on a flight of a machine without effects."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    lines = re.search(r"```python\n(.*?)```", readme, re.DOTALL)
-    coax("simulate", "--maneuver", "lon_3211,lat_3211,heave_3211,yaw_3211", "--out", "quick")
-    verdict, score = coax(text=lines[1].replace("my_flight", "quick/flight")).stdout.splitlines()
-    assert verdict == "consistent []"
-    assert "'success_rate': 1.0" in score
+    """From a log to a better hover, as README has it."""
+    lines, printed = ten_lines()
+    assert folded(coax(text=lines).stdout) == printed

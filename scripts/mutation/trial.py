@@ -15,53 +15,63 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 from coax_env.errors import InputError
 from coax_env.files import make_folder
+from mutation.draw import matches
 from mutation.sites import Mutation
 
 COPIED = ("coax_env", "controllers", "scripts", "tests", "pyproject.toml", "README.md")
 LIMIT = 900.0  # [s] for the tests of one mutation; who needs longer is caught in an endless loop
 
 _ENV = ("tests/test_sensors.py", "tests/test_hover.py", "tests/test_world.py", "tests/test_env.py")
+_MODEL = ("tests/test_dynamics.py", "tests/test_vehicle.py", "tests/test_linear.py", *_ENV)
 OWN: dict[str, tuple[str, ...]] = {
-    "coax_env/model/dynamics.py": (
-        "tests/test_dynamics.py", "tests/test_linear.py", "tests/test_env.py",
-    ),
-    "coax_env/model/effects.py": (
-        "tests/test_dynamics.py", "tests/test_vehicle.py", "tests/test_world.py",
-    ),
-    "coax_env/env/turbulence.py": ("tests/test_turbulence.py", "tests/test_world.py"),
     "coax_env/model/linear.py": ("tests/test_linear.py", "tests/test_controllers.py"),
-    "coax_env/model/vehicle.py": ("tests/test_vehicle.py", "tests/test_world.py"),
     "coax_env/model/sensors.py": _ENV,
     "coax_env/model/actuators.py": _ENV,
-    "coax_env/env/period.py": _ENV,
-    "coax_env/env/fleet.py": (*_ENV, "tests/test_simd.py"),
-    "coax_env/env/hover.py": _ENV,
-    "coax_env/env/tasks.py": _ENV,
-    "coax_env/estimation/kalman.py": ("tests/test_estimation.py",),
-    "coax_env/estimation/helicopter.py": (
-        "tests/test_helicopter.py", "tests/test_closed_loop.py",
-    ),
+    "coax_env/model/generic_terms.py": ("tests/test_unlisted.py", *_MODEL),
+    "coax_env/model/*": _MODEL,
+    "coax_env/env/fleet*": (*_ENV, "tests/test_simd.py"),
+    "coax_env/env/turbulence.py": ("tests/test_turbulence.py", *_ENV),
+    "coax_env/env/*": _ENV,
+    "coax_env/simulation/*": ("tests/test_simulation.py", "tests/test_sensors.py"),
     "controllers/estimator.py": (
         "tests/test_estimator.py", "tests/test_faulty_sensors.py", "tests/test_controllers.py",
     ),
-    "coax_env/estimation/fit.py": ("tests/test_estimation.py",),
-    "coax_env/estimation/whiteness.py": ("tests/test_estimation.py",),
-    "coax_env/identification/two_step/method.py": ("tests/test_two_step.py",),
-    "coax_env/identification/two_step/modes.py": ("tests/test_two_step.py",),
-    "coax_env/identification/two_step/processing.py": ("tests/test_two_step.py",),
-    "coax_env/identification/two_step/reconstruction.py": ("tests/test_two_step.py",),
-    "coax_env/identification/two_step/regression.py": ("tests/test_two_step.py",),
+    "coax_env/estimation/quadratic.py": ("tests/test_quadratic.py", "tests/test_diagnosis.py"),
+    "coax_env/estimation/prediction.py": ("tests/test_prediction.py", "tests/test_diagnosis.py"),
+    "coax_env/estimation/trajectories.py": ("tests/test_report.py",),
+    "coax_env/estimation/*": (
+        "tests/test_estimation.py", "tests/test_helicopter.py", "tests/test_closed_loop.py",
+        "tests/test_quadratic.py", "tests/test_prediction.py", "tests/test_diagnosis.py",
+    ),
+    "coax_env/identification/two_step/*": ("tests/test_two_step.py",),
+    "coax_env/identification/*": ("tests/test_identification.py", "tests/test_two_step.py"),
+    "coax_env/diagnosis/gain.py": ("tests/test_gain.py", "tests/test_diagnosis.py"),
+    "coax_env/diagnosis/calibration.py": ("tests/test_study.py",),
+    "coax_env/diagnosis/*": (
+        "tests/test_diagnosis.py", "tests/test_unlisted.py", "tests/test_closed_loop.py",
+        "tests/test_gain.py",
+    ),
 }  # fmt: skip
-"""File -> the tests that belong to it, tried first, in this order."""
+"""Pattern of files -> the tests that belong to them, tried first, in this order; the first fit."""
+
+WHOLE_FLIGHTS = ("coax_env/diagnosis/*", "coax_env/identification/identify.py")
+"""Files that are judged by whole flights: their own tests are tried with the slow ones among them."""
+
+
+def own_tests(file: str) -> tuple[str, ...]:
+    """The tests of a file."""
+    return next((tests for pattern, tests in OWN.items() if fnmatchcase(file, pattern)), ())
+
 
 APART = (
-    "tests/test_house.py", "tests/test_wheel.py", "tests/test_mutation.py", "tests/test_killed.py",
-    "tests/test_fuzz.py",
+    "tests/test_house.py", "tests/test_readme.py", "tests/test_wheel.py", "tests/test_mutation.py",
+    "tests/test_killed.py", "tests/test_fuzz.py",
 )  # fmt: skip
 """Tests of the house and not of its numbers: what they catch is not counted."""
 
@@ -94,15 +104,17 @@ class Tree:
             os.killpg(running.pid, signal.SIGKILL)
 
     def try_out(self, mutation: Mutation, rest: bool) -> dict[str, Any]:
-        """Break the code, test it (and by the `rest` of the tests), and mend it: the row's result."""
+        """Break the code, test it (by the `rest` of the tests too), restore it: the row's result."""
         path = self.place / mutation.file
         kept = self._machine_code()
         whole, stamp = path.read_text(encoding="utf-8"), path.stat().st_mtime_ns
         path.write_text(mutation.applied(whole), encoding="utf-8")
         start = time.monotonic()
         try:
-            own = OWN[mutation.file]
-            by = self.test([name for name in own if (self.place / name).exists()])
+            own = [name for name in own_tests(mutation.file) if (self.place / name).exists()]
+            by = self.test(own)
+            if not by and matches(mutation.file, WHOLE_FLIGHTS):
+                by = self.test(own, "slow")
             if not by and rest:
                 left_out = {*own, *APART}
                 others = sorted(p.name for p in (self.place / "tests").glob("test_*.py"))
@@ -117,8 +129,12 @@ class Tree:
         seconds = round(time.monotonic() - start, 1)
         return {"caught": bool(by), "by": by, "rest": rest, "seconds": seconds}
 
-    def test(self, tests: Sequence[str]) -> str:
-        """The first of the quick tests that fails in the tree as it stands; empty where all pass."""
+    def test(self, tests: Sequence[str], which: str = "not slow") -> str:
+        """The first of these tests that fails in the tree as it stands; empty where all pass.
+
+        Args:
+            tests: files of them. which: by pytest's markers.
+        """
         if not tests:
             return ""
         environment = os.environ | {
@@ -126,7 +142,7 @@ class Tree:
             "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
         }  # fmt: skip
         command = [
-            sys.executable, "-m", "pytest", "-x", "-q", "--tb=line", "-m", "not slow",
+            sys.executable, "-m", "pytest", "-x", "-q", "--tb=line", "-m", which,
             "-p", "no:cacheprovider", *tests,
         ]  # fmt: skip
         if self._stopped.is_set():
@@ -154,9 +170,9 @@ class Tree:
 
 def _verdict(code: int, said: str) -> str:
     """What pytest's exit code means: the failing test; empty where all passed."""
-    if code == 0:
+    if code in (0, 5):  # all passed, or none of them is of this kind
         return ""
-    if code in (3, 4, 5):  # pytest's own fault, its command line's, or nothing to test
+    if code in (3, 4):  # pytest's own fault, or its command line's
         raise InputError(f"pytest ended with {code}: {said.strip().splitlines()[-1]:.200}")
     found = _FAILED.search(said)
     return found[1] if found else f"pytest ended with {code}"

@@ -18,7 +18,7 @@ HIDDEN: tuple[Mapping[str, Mapping[str, float]], ...] = (
 SEED = 40
 
 
-def measure(say: Callable[[str], None]) -> list[dict[str, Any]]:
+def measure(report_progress: Callable[[str], None]) -> list[dict[str, Any]]:
     """What was hidden, what was named, the seconds that took (warm) and those flown, per flight."""
     from study.plan import injector
 
@@ -27,7 +27,7 @@ def measure(say: Callable[[str], None]) -> list[dict[str, Any]]:
 
     rows = []
     for effects in (HIDDEN[-1], *HIDDEN):  # the first one only warms up
-        say(f"a diagnosis with {' and '.join(effects) or 'nothing'} hidden")
+        report_progress(f"a diagnosis with {' and '.join(effects) or 'nothing'} hidden")
         with tempfile.TemporaryDirectory() as folder:
             injector.fly(folder, effects, gusts=True, seed=SEED + len(effects))
             flight = read_flight(folder)

@@ -106,9 +106,11 @@ def install(peer: Peer, folder: Path, sources: Path | None) -> Path:
 def reason(text: str) -> str:
     """What went wrong, in one line of a log: the last line that names an error with its cause."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    told = [line for line in lines if re.search(r"[A-Za-z]*(Error|ERROR|error|fatal): \S", line)]
-    causes = [line for line in told if not re.search("metadata|subprocess|See above", line)]
-    return (causes or told or lines or ["no word why"])[-1][:160]
+    reported = [
+        line for line in lines if re.search(r"[A-Za-z]*(Error|ERROR|error|fatal): \S", line)
+    ]
+    causes = [line for line in reported if not re.search("metadata|subprocess|See above", line)]
+    return (causes or reported or lines or ["no word why"])[-1][:160]
 
 
 def clean_environment() -> dict[str, str]:

@@ -140,7 +140,12 @@ _PLACES = np.array(
 def along(
     model: HeliModel, run: RunPass, values: dict[str, float], moved: Lag | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Wrench (n, 6) and the rates of the four flap angles (n, 4) along a run, gusts off."""
+    """Wrench (n, 6) and the rates of the four flap angles (n, 4) along a run, gusts off.
+
+    Args:
+        model: of the helicopter. run: the filter's pass over it, n rows.
+        values: of the model's parameters. moved: changes the commands (n, 5), as a lag does.
+    """
     p = model.vector(values)
     u = model.inputs(run.record, p)
     if moved is not None:
@@ -162,8 +167,10 @@ def wrench(
 ) -> np.ndarray:
     """The model's specific force [m/s2] and angular acceleration [rad/s2] along a run, (n, 6).
 
-    flaps: rates of the flap angles of the bare model. What differs from them is followed with the
-    flaps' own lags, since the reconstructed angles are the bare model's.
+    Args:
+        model, run, values, moved: as of `along`.
+        flaps: (n, 4) rates of the flap angles of the bare model [rad/s]. What differs from them is
+            followed with the flaps' own lags, since the reconstructed angles are the bare model's.
     """
     acting, rates = along(model, run, values, moved)
     if flaps is None or np.allclose(rates, flaps, rtol=0.0, atol=1e-12):
@@ -265,12 +272,22 @@ def by_f(least: float) -> Rule:
 
 
 def by_bic(n: int, without: float, with_it: float, own: int, columns: int) -> float:
-    """Fall of the Bayesian information criterion."""
+    """Fall of the Bayesian information criterion [twice a nat].
+
+    Args:
+        n: rows. without, with_it: residual sums of squares.
+        own: columns of the effect. columns: in all (no part of this criterion).
+    """
     return n * float(np.log(without / with_it)) - own * float(np.log(n))
 
 
 def stepwise(gram: Gram, groups: dict[str, list[int]], rule: Rule) -> list[str]:
-    """Effects in after forward steps, each followed by backward ones."""
+    """Effects in after forward steps, each followed by backward ones.
+
+    Args:
+        gram: the regression. groups: columns of each effect, which come and go together.
+        rule: says what an effect must earn.
+    """
     chosen: list[str] = []
 
     def columns(names: Sequence[str]) -> list[int]:

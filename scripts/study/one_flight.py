@@ -164,6 +164,10 @@ def expected_evidence(
     flight's commands, with the generator's noise, the base parameters (under their priors) and the
     other hidden effects projected out; taken at half the effect's size, which is the midpoint rule for
     what its whole size does. None: not in the catalogue.
+
+    Args:
+        planned: how it was flown. flight: its log. truth: of the generator, `hidden` and `values`.
+        held: names of the runs that are not fitted.
     """
     values = catalogue_values(truth["values"])
     listed = [e for e in truth["hidden"] if e in CATALOGUE]

@@ -131,7 +131,12 @@ def plan(
 
 
 def planned(kind: str, number: int, seed: int, runs: tuple[str, ...] | None) -> PlannedFlight:
-    """One flight, by its kind and number."""
+    """One flight, drawn from the study's seed, its kind and its number alone.
+
+    Args:
+        kind: one of KINDS. number: within its kind. seed: the study's.
+        runs: maneuvers that are flown, for all kinds but "hover"; None: all of the generator's.
+    """
     rng = np.random.default_rng([seed, KINDS.index(kind), number])
     names = _hidden(kind, number, rng)
     return PlannedFlight(

@@ -41,7 +41,11 @@ def stored(folder: Path, flight: PlannedFlight) -> dict[str, Any] | None:
 
 
 def store(folder: Path, flight: PlannedFlight, row: dict[str, Any]) -> None:
-    """Write a flight's result."""
+    """Write a flight's result.
+
+    Args:
+        folder: the study's. flight: as planned. row: its result (one_flight.py), or its failure.
+    """
     write_json(path_of(folder, flight), row)
 
 

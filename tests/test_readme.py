@@ -1,0 +1,89 @@
+"""READMEs: what they print is printed, what they name is there, and the first one stays short."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+ALL = sorted(
+    p for p in ROOT.rglob("README.md") if not {"runs", ".venv"} & set(p.relative_to(ROOT).parts)
+)
+LONGEST = 200  # lines of the first README
+
+
+def folded(text: str) -> str:
+    """Without regard to how lines are wrapped and columns set."""
+    return " ".join(text.split())
+
+
+def test_the_first_readme_is_short():
+    assert README.count("\n") < LONGEST
+
+
+@pytest.mark.parametrize("path", ALL, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_and_scripts_are_there(path):
+    text = path.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        if "://" not in target:
+            assert (path.parent / target).exists(), target
+    for script in re.findall(r"scripts/[a-z_]+\.py", text):
+        assert (ROOT / script).exists(), script
+    for name in re.findall(r"`((?:coax_env|controllers|tests|scripts)/[a-z0-9_/.]+)`", text):
+        assert (ROOT / name).exists(), name
+
+
+def test_every_script_is_in_the_readme():
+    shared = {
+        "coax.py",
+        "command_line.py",
+        "demo.py",
+    }  # the entry, what all share, scripts/demo's own
+    for path in (ROOT / "scripts").glob("*.py"):
+        assert path.name in shared or f"scripts/{path.name}" in README, path.name
+
+
+def test_every_test_named_as_a_proof_is_there():
+    text = (ROOT / "tests" / "README.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(test_\w+\.py)::(\w+)`", text)
+    assert len(named) > 50
+    for file, name in named:
+        tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
+        tests = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+        assert name in tests, f"{file}::{name}"
+
+
+@pytest.mark.slow
+def test_the_demo_prints_what_readme_says(tmp_path):
+    """Word by word and number by number; [...] stands for what README leaves out."""
+    block = README.partition("prints (the bundled flight")[2].partition("\n\n")[2]
+    block = block.partition("\n\nand where")[0]
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "demo.py"), "--no-real", "--out", str(tmp_path)],
+        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-1500:]
+    pattern = ".*?".join(re.escape(part) for part in folded(block).split("[...]"))
+    assert re.search(pattern, folded(done.stdout)), done.stdout
+
+
+def ten_lines() -> tuple[str, str]:
+    """README's lines of Python, and what it says they print."""
+    found = re.search(r"```python\n(.*?)```\s+prints\s+(.*?)\n\n(?=\S)", README, re.DOTALL)
+    assert found
+    return found[1], folded(found[2])
+
+
+@pytest.mark.slow
+def test_the_ten_lines_print_what_readme_says(tmp_path):
+    lines, printed = ten_lines()
+    done = subprocess.run(
+        [sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, check=False,
+        timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-1500:]
+    assert folded(done.stdout) == printed
