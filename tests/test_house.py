@@ -106,7 +106,10 @@ def test_flights_are_read_without_a_model():
                 )
 
 
-@pytest.mark.parametrize("name", ["engine", "kalman", "noise_levels", "quadratic", "state_space", "whiteness"])
+ENGINE = "engine kalman noise_levels quadratic state_space whiteness"
+
+
+@pytest.mark.parametrize("name", ENGINE.split())
 def test_the_engine_knows_no_helicopter(name):
     for target in reached(f"coax_env.estimation.{name}"):
         assert room(target) in ("estimation", "kernel"), f"{name} reaches {target}"

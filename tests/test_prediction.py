@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from coax_env import InputError, load_vehicle
-from coax_env.estimation.fit import Engine
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.prediction import (
     ChannelReplay,

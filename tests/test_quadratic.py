@@ -13,12 +13,11 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from coax_env.estimation.fit import Linearised
-from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter
 
 NAMES = ("a", "b", "c", "d", "e")
-variance_inflation = Quadratic.colour
+variance_inflation = Quadratic.variance_inflation
 KEPT = 0.9  # share of the blocks that it looks at, the smallest
 
 
@@ -214,7 +213,7 @@ def test_the_inflation_is_the_long_run_variance_of_the_scores(rho):
     assert 0.3 * slow < together < 0.6 * slow  # half of two directions is slow; trimmed
 
 
-def test_white_scores_are_not_inflated_and_one_bad_block_is_no_colour():
+def test_white_scores_are_not_inflated_and_one_bad_block_is_no_correlation():
     q = scored(0.0)
     assert variance_inflation(q, ["a"], ["a", "b"]) == 1.0
     q = scored(0.5, blocks=300)

@@ -46,7 +46,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/estimation/prediction.py": ("tests/test_prediction.py", "tests/test_diagnosis.py"),
     "coax_env/estimation/trajectories.py": ("tests/test_report.py",),
     "coax_env/estimation/*": (
-        "tests/test_estimation.py", "tests/test_helicopter.py", "tests/test_closed_loop.py",
+        "tests/test_estimation.py", "tests/test_helicopter.py", "tests/test_input_innovations.py",
         "tests/test_quadratic.py", "tests/test_prediction.py", "tests/test_diagnosis.py",
     ),
     "coax_env/identification/two_step/*": ("tests/test_two_step.py",),
@@ -54,7 +54,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/diagnosis/gain.py": ("tests/test_gain.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/calibration.py": ("tests/test_study.py",),
     "coax_env/diagnosis/*": (
-        "tests/test_diagnosis.py", "tests/test_unlisted.py", "tests/test_closed_loop.py",
+        "tests/test_diagnosis.py", "tests/test_unlisted.py", "tests/test_input_innovations.py",
         "tests/test_gain.py",
     ),
 }  # fmt: skip
