@@ -8,7 +8,7 @@ import command_line
 from coax_env.files import make_folder, write_text
 from coax_env.model.sensors import SUITES
 from coax_env.model.vehicle import load_vehicle
-from controllers import lqr
+from controllers import lqr, margins
 from controllers.design_report import (
     MARGIN_HEADER,
     design_page,
@@ -34,23 +34,23 @@ def main() -> None:
 
     vehicle = load_vehicle(options.vehicle)
     controller = lqr.design(vehicle, options.nominal, options.sensors)
-    margins, disk = lqr.margins(controller)
+    inputs, disk = margins.stability_margins(controller)
     score = evaluate(controller, vehicle, episodes=50, seed=options.seed)
     worst = evaluate_spread(controller, vehicle, options.vehicles, 5, seed=options.seed)
-    spread = lqr.margins_over_spread(controller, vehicle, options.vehicles, options.seed)
+    spread = margins.margins_over_spread(controller, vehicle, options.vehicles, options.seed)
     page = design_page(
-        controller, vehicle, margins, disk, score, worst, spread,
+        controller, vehicle, inputs, disk, score, worst, spread,
         "scripts/design_lqr.py " + shlex.join(sys.argv[1:]),
     )  # fmt: skip
     make_folder(options.out)
     path = controller.save(options.out / "controller.json")
     write_text(options.out / "report.html", page)
 
-    command_line.print_columns([MARGIN_HEADER, *margin_rows(margins)])
+    command_line.print_columns([MARGIN_HEADER, *margin_rows(inputs)])
     gain, phase = disk_in_words(disk)
     print(f"all inputs at once: disk margin {disk:.2f}, {gain} in gain or {phase} in phase")
     hidden = controller.estimator.unobserved
-    print("not shown by these sensors, left out:", ", ".join(hidden) or "nothing")
+    print("not observable with these sensors, left out:", ", ".join(hidden) or "nothing")
     if "theta" in hidden:
         print("WARNING: without attitude or velocity no linear design can hold the hover")
     print(

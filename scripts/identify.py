@@ -1,4 +1,4 @@
-"""Fit a vehicle's own numbers to a flight; the result is a vehicle file for the env."""
+"""Fit a vehicle's parameters to a flight; the result is a vehicle file for the env."""
 
 import shlex
 import sys
@@ -32,12 +32,12 @@ def main() -> None:
     )  # fmt: skip
     options = parser.parse_args()
 
-    with command_line.progress("identification") as say:
+    with command_line.progress("identification") as report_progress:
         result = identify(
             options.flight,
             options.vehicle,
             options.method,
-            say,
+            report_progress,
             channels=None if options.channels is None else options.channels.split(","),
             also=[name for name in options.also.split(",") if name],
             hold_out=[name for name in options.hold_out.split(",") if name],
@@ -71,7 +71,7 @@ def main() -> None:
         print(f"1 s prediction error on {', '.join(result.flight.run_names)}: {moved}")
     if not isinstance(result, TwoStep) and result.undetermined:
         print("not determined by these flights:", ", ".join(result.undetermined))
-        print("left open:", "; ".join(result.directions) or "each of them")
+        print("undetermined combinations:", "; ".join(result.directions) or "each of them")
     for remark in result.remarks:
         print(remark)
     print(f"vehicle {options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")
