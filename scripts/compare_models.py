@@ -1,5 +1,6 @@
 """Fly controllers designed on the bare and on the corrected model on one machine, and compare them."""
 
+import argparse
 import os
 import shlex
 import sys
@@ -13,20 +14,7 @@ from controllers import model_comparison
 
 
 def main() -> None:
-    parser = command_line.parser("compare_models", __doc__, seed=True)
-    parser.add_argument(
-        "--machine", metavar="FILE",
-        help="the true vehicle (default: --model with motor lag, torque out of balance, rotor drag)",
-    )  # fmt: skip
-    parser.add_argument("--model", default="lama400d", help="the bare model (default: %(default)s)")
-    parser.add_argument(
-        "--flight", type=Path, metavar="FOLDER", help="its flights (default: simulated)"
-    )
-    parser.add_argument("--episodes", type=int, default=100, help="(default: %(default)s)")
-    parser.add_argument(
-        "--steps", type=float, default=4e6, help="of each policy's training; 0: LQG only"
-    )
-    options = parser.parse_args()
+    options = arguments()
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
 
     model_comparison.check_machine(options.machine, options.flight)
@@ -52,6 +40,24 @@ def main() -> None:
     for kind, factor in content["cost_ratio"].items():
         print(f"{kind}: {factor:.2f} times less cost with the corrected model")
     print(f"report {options.out / 'report.html'}")
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
+    parser = command_line.parser("compare_models", __doc__, seed=True)
+    parser.add_argument(
+        "--machine", metavar="FILE",
+        help="the true vehicle (default: --model with motor lag, torque out of balance, rotor drag)",
+    )  # fmt: skip
+    parser.add_argument("--model", default="lama400d", help="the bare model (default: %(default)s)")
+    parser.add_argument(
+        "--flight", type=Path, metavar="FOLDER", help="its flights (default: simulated)"
+    )
+    parser.add_argument("--episodes", type=int, default=100, help="(default: %(default)s)")
+    parser.add_argument(
+        "--steps", type=float, default=4e6, help="of each policy's training; 0: LQG only"
+    )
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Design a hover controller (LQR with integral action, and a Kalman filter) on a vehicle."""
 
+import argparse
 import shlex
 import sys
 
@@ -20,18 +21,7 @@ from controllers.evaluation import evaluate, evaluate_spread
 
 
 def main() -> None:
-    parser = command_line.parser("design_lqr", __doc__, seed=True)
-    parser.add_argument("--vehicle", default="lama400d", help="shipped name or TOML file")
-    parser.add_argument("--nominal", help="vehicle whose trim centres the action (default: bare)")
-    parser.add_argument(
-        "--sensors", default="onboard", help=f"{', '.join(SUITES)} (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--vehicles", type=int, default=20,
-        help="how many to draw from the file's spread for the worst case (default: %(default)s)",
-    )  # fmt: skip
-    options = parser.parse_args()
-
+    options = arguments()
     vehicle = load_vehicle(options.vehicle)
     controller = lqr.design(vehicle, options.nominal, options.sensors)
     inputs, disk = margins.stability_margins(controller)
@@ -46,6 +36,23 @@ def main() -> None:
     path = controller.save(options.out / "controller.json")
     write_text(options.out / "report.html", page)
 
+    print_margins(controller, inputs, disk)
+    print(
+        f"{score['episodes']} flights of {score['seconds']:.0f} s on this vehicle: "
+        f"{100 * score['success_rate']:.0f} % succeed, mean cost {score['mean_cost']:.3g}"
+    )
+    print(spread_in_words(worst, spread))
+    print(f"controller {path}, report {options.out / 'report.html'}")
+
+
+def print_margins(controller: lqr.LQG, inputs: list[margins.InputMargins], disk: float) -> None:
+    """Stability margins, and the states that the sensors do not show.
+
+    Args:
+        controller: the design.
+        inputs: margins of each input.
+        disk: margin of all inputs at once.
+    """
     command_line.print_columns([MARGIN_HEADER, *margin_rows(inputs)])
     gain, phase = disk_in_words(disk)
     print(f"all inputs at once: disk margin {disk:.2f}, {gain} in gain or {phase} in phase")
@@ -53,12 +60,21 @@ def main() -> None:
     print("not observable with these sensors, left out:", ", ".join(hidden) or "nothing")
     if "theta" in hidden:
         print("WARNING: without attitude or velocity no linear design can hold the hover")
-    print(
-        f"{score['episodes']} flights of {score['seconds']:.0f} s on this vehicle: "
-        f"{100 * score['success_rate']:.0f} % succeed, mean cost {score['mean_cost']:.3g}"
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
+    parser = command_line.parser("design_lqr", __doc__, seed=True)
+    parser.add_argument("--vehicle", default="lama400d", help="shipped name or TOML file")
+    parser.add_argument("--nominal", help="vehicle whose trim centres the action (default: bare)")
+    parser.add_argument(
+        "--sensors", default="onboard", help=f"{', '.join(SUITES)} (default: %(default)s)"
     )
-    print(spread_in_words(worst, spread))
-    print(f"controller {path}, report {options.out / 'report.html'}")
+    parser.add_argument(
+        "--vehicles", type=int, default=20,
+        help="how many to draw from the file's spread for the worst case (default: %(default)s)",
+    )  # fmt: skip
+    return parser.parse_args()
 
 
 if __name__ == "__main__":
