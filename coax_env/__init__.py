@@ -4,7 +4,7 @@ One compiled model of the flight dynamics (dynamics.py) stands in the middle::
 
     vehicles/*.toml -> vehicle -> dynamics (+ effects) -> sensors -> env -> controllers -> scripts
     flight folder -> flight -> engine (innovations, likelihood) -> identification -> vehicle file
-    flight + model -> innovations -> signatures -> diagnosis -> extended vehicle -> gain, report
+    flight + model -> innovations -> signatures -> diagnosis -> corrected vehicle -> gain, report
 
 The names below are imported when first used, so that ``import coax_env`` is light and works without
 torch, plotly and control. Importing it registers ``CoaxHeli-v0`` with Gymnasium.

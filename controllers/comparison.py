@@ -15,12 +15,12 @@ from controllers.loading import Controller
 
 GUSTS = (0.08, 1e-3)  # [N, N m] std: some 1 % of the weight
 WIND = {"wind": 2.0, "turbulence": "light"}  # [m/s] from anywhere
-ROTOR_DRAG = 3.5e-4  # [N s/m per rad/s] given to a vehicle that feels no wind of its own
-_DRAGS = ("rotor_drag", "body_drag", "flap_blowback")
-_AIMED = "mocap"
+ROTOR_DRAG = 3.5e-4  # [N s/m per rad/s] given to a vehicle on which wind has no effect
+_WIND_EFFECTS = ("rotor_drag", "body_drag", "flap_blowback")
+TARGET_SENSORS = "mocap"
 
 Maker = Callable[[Vehicle, Nominal, str, bool], Controller | None]
-"""Vehicle designed on, nominal, suite, whether there is somewhere to go: a controller, or None."""
+"""Vehicle designed on, nominal, suite, whether there is a target -> a controller, or None."""
 
 
 @dataclass(frozen=True)
@@ -34,40 +34,42 @@ class Condition:
     spread: bool = False  # over vehicles drawn from the file's std: the worst counts
 
     @property
-    def aims(self) -> bool:
-        """Whether there is somewhere to go."""
+    def has_target(self) -> bool:
+        """Whether there is a target other than the start."""
         return self.arguments.get("task", "hover") != "hover"
 
 
 def conditions(vehicle: str | Vehicle) -> list[Condition]:
     """Hover in still air, in gusts, in wind, on drawn vehicles; a position; waypoints."""
     vehicle = load_vehicle(vehicle)
-    felt = any(vehicle.effects.get(name) for name in _DRAGS)
-    windy = vehicle if felt else vehicle.with_effect("rotor_drag", coefficient=ROTOR_DRAG)
+    wind_acts = any(vehicle.effects.get(name) for name in _WIND_EFFECTS)
+    windy = vehicle if wind_acts else vehicle.with_effect("rotor_drag", coefficient=ROTOR_DRAG)
     return [
         Condition("hover", vehicle),
         Condition("hover in gusts", vehicle, arguments={"gusts": GUSTS}),
         Condition("hover in wind", windy, arguments=WIND),
         Condition("worst drawn vehicle", vehicle, spread=True),
-        Condition("position", vehicle, _AIMED, {"task": "position"}),
-        Condition("waypoints", vehicle, _AIMED, {"task": "waypoints"}),
+        Condition("position", vehicle, TARGET_SENSORS, {"task": "position"}),
+        Condition("waypoints", vehicle, TARGET_SENSORS, {"task": "waypoints"}),
     ]
 
 
 def makers(ppo: Controller | None) -> dict[str, Maker]:
-    """How each controller of the comparison comes to be; `ppo` flies what its sensors are for."""
+    """How each controller of the comparison is made; `ppo` only flies with its own sensors."""
 
-    def trained(vehicle: Vehicle, nominal: Nominal, sensors: str, aims: bool) -> Controller | None:
+    def trained(
+        vehicle: Vehicle, nominal: Nominal, sensors: str, has_target: bool
+    ) -> Controller | None:
         return ppo if ppo is not None and ppo.sensors == sensors else None
 
     return {
-        "lqg": lambda vehicle, nominal, sensors, aims: lqr.design(
-            vehicle, nominal, sensors, lqr.BRISK if aims else None
+        "lqg": lambda vehicle, nominal, sensors, has_target: lqr.design(
+            vehicle, nominal, sensors, lqr.BRISK if has_target else None
         ),
         "ppo": trained,
-        "pid": lambda vehicle, nominal, sensors, aims: pid.design(vehicle, nominal, sensors),
-        "lqi": lambda vehicle, nominal, sensors, aims: state_feedback.design(
-            vehicle, nominal, limits=lqr.BRISK if aims else None
+        "pid": lambda vehicle, nominal, sensors, has_target: pid.design(vehicle, nominal, sensors),
+        "lqi": lambda vehicle, nominal, sensors, has_target: state_feedback.design(
+            vehicle, nominal, limits=lqr.BRISK if has_target else None
         ),
     }
 
@@ -85,13 +87,19 @@ def compare(
 ) -> dict[str, Any]:
     """Fly every controller in every condition.
 
-    All but `ppo` are designed on `vehicle`; none is told of wind, gusts or draws. ``lqi`` is given
+    All but `ppo` are designed on `vehicle`; none knows of wind, gusts or draws. ``lqi`` is given
     the exact state: what it does better than ``lqg`` is what the sensors' noise costs.
 
     Args:
+        vehicle: what flies.
         ppo: the trained policy; default the shipped one.
         episodes: flights per condition; on drawn vehicles a fifth of that for each.
-        vehicles: how many are drawn. jobs, backend: how many of them at once, and where.
+        seconds: duration of a flight.
+        vehicles: how many are drawn.
+        seed: of the first flight, and of the draws.
+        progress: called with what is being flown.
+        jobs: drawn vehicles at once, as in `coax_env.workers.each`.
+        backend: where, as in `coax_env.workers.each`.
 
     Returns:
         compare.json: condition -> controller -> score.json, None where it cannot fly that.
@@ -104,7 +112,7 @@ def compare(
         for name, make in makers(ppo).items():
             if progress:
                 progress(f"{condition.name}: {name}")
-            controller = make(vehicle, None, condition.sensors, condition.aims)
+            controller = make(vehicle, None, condition.sensors, condition.has_target)
             if controller is None:
                 row[name] = None
             elif condition.spread:
@@ -139,19 +147,19 @@ def score_words(score: Mapping[str, Any] | None) -> list[str]:
     if score is None:
         return ["-"] * (len(HEADER) - 2)
 
-    def words(key: str, form: str, factor: float = 1.0) -> str:
+    def formatted(key: str, form: str, factor: float = 1.0) -> str:
         value = score.get(key)
         return "-" if value is None else form.format(factor * value)
 
     return [
-        words("success_rate", "{:.0f} %", 100.0),
-        words("mean_cost", "{:.3g}"),
-        words("worst_cost", "{:.3g}"),
-        words("height_rms_m", "{:.1f} cm", 100.0),
-        words("velocity_rms_mps", "{:.3f} m/s"),
-        words("heading_rms_deg", "{:.2f} deg"),
-        words("effort", "{:.2f}"),
-        words("mean_reached", "{:.1f}"),
+        formatted("success_rate", "{:.0f} %", 100.0),
+        formatted("mean_cost", "{:.3g}"),
+        formatted("worst_cost", "{:.3g}"),
+        formatted("height_rms_m", "{:.1f} cm", 100.0),
+        formatted("velocity_rms_mps", "{:.3f} m/s"),
+        formatted("heading_rms_deg", "{:.2f} deg"),
+        formatted("effort", "{:.2f}"),
+        formatted("mean_reached", "{:.1f}"),
     ]
 
 
@@ -172,11 +180,11 @@ def comparison_page(content: Mapping[str, Any], command_line: str = "") -> str:
         ("success_rate", "share of flights that succeed", False),
         ("effort", "rms of the action", False),
     )
-    shown = [figure(figures.side_by_side(list(found), values(k), t, log)) for k, t, log in charts]
+    shown = [figure(figures.grouped_bars(list(found), values(k), t, log)) for k, t, log in charts]
     parts = [
         Section("Figures", [
             prose("Less is better, but for success. `lqi` is given the exact state and no noise: "
-                  "it says what the sensors cost the others."),
+                  "the difference is what the sensors cost the others."),
             *shown,
         ]),
         Section("Table", [table(HEADER, rows(found))]),
@@ -186,17 +194,17 @@ def comparison_page(content: Mapping[str, Any], command_line: str = "") -> str:
     lead = [
         f"{content['episodes']} flights each from the same seeds, on {content['vehicle']}. LQG, LQI "
         "and PID are designed on the file as it is, the policy is trained as its description says; "
-        "none is told of wind, gusts or what was drawn."
+        "none knows of wind, gusts or what was drawn."
     ]
     return page("Controllers side by side", lead, parts, kicker="Comparison")
 
 
 def ratio(worse: Mapping[str, Any], better: Mapping[str, Any]) -> float:
-    """How many times the one's mean cost is of the other's."""
+    """Mean cost of the one over that of the other."""
     return float(worse["mean_cost"]) / float(better["mean_cost"])
 
 
-def printed(header: Sequence[str], body: Sequence[Sequence[str]]) -> list[list[str]]:
+def without_repeats(header: Sequence[str], body: Sequence[Sequence[str]]) -> list[list[str]]:
     """A table for a terminal, a repeated first cell left out."""
     shown = [list(header)]
     last = ""

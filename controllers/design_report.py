@@ -1,4 +1,4 @@
-"""The report of a controller design: margins, what it sees, and a flight, on one page."""
+"""The report of a controller design: margins, a flight, and the estimator, on one page."""
 
 from typing import Any
 
@@ -7,23 +7,29 @@ from gymnasium.vector import AutoresetMode
 
 from coax_env.env import hover
 from coax_env.env.gym_env import CoaxVectorEnv
-from coax_env.model.layout import ATTITUDE, N_STATES, STATES
+from coax_env.model.layout import ATTITUDE, FULL_STATES, N_STATES, STATES
 from coax_env.model.vehicle import Vehicle
+from coax_env.plain_words import unit_name
 from coax_env.report import figures
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from controllers.loading import Controller
-from controllers.lqr import LQG, Margins, frequency_responses
+from controllers.lqr import LQG
+from controllers.margins import InputMargins, frequency_responses
 
-MARGIN_HEADER = ("input", "gain down", "gain up", "phase", "least distance", "at")
+MARGIN_HEADER = (
+    "input", "gain margin down", "gain margin up", "phase margin", "least |1 + L|", "crossover",
+)  # fmt: skip
+LOWEST_SHOWN = 0.06
+"""Frequency from which the loops are drawn [rad/s]."""
 START = {"z": -hover.HEIGHT + 0.5, "psi": 0.5, "phi": 0.08, "u": 0.5}
 """Start of the flight that is shown: too low, turned, tilted, moving. SI."""
 
 
-def margin_rows(margins: list[Margins]) -> list[list[str]]:
+def margin_rows(margins: list[InputMargins]) -> list[list[str]]:
     """The margins in words, under MARGIN_HEADER."""
     return [
         [
-            m.input.replace("_", " "), f"x {m.gain_down:.2f}", f"x {m.gain_up:.1f}",
+            m.input.replace("_", " "), _decibels(m.gain_down), _decibels(m.gain_up),
             f"{m.phase_deg:.0f} deg" if np.isfinite(m.phase_deg) else "any",
             f"{m.distance:.2f}", f"{m.crossover_hz:.1f} Hz",
         ]
@@ -31,10 +37,17 @@ def margin_rows(margins: list[Margins]) -> list[list[str]]:
     ]  # fmt: skip
 
 
+def _decibels(gain: float) -> str:
+    """A factor of the loop's gain in dB; any where there is no limit."""
+    if not 0.0 < gain < np.inf:
+        return "any"
+    return f"{20.0 * np.log10(gain):+.1f} dB".replace("-", "−")
+
+
 def design_page(
     controller: LQG,
     vehicle: Vehicle,
-    margins: list[Margins],
+    margins: list[InputMargins],
     disk: float,
     score: dict[str, Any],
     worst: dict[str, Any],
@@ -43,7 +56,15 @@ def design_page(
 ) -> str:
     """The report as HTML text.
 
-    `worst` is of `evaluate_spread`, `spread` of `lqr.margins_over_spread`, on the same vehicle.
+    Args:
+        controller: the design.
+        vehicle: what it was designed on.
+        margins: of each input, from `stability_margins`.
+        disk: margin of all inputs at once, from the same.
+        score: of `evaluate` on the vehicle.
+        worst: of `evaluate_spread` on it.
+        spread: of `margins_over_spread` on it, (draws,).
+        command_line: what was typed.
     """
     gain, phase = disk_in_words(disk)
     lead = [
@@ -53,31 +74,44 @@ def design_page(
         f"All four inputs at once may be off by {gain} in gain or {phase} in phase.",
         spread_in_words(worst, spread),
     ]
-    omega, _, single = frequency_responses(controller)
-    loops = dict(zip((m.input.replace("_", " ") for m in margins), single.T, strict=True))
-    seen_band = omega > 0.06
-    t, panels = step_response(controller, vehicle)
-    blocks = [figure(figures.histories(t, panels), "From a start that is too low, turned, tilted")]
-    seen = [f"{n}: {s:.2g}" for n, s in zip(controller.estimator.states,
-            controller.estimator.spread, strict=True)]  # fmt: skip
-    hidden = ", ".join(controller.estimator.unobserved) or "none"
-    parts = [
-        Section("Margins", [
-            table(MARGIN_HEADER, margin_rows(margins), "One input at a time, the others closed"),
-            figure(figures.bode(omega[seen_band], {n: r[seen_band] for n, r in loops.items()}),
-                   "The loop of each input, the others closed"),
-            prose("Of the loop with the single-rate equivalent of the multi-rate filter."),
-        ]),
-        Section("A flight", blocks),
-        Section("What the filter knows", [
-            prose(f"Not shown by these sensors, and left out: {hidden}. "
-                  "Std of the estimation error, SI:"),
-            bullets(seen),
-        ]),
-    ]  # fmt: skip
+    response = figures.histories(*step_response(controller, vehicle))
+    sections = [
+        Section("Margins", _margin_blocks(controller, margins)),
+        Section("A flight", [figure(response, "From a start that is too low, turned, tilted")]),
+        Section("The estimator", _estimator_blocks(controller)),
+    ]
     if command_line:
-        parts.append(Section("How this was computed", [command(command_line)]))
-    return page(f"Hover controller for {vehicle.name}", lead, parts, kicker="Controller design")
+        sections.append(Section("How this was computed", [command(command_line)]))
+    return page(f"Hover controller for {vehicle.name}", lead, sections, kicker="Controller design")
+
+
+def _margin_blocks(controller: LQG, margins: list[InputMargins]) -> list[str]:
+    """Margins as a table, and the loops as a Bode diagram."""
+    omega, _, single = frequency_responses(controller)
+    band = omega > LOWEST_SHOWN
+    loops = {m.input.replace("_", " "): h[band] for m, h in zip(margins, single.T, strict=True)}
+    return [
+        table(MARGIN_HEADER, margin_rows(margins), "One input at a time, the others closed"),
+        figure(figures.bode(omega[band], loops), "The loop of each input, the others closed"),
+        prose("Of the loop with the single-rate equivalent of the multi-rate filter."),
+    ]
+
+
+def _estimator_blocks(controller: LQG) -> list[str]:
+    """Std of the estimation error of each state, with its unit where the state has one."""
+    estimator = controller.estimator
+    units = dict(FULL_STATES)
+    stds = [
+        f"{name}: {std:.2g} {unit_name(units.get(name, ''))}".rstrip()
+        for name, std in zip(estimator.states, estimator.spread, strict=True)
+    ]
+    return [
+        prose(
+            "Not observable with these sensors, and left out: "
+            f"{', '.join(estimator.unobserved) or 'none'}. Std of the estimation error, SI:"
+        ),
+        bullets(stds),
+    ]
 
 
 def spread_in_words(worst: dict[str, Any], spread: np.ndarray) -> str:
@@ -100,7 +134,16 @@ def disk_in_words(disk: float) -> tuple[str, str]:
 def step_response(
     controller: Controller, vehicle: Vehicle, seconds: float = 8.0
 ) -> tuple[np.ndarray, list[tuple[str, dict[str, np.ndarray]]]]:
-    """True states of one flight from START on noisy sensors: time (n,) and panels of curves."""
+    """True states of one flight from START on noisy sensors.
+
+    Args:
+        controller: what flies.
+        vehicle: what is flown.
+        seconds: duration.
+
+    Returns:
+        time [s] (n,); axis title and curves (n,) by name, for `figures.histories`.
+    """
     names = [name for name, _ in STATES]
     start = np.zeros(N_STATES)
     for name, value in START.items():
@@ -126,6 +169,6 @@ def step_response(
             {"roll": degrees[:, 0], "pitch": degrees[:, 1], "heading": degrees[:, 2]},
         ),
         ("speed [m/s]", {"forward": x[:, 0], "right": x[:, 1], "down": x[:, 2]}),
-        ("place [m]", {"north": x[:, 13], "east": x[:, 14]}),
+        ("position [m]", {"north": x[:, 13], "east": x[:, 14]}),
         ("action [1]", dict(zip(("upper", "lower", "lon", "lat"), a.T, strict=True))),
     ]

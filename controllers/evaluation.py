@@ -28,17 +28,22 @@ def evaluate(
     progress: Callable[[int], None] | None = None,
     **env_arguments: Any,
 ) -> dict[str, Any]:
-    """Fly ``episodes`` flights at once, seeds seed, seed + 1, ..., and judge them.
+    """Fly ``episodes`` flights at once, seeds seed, seed + 1, ..., and score them.
 
     Success is `tasks.judge`'s, from true states: hovering, flown to the end, and after the
     first 3 s height rms < 0.10 m, speed rms < 0.25 m/s, heading rms < 10 deg, drift < 2 m, the
-    largest horizontal distance from the place at 3 s (in ``position`` from the target); of
+    largest horizontal distance from the position at 3 s (in ``position`` from the target); of
     ``waypoints`` those given must be reached, or the first of those drawn. The rms figures are
     pooled over what was flown after 3 s. ``mean_cost`` is the mean of `hover.cost` about the target
     over every step; steps not flown cost hover.CRASHED_COST. ``effort`` is the rms of the action
     vector.
 
     Args:
+        controller: what flies.
+        vehicle: what is flown.
+        episodes: flights.
+        seconds: duration of a flight.
+        seed: of the first flight.
         sensors: default the controller's own suite, which it must be.
         progress: called with the number of steps flown.
         env_arguments: further ones of CoaxVectorEnv, such as ``wind``.
@@ -56,26 +61,26 @@ def evaluate(
         autoreset_mode=AutoresetMode.DISABLED, **env_arguments,
     )  # fmt: skip
     steps = round(seconds / hover.CONTROL_PERIOD)
-    tally = _Tally(episodes, env_arguments.get("task", "hover"), env_arguments.get("target"))
+    totals = _Totals(episodes, env_arguments.get("task", "hover"), env_arguments.get("target"))
     observations, info = env.reset(seed=seed)
     controller.reset(episodes)
     for step in range(steps):
         actions = np.nan_to_num(controller.act(observations))
-        targets = info.get("target", tally.targets)
+        targets = info.get("target", totals.targets)
         observations, rewards, terminated, _, info = env.step(actions)
-        late = step + 1 >= tasks.FIRST_JUDGED
-        tally.add(info, targets, np.clip(actions, -1.0, 1.0), rewards, late)
-        tally.alive &= ~terminated
+        settled = step + 1 >= tasks.FIRST_JUDGED
+        totals.add(info, targets, np.clip(actions, -1.0, 1.0), rewards, settled)
+        totals.alive &= ~terminated
         if progress:
             progress(1)
-    return tally.score(steps) | {
+    return totals.score(steps) | {
         "controller": controller.kind,
         "vehicle": vehicle.name,
         "episodes": episodes,
         "seconds": seconds,
         "seed": seed,
         "sensors": controller.sensors,
-        "task": tally.task,
+        "task": totals.task,
         "cost": {
             "weights": hover.COST_WEIGHTS,
             "limits": hover.LIMITS,
@@ -99,9 +104,16 @@ def evaluate_spread(
     """`evaluate` on vehicles drawn from a vehicle's spread, the same seeds on each.
 
     Args:
+        controller: what flies.
+        vehicle: whose parameters' stds give the spread.
+        vehicles: how many are drawn.
+        episodes: flights on each.
+        seconds: duration of a flight.
+        seed: of the first flight, and of the draws.
         progress: called with the number of vehicles flown.
-        jobs, backend: vehicles at once, and where, as in `coax_env.workers.each`; the figures are
-            the same.
+        jobs: vehicles at once, as in `coax_env.workers.each`; the figures are the same.
+        backend: where, as in `coax_env.workers.each`.
+        env_arguments: further ones of CoaxVectorEnv.
 
     Returns:
         score.json of the vehicle with the lowest success rate (the highest cost among equals), with
@@ -144,7 +156,7 @@ FIGURES = (
 """What a table of scores shows."""
 
 
-class _Tally:
+class _Totals:
     """Sums over every flight, kept while they are flown."""
 
     def __init__(self, count: int, task: str, course: Any) -> None:
@@ -164,9 +176,17 @@ class _Tally:
         targets: np.ndarray,
         actions: np.ndarray,
         rewards: np.ndarray,
-        late: bool,
+        settled: bool,
     ) -> None:
-        """Count one period: states after `actions`, judged about the targets before them."""
+        """Add one period.
+
+        Args:
+            info: of the env after the period; ``state`` is (count, n).
+            targets: x y z psi before it, (count, 4).
+            actions: (count, 4).
+            rewards: (count,).
+            settled: whether errors count already.
+        """
         states = info["state"]
         finite = self.alive & np.isfinite(states).all(axis=1)
         states = np.where(finite[:, None], states, 0.0)
@@ -175,7 +195,7 @@ class _Tally:
         self.effort += np.where(finite, (actions.astype(float) ** 2).sum(axis=1), 0.0)
         self.flown += finite
         self.reached = np.where(finite, info.get("reached", 0), self.reached)
-        if not late:
+        if not settled:
             return
         if self.place is None:
             self.place = states[:, PLACE].copy()

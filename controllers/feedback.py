@@ -14,7 +14,7 @@ VERSION = 1
 
 
 class Feedback(ABC):
-    """A controller: a class that says how a flight begins and what an observation is answered with.
+    """A controller: a subclass defines how a flight begins and the action to an observation.
 
     Its actions are about `action_trim`, in units of `action_scale`, both (4,) per command.
     """

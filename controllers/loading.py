@@ -1,4 +1,4 @@
-"""What every controller can do, and how one is got: by name, or from its file."""
+"""The interface of every controller, and how one is made: by name, or from its file."""
 
 import json
 from importlib import import_module
@@ -30,7 +30,7 @@ _CLASSES = {
 
 
 class Controller(Protocol):
-    """Anything that flies CoaxHeli-v0: one helicopter or a batch, told nothing but observations."""
+    """Anything that flies CoaxHeli-v0, one helicopter or a batch, from observations alone."""
 
     @property
     def kind(self) -> str:
@@ -59,8 +59,12 @@ def make_controller(
 ) -> Controller:
     """A controller by a name of KINDS, designed on a vehicle for a suite, or read from a file.
 
-    ``sensors`` defaults to ``onboard``; ``lqi`` is given the exact state, the shipped policy of
-    ``ppo`` and a file have suites of their own.
+    Args:
+        name: a key of KINDS, or the path of a controller.json or policy.zip.
+        vehicle: what it is designed on.
+        nominal: vehicle whose trim centres the action, as in the env (default: the bare one).
+        sensors: suite to design for (default: ``onboard``); ``lqi`` is given the exact state, the
+            shipped policy of ``ppo`` and a file have suites of their own.
     """
     from controllers import lqr, pid, policy, state_feedback
 

@@ -3,10 +3,10 @@
 The regulator minimises the quadratic cost by which every controller is compared (hover.LIMITS and
 COST_WEIGHTS), with integrals of the measured height, heading and position added, so that no error
 of trim or sensor model stays in them. Where position is not measured, the integral of the measured
-velocity stands for it: the machine then holds still, and its place drifts.
+velocity stands for it: the machine then holds still, and its position drifts. Its stability margins
+are computed in margins.py.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -25,8 +25,6 @@ from controllers.estimator import (
     integrated_readings,
 )
 from controllers.feedback import Designed
-
-INPUT_NAMES = ("rotor_upper", "rotor_lower", "swash_lon", "swash_lat")
 
 
 @dataclass
@@ -100,7 +98,15 @@ def design(
 def regulator_problem(
     estimator: EstimatorDesign, limits: Mapping[str, float] | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A, B, Q, R of the regulator: states and integrals, actions, `hover.cost` per period."""
+    """The discrete regulator problem: `hover.cost` per control period, deviations from trim.
+
+    Args:
+        estimator: whose states, with the integrals of its readings, are fed back.
+        limits: errors that count 1 in the cost, where not hover.LIMITS.
+
+    Returns:
+        A (n + i, n + i), B (n + i, 4) per action, Q (n + i, n + i), R (4, 4).
+    """
     limits = hover.LIMITS | dict(limits or {})
     integrated = integrated_readings(estimator)
     n = len(estimator.states)
@@ -119,146 +125,3 @@ def regulator_problem(
             Q[at, at] += hover.COST_WEIGHTS[error] / limits[error] ** 2
     R = np.eye(4) * hover.COST_WEIGHTS["effort"] / limits["effort"] ** 2
     return A, B, Q, R
-
-
-@dataclass(frozen=True)
-class Margins:
-    """Stability margins at one plant input, the other loops closed."""
-
-    input: str
-    gain_down: float  # the loop's gain may fall to this
-    gain_up: float  # and rise to this
-    phase_deg: float
-    distance: float  # least |1 + L|
-    crossover_hz: float  # where the phase margin is least
-
-
-def loop(controller: LQG, flown: EstimatorDesign | None = None) -> Any:
-    """The loop broken at the plant's four inputs, as a discrete ``control.StateSpace``.
-
-    `flown` is the model of another plant than the one designed on, from `design_estimator`.
-
-    The estimator is the single-rate equivalent of the periodic one: slow sensors taken as fast ones
-    with as much more noise.
-    """
-    import control
-
-    e = controller.estimator
-    integrated = integrated_readings(e)
-    n, m, i = len(e.states), len(e.readings), len(integrated)
-    S, plant_of = np.diag(e.action_scale), flown or e
-    # plant: the states and the command in force; readings see both
-    plant = control.ss(
-        np.block([[plant_of.A, np.zeros((n, 4))], [np.zeros((4, n)), np.zeros((4, 4))]]),
-        np.vstack([plant_of.B @ S, S]),
-        np.hstack([plant_of.C, plant_of.D]),
-        np.zeros((m, 4)),
-        DT,
-    )
-    K, F = e.single_rate_gain, controller.gain
-    F_x, F_i = F[:, :n], F[:, n:]
-    M = np.zeros((i, m))
-    for k, name in enumerate(integrated):
-        M[k, e.readings.index(name)] = DT
-    # state: prediction, integrals, command in force; corrected = prediction + K (y - C x - D u)
-    corrected = np.hstack([np.eye(n) - K @ e.C, np.zeros((n, i)), -K @ e.D])
-    act = -F_x @ corrected - np.hstack([np.zeros((4, n)), F_i, np.zeros((4, 4))])
-    act_y = -F_x @ K
-    regulator = control.ss(
-        np.vstack(
-            [
-                e.A @ corrected + e.B @ S @ act,
-                np.hstack([np.zeros((i, n)), np.eye(i), np.zeros((i, 4))]),
-                S @ act,
-            ]
-        ),
-        np.vstack([e.A @ K + e.B @ S @ act_y, M, S @ act_y]),
-        -act,
-        -act_y,
-        DT,
-    )
-    return regulator * plant
-
-
-def frequency_responses(
-    controller: LQG, flown: EstimatorDesign | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of `loop`, up to Nyquist: frequencies [rad/s] (w,), the whole loop (w, 4, 4), and the loop of
-    each input with the others closed (w, 4)."""
-    omega = np.append(np.geomspace(1e-3, 0.99 * math.pi / DT, 1000), math.pi / DT)
-    L = np.moveaxis(loop(controller, flown).frequency_response(omega).frdata, -1, 0)
-    single = np.empty(L.shape[:2], dtype=complex)
-    for k in range(4):
-        rest = [i for i in range(4) if i != k]
-        others = np.linalg.solve(np.eye(3) + L[:, rest][:, :, rest], L[:, rest, k : k + 1])
-        single[:, k] = L[:, k, k] - (L[:, k : k + 1, rest] @ others)[:, 0, 0]
-    return omega, L, single
-
-
-def margins(controller: LQG) -> tuple[list[Margins], float]:
-    """Classical margins of each input with the others closed, and the disk margin of all four.
-
-    The disk margin alpha allows every input at once a gain between (2 - alpha)/(2 + alpha) and its
-    inverse, or a phase of 2 atan(alpha/2) (Seiler, Packard and Gahinet, IEEE CSM 2020).
-    """
-    import control
-
-    omega, L, single = frequency_responses(controller)
-    found = [
-        Margins(name, *_classical(control.frd(one, omega)))
-        for name, one in zip(INPUT_NAMES, single.T, strict=True)
-    ]
-    return found, _disk(L)
-
-
-def margins_over_spread(
-    controller: LQG, vehicle: str | Vehicle, draws: int = 20, seed: int = 0
-) -> np.ndarray:
-    """Disk margin on each of so many vehicles drawn from a vehicle's spread, (draws,); 0: unstable."""
-    import control
-
-    vehicle = load_vehicle(vehicle)
-    rng = np.random.default_rng(seed)
-    found = np.zeros(draws)
-    for k in range(draws):
-        flown = design_estimator(vehicle.draw(rng), controller.nominal, controller.sensors)
-        closed = control.feedback(loop(controller, flown), np.eye(4))
-        if np.abs(closed.poles()).max() < 1.0:
-            found[k] = _disk(frequency_responses(controller, flown)[1])
-    return found
-
-
-def _disk(L: np.ndarray) -> float:
-    """Disk margin of a loop's frequency response (w, 4, 4), all inputs at once."""
-    S = np.linalg.inv(np.eye(4) + L)
-    return 1.0 / max(_structured(matrix - 0.5 * np.eye(4)) for matrix in S)  # (S - T)/2
-
-
-def _classical(loop: Any) -> tuple[float, float, float, float, float]:
-    """Fields of Margins but the name, from the frequency response of a loop up to Nyquist."""
-    import control
-
-    values = loop.frdata[0, 0]
-    gains, phases, _, _, crossovers, _ = control.stability_margins(loop, returnall=True)
-    gains, phases = np.asarray(gains, dtype=float), np.abs(np.asarray(phases, dtype=float))
-    if values[-1].real < 0.0:  # the last crossing of the negative axis
-        gains = np.append(gains, -1.0 / values[-1].real)
-    worst = int(np.argmin(phases)) if len(phases) else None
-    return (
-        float(gains[gains < 1.0].max(initial=0.0)),
-        float(gains[gains > 1.0].min(initial=math.inf)),
-        math.inf if worst is None else float(phases[worst]),
-        float(np.abs(1.0 + values).min()),
-        0.0 if worst is None else float(crossovers[worst]) / (2.0 * math.pi),
-    )
-
-
-def _structured(matrix: np.ndarray) -> float:
-    """Upper bound of the structured singular value for diagonal uncertainty (Osborne scaling)."""
-    scale = np.ones(len(matrix))
-    for _ in range(30):
-        M = matrix * scale[:, None] / scale
-        off = M - np.diag(np.diag(M))
-        rows, columns = np.linalg.norm(off, axis=1), np.linalg.norm(off, axis=0)
-        scale *= np.sqrt(np.maximum(columns, 1e-12) / np.maximum(rows, 1e-12))
-    return float(np.linalg.norm(matrix * scale[:, None] / scale, 2))

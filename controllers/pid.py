@@ -2,11 +2,11 @@
 
 ::
 
-    place -> speed asked for -> speed -> tilt asked for -> attitude -> swash
+    position -> speed demand -> speed -> tilt demand -> attitude -> swash
     height -> climb -> both rotors          heading -> turn rate -> one rotor against the other
 
 It knows no model: twelve gains tried out on lama400d. Slow and noisy speeds are smoothed by a first
-order lag. The place is held only where it is measured (suite ``mocap``).
+order lag. The position is held only where it is measured (suite ``mocap``).
 """
 
 import math
@@ -30,13 +30,13 @@ _PLACE = ("pn", "pe")
 
 @dataclass(frozen=True)
 class Gains:
-    """Of the loops, from outside in; an action of 1 is the end of its range."""
+    """Of the loops, from outside in, named as in controller.json; an action of 1 is full range."""
 
     place: float = 0.35  # [m/s per m]
-    fastest: float = 0.5  # [m/s] that the place asks for
+    fastest: float = 0.5  # [m/s], of the speed demand
     speed: float = 0.14  # [rad of tilt per m/s]
     speed_sum: float = 0.02  # [rad per m]
-    steepest: float = 0.2  # [rad] that the speed asks for
+    steepest: float = 0.2  # [rad], of the tilt demand
     tilt: float = 10.0  # [action per rad]
     rate: float = 1.0  # [action per rad/s]
     height: float = 2.5  # [action per m]
@@ -81,10 +81,10 @@ class PID(Feedback, Designed):
         measured = np.column_stack([speed, y["vd"]])
         self._smooth += (measured - self._smooth) * (1.0 - math.exp(-DT / g.smoothing))
         forward, right, down = self._smooth.T
-        ask_forward, ask_right = self._speed_asked(y).T
+        demand_forward, demand_right = self._speed_demand(y).T
         height = hover.HEIGHT - y["h"]
         heading = -((y["psi"] + math.pi) % (2.0 * math.pi) - math.pi)
-        ahead, aside = ask_forward - forward, ask_right - right
+        ahead, aside = demand_forward - forward, demand_right - right
         self._sums += DT * there[:, None] * np.column_stack([ahead, aside, height, heading])
         most = np.array([g.steepest / g.speed_sum] * 2 + [0.5 / g.height_sum, 0.5 / g.heading_sum])
         np.clip(self._sums, -most, most, out=self._sums)
@@ -102,14 +102,14 @@ class PID(Feedback, Designed):
             ]
         )
 
-    def _speed_asked(self, y: dict[str, np.ndarray]) -> np.ndarray:
-        """Forward and right [m/s] (count, 2), towards a place that is measured."""
+    def _speed_demand(self, y: dict[str, np.ndarray]) -> np.ndarray:
+        """Forward and right [m/s] (count, 2), towards a position that is measured."""
         if "pn" not in y:
             return np.zeros((self.count, 2))
-        ask = -self.gains.place * np.column_stack([y["pn"], y["pe"]])
-        length = np.maximum(np.linalg.norm(ask, axis=1), 1e-9)
-        ask *= np.minimum(1.0, self.gains.fastest / length)[:, None]
-        return turned(ask, -y["psi"])
+        demand = -self.gains.place * np.column_stack([y["pn"], y["pe"]])
+        length = np.maximum(np.linalg.norm(demand, axis=1), 1e-9)
+        demand *= np.minimum(1.0, self.gains.fastest / length)[:, None]
+        return turned(demand, -y["psi"])
 
     def content(self) -> dict[str, Any]:
         """What a file of this kind has of its own."""
@@ -131,6 +131,12 @@ class PID(Feedback, Designed):
 
 
 def design(vehicle: str | Vehicle, nominal: Nominal = None, sensors: str = "onboard") -> PID:
-    """The cascade about a vehicle's nominal trim; nothing else of the vehicle is used."""
+    """The cascade about a vehicle's nominal trim; nothing else of the vehicle is used.
+
+    Args:
+        vehicle: what flies.
+        nominal: vehicle whose trim centres the action, as in the env (default: the bare one).
+        sensors: suite that it is given; must measure rates, attitude, height and velocity.
+    """
     vehicle = load_vehicle(vehicle)
     return PID(vehicle.name, sensors, *action_map(vehicle, nominal))

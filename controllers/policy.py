@@ -2,7 +2,7 @@
 
 ``policy.zip`` holds two members that anyone's file can be read from without running any code::
 
-    policy.json   what it is, how it was made, and the estimator it looks through
+    policy.json   what it is, how it was made, and the estimator before it
     weights.npz   the network's arrays, which NumPy reads with pickles forbidden
 
 Beside them `ppo.train` leaves what Stable-Baselines3 needs to go on training (``data``, ``*.pth``):
@@ -61,9 +61,9 @@ class Network:
 
     def __call__(self, features: np.ndarray) -> np.ndarray:
         """Features (count, in) to outputs (count, out)."""
-        bend = ACTIVATIONS[self.activation]
+        activate = ACTIVATIONS[self.activation]
         for weight, bias in self.layers[:-1]:
-            features = bend(features @ weight.T + bias)
+            features = activate(features @ weight.T + bias)
         weight, bias = self.layers[-1]
         return features @ weight.T + bias
 
@@ -118,6 +118,10 @@ def save_policy(
     """Write policy.zip whole or not at all.
 
     Args:
+        path: where to.
+        network: its input are the features.
+        design: the estimator whose estimate they are made of.
+        scales: of the features, (n + i,).
         content: further entries of the description.
         training: a zip file of Stable-Baselines3, whose members join the plain ones.
     """

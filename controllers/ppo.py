@@ -1,4 +1,4 @@
-"""PPO (Schulman et al. 2017, by Stable-Baselines3) on what the Kalman filter knows.
+"""PPO (Schulman et al. 2017, by Stable-Baselines3) on the Kalman filter's estimate.
 
 The policy that comes out is controllers/policy.py's. Torch is imported only to train.
 """
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
 
 from coax_env.env import hover
 from coax_env.env.fleet import DT, Nominal
@@ -21,13 +20,11 @@ from coax_env.files import make_folder, write_bytes
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 from coax_env.workers import each
-from controllers.estimator import EstimatorDesign, Tracker, design_estimator
+from controllers.estimator import EstimatorDesign, design_estimator
 from controllers.policy import (
     Network,
     feature_scales,
-    features,
     load_policy,
-    n_features,
     save_policy,
 )
 
@@ -53,79 +50,9 @@ SETTINGS: dict[str, Any] = {
 
 ``hold``: an action is held for so many control periods while training (it is flown at 100 Hz):
 noise that lasts 40 ms moves the machine, so less of it is needed to learn from. ``cost_weight``: of
-`hover.cost`, added to the env's reward as weight * (MOST_COST - cost), which counts the first seconds
-of a flight as they are judged. ``threads``: torch's; two only help on a machine with nothing else to
-do.
+`hover.cost`, added to the env's reward, see `HoverVecEnv`, which counts the first seconds of a flight
+as the score does. ``threads``: torch's; two only help on an otherwise idle machine.
 """
-
-MOST_COST = 20.0
-"""Costs above count as this: a start far off may cost as much, and flying on must stay worth it."""
-
-
-def hover_vec_env(
-    vehicle: str | Vehicle,
-    design: EstimatorDesign,
-    n_envs: int,
-    episode_s: float = 10.0,
-    reward_scale: float = 1.0,
-    hold: int = 1,
-    cost_weight: float = 0.0,
-    **env_arguments: Any,
-) -> Any:
-    """A Stable-Baselines3 VecEnv over CoaxVectorEnv, whose observations are the features.
-
-    One step holds the action for `hold` control periods; its reward is the sum of theirs times the
-    scale, each with `cost_weight` * (MOST_COST - cost) where the flight goes on.
-    Each env gets its own ``terminal_observation`` and ``TimeLimit.truncated`` as it ends.
-    """
-    from controllers.vec_env import FleetVecEnv  # imports Stable-Baselines3, and with it torch
-
-    class HoverVecEnv(FleetVecEnv):
-        """See hover_vec_env."""
-
-        def __init__(self) -> None:
-            self.tracker, self.scales = Tracker(design, n_envs), feature_scales(design)
-            super().__init__(
-                n_envs, round(episode_s / DT), reward_scale,
-                Box(-10.0, 10.0, (n_features(design),), np.float32),
-                vehicle=vehicle, nominal=(design.action_trim, design.action_scale),
-                sensors=design.sensors, **env_arguments,
-            )  # fmt: skip
-
-        def begin(self, which: np.ndarray) -> None:
-            self.tracker.reset(which)
-
-        def view(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
-            return features(self.tracker.see(observations, which), self.scales)
-
-        def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-            actions, total = self._actions, np.zeros(n_envs)
-            over = np.zeros(n_envs, dtype=bool)
-            infos: list[dict[str, Any]] = [{} for _ in range(n_envs)]
-            for _ in range(hold):
-                self.tracker.acted(actions)
-                observations, rewards, terminated, truncated, info = self.env.step(actions)
-                done = terminated | truncated
-                ended = info["final_info"]["state"] if done.any() else info["state"]
-                saved = MOST_COST - np.nan_to_num(hover.cost(ended, actions), nan=MOST_COST)
-                bonus = np.where(terminated, 0.0, cost_weight * np.maximum(saved, 0.0))
-                total += np.where(over, 0.0, rewards + bonus)
-                self._return += np.where(over, 0.0, rewards)
-                self._length += ~over
-                if not done.any():
-                    known = self.tracker.see(observations)
-                    continue
-                last = self.view(info["final_obs"])
-                self.begin(done)
-                known = self.tracker.see(observations, done)
-                self.tell_the_end(infos, done & ~over, truncated & ~terminated, last)
-                over |= done
-                actions = np.where(over[:, None], 0.0, actions)  # until the next decision
-            self._return[over], self._length[over] = 0.0, 0
-            rewards = (reward_scale * total).astype(np.float32)
-            return features(known, self.scales), rewards, over, infos
-
-    return HoverVecEnv()
 
 
 def train(
@@ -146,11 +73,18 @@ def train(
     """Train a policy; OUT/policy.zip is there from the first checkpoint on, and after Ctrl-C.
 
     Args:
+        vehicle: what flies: shipped name, path or Vehicle.
+        out: folder of policy.zip.
         steps: control periods, all envs together.
+        seed: of the network, the flights and the draws.
+        nominal: whose trim centres the action, as in the env.
+        sensors: the suite that the policy is given.
         resume: a policy.zip to go on from. Its training members are pickles, which can run
             anything: only from those you trust.
-        progress: called after every rollout with the steps so far and the mean episode's figures.
+        progress: called after every rollout with the steps so far and the mean episode's return
+            and duration [s].
         tensorboard: folder for TensorBoard's logs; its package is the extra ``tensorboard``.
+        checkpoint_steps: control periods between two checkpoints.
         command_line: what made the policy, for its description.
         settings: where not SETTINGS.
         env_arguments: further ones of CoaxVectorEnv, such as ``randomize="posterior"``.
@@ -158,7 +92,7 @@ def train(
     Returns:
         the path of policy.zip.
     """
-    callbacks = require("stable_baselines3.common.callbacks", "rl")
+    require("stable_baselines3", "rl")
     torch = require("torch", "rl")
     if tensorboard:
         require("tensorboard", "tensorboard")
@@ -168,10 +102,8 @@ def train(
     vehicle = load_vehicle(vehicle)
     old = load_policy(resume) if resume else None
     design = old.estimator if old else design_estimator(vehicle, nominal, sensors)
-    chosen = {**SETTINGS, **(settings or {})}
-    if chosen.keys() > SETTINGS.keys():
-        raise InputError(f"no setting {', '.join(chosen.keys() - SETTINGS.keys())} of PPO")
-    content = {
+    chosen = _settings(settings)
+    description = {
         "vehicle": vehicle.name,
         "command": command_line,
         "seed": seed,
@@ -180,11 +112,7 @@ def train(
         "cost": {"weights": hover.COST_WEIGHTS, "limits": hover.LIMITS},
         "reward": {"weights": hover.REWARD_WEIGHTS, "scales": hover.REWARD_SCALES},
     }
-    env = hover_vec_env(
-        vehicle, design, chosen["n_envs"], chosen["episode_s"],
-        reward_scale=(1.0 - chosen["gamma"]) / chosen["hold"], hold=chosen["hold"],
-        cost_weight=chosen["cost_weight"], **env_arguments,
-    )  # fmt: skip
+    env = _training_env(vehicle, design, chosen, env_arguments)
     env.seed(seed)
     torch.set_num_threads(chosen["threads"])
     model = (
@@ -194,11 +122,53 @@ def train(
     )
 
     def save() -> None:
-        save_policy(path, network(model), design, feature_scales(design), content, _file_of(model))
+        scales = feature_scales(design)
+        save_policy(path, network(model), design, scales, description, _file_of(model))
 
-    class Watch(callbacks.BaseCallback):  # type: ignore[name-defined]
-        """Reports and saves after rollouts."""
+    hold = chosen["hold"]
+    callback = _rollout_callback(save, progress, checkpoint_steps, hold)
+    try:
+        model.learn(max(steps // hold, 1), callback=callback, progress_bar=False)
+    finally:
+        save()
+        env.close()
+    return path
 
+
+def _settings(settings: Mapping[str, Any] | None) -> dict[str, Any]:
+    """SETTINGS with those given."""
+    chosen = {**SETTINGS, **(settings or {})}
+    if chosen.keys() > SETTINGS.keys():
+        raise InputError(f"no setting {', '.join(chosen.keys() - SETTINGS.keys())} of PPO")
+    return chosen
+
+
+def _training_env(
+    vehicle: Vehicle,
+    design: EstimatorDesign,
+    settings: Mapping[str, Any],
+    env_arguments: Mapping[str, Any],
+) -> Any:
+    from controllers.hover_vec_env import HoverVecEnv  # imports Stable-Baselines3, and torch
+
+    hold = settings["hold"]
+    return HoverVecEnv(
+        vehicle, design, settings["n_envs"], settings["episode_s"],
+        reward_scale=(1.0 - settings["gamma"]) / hold, hold=hold,
+        cost_weight=settings["cost_weight"], **env_arguments,
+    )  # fmt: skip
+
+
+def _rollout_callback(
+    save: Callable[[], None],
+    progress: Callable[[int, dict[str, float]], None] | None,
+    checkpoint_steps: int,
+    hold: int,
+) -> Any:
+    """A callback of Stable-Baselines3 that reports and saves after rollouts."""
+    callbacks = require("stable_baselines3.common.callbacks", "rl")
+
+    class AfterRollout(callbacks.BaseCallback):  # type: ignore[name-defined]
         saved = 0
 
         def _on_step(self) -> bool:
@@ -206,22 +176,23 @@ def train(
 
         def _on_rollout_end(self) -> None:
             if progress:
-                episodes = list(self.model.ep_info_buffer or [])
-                mean = {
-                    "return": float(np.mean([e["r"] for e in episodes])) if episodes else 0.0,
-                    "seconds": DT * float(np.mean([e["l"] for e in episodes])) if episodes else 0.0,
-                }
-                progress(self.num_timesteps * chosen["hold"], mean)
-            if chosen["hold"] * (self.num_timesteps - self.saved) >= checkpoint_steps:
+                progress(self.num_timesteps * hold, _mean_episode(self.model))
+            if hold * (self.num_timesteps - self.saved) >= checkpoint_steps:
                 self.saved = self.num_timesteps
                 save()
 
-    try:
-        model.learn(max(steps // chosen["hold"], 1), callback=Watch(), progress_bar=False)
-    finally:
-        save()
-        env.close()
-    return path
+    return AfterRollout()
+
+
+def _mean_episode(model: Any) -> dict[str, float]:
+    """Mean return and duration [s] of the last episodes; 0 before the first has ended."""
+    episodes = list(model.ep_info_buffer or [])
+    if not episodes:
+        return {"return": 0.0, "seconds": 0.0}
+    return {
+        "return": float(np.mean([e["r"] for e in episodes])),
+        "seconds": DT * float(np.mean([e["l"] for e in episodes])),
+    }
 
 
 def train_seeds(
@@ -238,7 +209,11 @@ def train_seeds(
     cluster need no disk in common; one that is interrupted is lost.
 
     Args:
-        jobs, backend: as in `coax_env.workers.each`.
+        vehicle: what flies.
+        out: folder of the policies.
+        seeds: one policy each.
+        jobs: how many at once, as in `coax_env.workers.each`.
+        backend: where, as in `coax_env.workers.each`.
         training: further arguments of `train`, but for ``progress``.
 
     Returns:

@@ -2,11 +2,11 @@
 
 Three designs share one quadratic cost (`lqr.regulator_problem`) and differ in what they are given:
 
-``lqr``   the exact state (suite ``state``), nothing remembered
+``lqr``   the exact state (suite ``state``), no memory
 ``lqi``   the same, and the integrals of height, heading and position: no offset stays
 ``lqg``   any suite's noisy readings: `lqi`'s feedback of a Kalman filter's estimate (lqr.py)
 
-The first two say what the noise of real sensors costs the third.
+The first two show what the noise of real sensors costs the third.
 """
 
 from collections.abc import Mapping
@@ -93,7 +93,14 @@ def design(
     integral: bool = True,
     limits: Mapping[str, float] | None = None,
 ) -> StateFeedback:
-    """Design LQI, or LQR without the integrals, on a vehicle; `limits` as in `lqr.design`."""
+    """Design LQI, or LQR without the integrals, on a vehicle.
+
+    Args:
+        vehicle: what the design is made on: shipped name, path or Vehicle.
+        nominal: vehicle whose trim centres the action, as in the env (default: the bare one).
+        integral: whether height, heading and position are integrated.
+        limits: errors that count 1 in the cost, where not hover.LIMITS.
+    """
     import control
 
     vehicle = load_vehicle(vehicle)

@@ -1,10 +1,10 @@
 """Flying to a target with a controller that only hovers: the flight seen from the target.
 
-In the tasks ``position`` and ``waypoints`` the observation ends with the way to the target
-(coax_env/tasks.py). Moved and turned so that the target lies at the start's place, height and
-heading, it is an observation of ``hover``, and a hover controller flies it. A target that is far
-away is approached through a point on the way, no farther than REACH: a linear controller asked for
-more would only saturate.
+In the tasks ``position`` and ``waypoints`` the observation ends with the vector to the target
+(coax_env/env/tasks.py). Moved and rotated so that the target lies at the start's position, height
+and heading, it is an observation of ``hover``, and a hover controller flies it. A distant target is
+approached through setpoints on the way, no farther than REACH: a larger error would only saturate
+a linear controller.
 """
 
 import math
@@ -15,7 +15,7 @@ from coax_env.env import hover, tasks
 from coax_env.model.sensors import slow_instruments, suite
 
 REACH = {"place": 0.5, "height": 0.15, "heading": math.radians(10.0)}
-"""Farthest point asked for at once [m, m, rad]."""
+"""Farthest setpoint at once [m, m, rad]."""
 
 
 class TargetView:
@@ -38,8 +38,8 @@ class TargetView:
         """Observations (count, n), with or without a target, as those of a hover.
 
         Returns:
-            observations (count, width), float; whether what is asked for is the target itself, or
-            nothing but to hover, (count,) bool.
+            observations (count, width), float; whether the setpoint is the target itself, or there is
+            no target but to hover, (count,) bool.
         """
         if self.aims(observations):
             seen, _, there = self.seen(observations)
@@ -50,7 +50,7 @@ class TargetView:
         """Observations (count, width + 4) as those of a hover at the target, or on the way to it.
 
         Returns:
-            observations (count, width); the point asked for, x y z psi (count, 4); whether it is
+            observations (count, width); the setpoint, x y z psi (count, 4); whether it is
             the target itself, (count,) bool.
         """
         assert self._places is not None
@@ -63,16 +63,16 @@ class TargetView:
         way[:, 3] = np.clip(way[:, 3], -REACH["heading"], REACH["heading"])
         x, y, z, psi = self._places
         heading = seen[:, psi].copy()
-        asked = np.empty((len(seen), 4))
-        asked[:, :2] = seen[:, [x, y]] + turned(way[:, :2], heading)
-        asked[:, 2] = -self._up * seen[:, z] - way[:, 2]
-        asked[:, 3] = heading + way[:, 3]
+        setpoint = np.empty((len(seen), 4))
+        setpoint[:, :2] = seen[:, [x, y]] + turned(way[:, :2], heading)
+        setpoint[:, 2] = -self._up * seen[:, z] - way[:, 2]
+        setpoint[:, 3] = heading + way[:, 3]
         seen[:, psi] = -way[:, 3]
         seen[:, [x, y]] = -turned(way[:, :2], seen[:, psi])
         seen[:, z] = self._up * (hover.HEIGHT - way[:, 2])
         if self._speed:
-            seen[:, self._speed] = turned(seen[:, self._speed], -asked[:, 3])
-        return seen, asked, (way == whole).all(axis=1)
+            seen[:, self._speed] = turned(seen[:, self._speed], -setpoint[:, 3])
+        return seen, setpoint, (way == whole).all(axis=1)
 
 
 def turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:

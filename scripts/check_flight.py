@@ -1,4 +1,4 @@
-"""Say what a flight folder contains, what is wrong with it, and what can be learned from it."""
+"""Report what a flight folder contains, what is wrong with it, and what it can determine."""
 
 import math
 from pathlib import Path
@@ -28,15 +28,15 @@ def main() -> None:
         return
     from coax_env.inspection.flight_check import check_flight  # compiles the kernel
 
-    with command_line.progress("check") as say:
-        found = check_flight(options.flight, options.vehicle, say)
+    with command_line.progress("check") as report_progress:
+        found = check_flight(options.flight, options.vehicle, report_progress)
     write_json(options.out / "check.json", found.as_json())
     show(found)
     print(f"\nall numbers {options.out / 'check.json'}")
 
 
 def draft(folder: Path, vehicle: str) -> None:
-    """Write a card and say what was guessed."""
+    """Write a card and report what was guessed."""
     load_vehicle(vehicle)
     card, guessed = draft_card(folder, vehicle)
     print(f"{card}: look at every line")
@@ -62,26 +62,28 @@ def show(found: "FlightCheck") -> None:
     command_line.print_columns(rows)
     print("not measured:", " ".join(found.missing) or "nothing")
     for note in found.mended:
-        print("mended:", note)
+        print("repaired:", note)
     if found.unread:
         print("columns not read:", ", ".join(found.unread))
     for suspicion in found.suspicions:
         print("SUSPICIOUS:", suspicion)
     print()
-    rows = [["effect at its usual size", "verdict", "nats", "std / usual", "best in", "looks like"]]
+    rows = [
+        ["effect at its usual size", "verdict", "nats", "std / usual", "best in", "confounded with"]
+    ]
     for e in found.effects:
         ratio = max(e.std[name] / e.usual[name] for name in e.std)
         cells = (f"{e.nats:.0f}", "-" if math.isinf(ratio) else f"{ratio:.2g}", e.run)
         rows.append([e.effect, e.verdict, *cells, ", ".join(e.alike)])
     command_line.print_columns(rows)
     print("(with the vehicle as given: wind, say, acts through a drag that must be in the file)\n")
-    rows = [["own number", "std in the file", "std after a fit", "left"]]
+    rows = [["parameter", "std in the file", "std after a fit", "left"]]
     for n in found.own_numbers:
         left = f"{100 * n.std_after / n.std_before:.0f} %"
         rows.append([n.name, f"{n.std_before:.2g} {n.unit}", f"{n.std_after:.2g}", left])
     command_line.print_columns(rows)
     if found.undetermined:
-        print("stay open:", "; ".join(found.directions) or ", ".join(found.undetermined))
+        print("undetermined:", "; ".join(found.directions) or ", ".join(found.undetermined))
     print("\nnext:", command_line.as_called(found.next_step))
 
 

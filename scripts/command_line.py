@@ -1,4 +1,4 @@
-"""What every script here shares: the common arguments, the exit codes, one-line errors."""
+"""Common to all scripts: shared arguments, exit codes, one-line errors."""
 
 import argparse
 import os
@@ -29,19 +29,33 @@ class Parser(argparse.ArgumentParser):
 
 
 def parser(name: str, description: str, *, seed: bool = False) -> Parser:
-    """A parser with ``--out`` (default ``runs/NAME``) and, where chance plays, ``--seed``."""
+    """A parser with ``--out`` and, where numbers are drawn, ``--seed``.
+
+    Args:
+        name: of the script; ``--out`` defaults to ``runs/NAME``.
+        description: what ``--help`` shows first.
+        seed: whether there is a ``--seed``.
+    """
     result = Parser(prog=as_called(f"scripts/{name}.py"), description=description)
     result.add_argument(
         "--out", type=Path, default=Path("runs") / name, metavar="DIR",
         help="folder for the results (default: %(default)s)",
     )  # fmt: skip
     if seed:
-        result.add_argument("--seed", type=int, default=0, help="of chance (default: 0)")
+        result.add_argument(
+            "--seed", type=int, default=0, help="of the random numbers (default: 0)"
+        )
     return result
 
 
 def add_workers(parser: Parser, what: str, default: int) -> None:
-    """``--jobs`` and ``--backend``, for `coax_env.workers.each`; `what` is worked on at once."""
+    """``--jobs`` and ``--backend``, for `coax_env.workers.each`.
+
+    Args:
+        parser: to which they are added.
+        what: is worked on at once, such as ``"seeds"``.
+        default: of ``--jobs``; -1: all cores.
+    """
     usual = "all cores" if default < 0 else f"{default}; -1: all cores"
     parser.add_argument(
         "--jobs", type=_jobs, default=default, help=f"{what} at once (default: {usual})"

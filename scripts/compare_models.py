@@ -1,5 +1,6 @@
-"""What mending the model is worth: controllers of the bare and of the mended model on one machine."""
+"""Fly controllers designed on the bare and on the corrected model on one machine, and compare them."""
 
+import argparse
 import os
 import shlex
 import sys
@@ -9,10 +10,40 @@ import command_line
 
 from coax_env.files import make_folder, write_json, write_text
 from coax_env.model.vehicle_file import load_vehicle, vehicle_toml
-from controllers import mended
+from controllers import model_comparison
 
 
 def main() -> None:
+    options = arguments()
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
+
+    model_comparison.check_machine(options.machine, options.flight)
+    bare = load_vehicle(options.model)
+    machine = (
+        load_vehicle(options.machine) if options.machine else model_comparison.default_machine(bare)
+    )
+    make_folder(options.out)
+    with command_line.progress("compare_models") as report_progress:
+        content, result, controllers = model_comparison.compare_models(
+            machine, bare, options.flight, options.out, options.episodes, round(options.steps),
+            options.seed, report_progress,
+        )  # fmt: skip
+    write_json(options.out / "models.json", content)
+    write_text(options.out / "vehicle.toml", vehicle_toml(result.vehicle_after))
+    words = "scripts/compare_models.py " + shlex.join(sys.argv[1:])
+    page = model_comparison.models_page(content, controllers, machine, words)
+    write_text(options.out / "report.html", page)
+
+    print("hidden:", ", ".join(content["hidden"]))
+    print("named: ", ", ".join(content["found"]) or "nothing")
+    command_line.print_columns([model_comparison.ROW_HEADER, *model_comparison.rows(content)])
+    for kind, factor in content["cost_ratio"].items():
+        print(f"{kind}: {factor:.2f} times less cost with the corrected model")
+    print(f"report {options.out / 'report.html'}")
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
     parser = command_line.parser("compare_models", __doc__, seed=True)
     parser.add_argument(
         "--machine", metavar="FILE",
@@ -26,30 +57,7 @@ def main() -> None:
     parser.add_argument(
         "--steps", type=float, default=4e6, help="of each policy's training; 0: LQG only"
     )
-    options = parser.parse_args()
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
-
-    mended.check_machine(options.machine, options.flight)
-    bare = load_vehicle(options.model)
-    machine = load_vehicle(options.machine) if options.machine else mended.default_machine(bare)
-    make_folder(options.out)
-    with command_line.progress("compare_models") as say:
-        content, result, controllers = mended.compare_models(
-            machine, bare, options.flight, options.out, options.episodes, round(options.steps),
-            options.seed, say,
-        )  # fmt: skip
-    write_json(options.out / "models.json", content)
-    write_text(options.out / "vehicle.toml", vehicle_toml(result.vehicle_after))
-    words = "scripts/compare_models.py " + shlex.join(sys.argv[1:])
-    page = mended.models_page(content, controllers, machine, words)
-    write_text(options.out / "report.html", page)
-
-    print("hidden:", ", ".join(content["hidden"]))
-    print("named: ", ", ".join(content["found"]) or "nothing")
-    command_line.print_columns([mended.ROW_HEADER, *mended.rows(content)])
-    for kind, factor in content["cost_ratio"].items():
-        print(f"{kind}: {factor:.2f} times less cost with the mended model")
-    print(f"report {options.out / 'report.html'}")
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

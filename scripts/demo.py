@@ -1,4 +1,4 @@
-"""The main job on a bundled flight: where the simulation is wrong, why, and what mending it is worth.
+"""The main job on a bundled flight: where the simulation is wrong, why, and what correcting it gains.
 
 The bundled flight is synthetic: an independent simulator flew it with effects hidden in it, and
 truth.json beside it says which. Where ../shared/flights/skybotix_coax is present, real flights of a
@@ -19,12 +19,13 @@ from coax_env.files import write_json
 from coax_env.logs.flight import read_flight
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from coax_env.report import FlownControllers
-from controllers import mended
+from coax_env.report import ControllerScores
+from controllers import model_comparison
 
 PACKAGE = Path(coax_env.__file__).resolve().parent
 BUNDLED = PACKAGE / "logs" / "flights" / "windy"
 REAL = PACKAGE.parent.parent / "shared" / "flights" / "skybotix_coax"
+CHANNELS_PRINTED = 4
 
 
 def main() -> None:
@@ -34,57 +35,70 @@ def main() -> None:
     start = monotonic()
 
     print("1. A measured flight: 12 runs of a Lama 400D, synthetic, from an independent simulator.")
-    result = look("demo", BUNDLED, None)
+    result = diagnose_and_print("demo", BUNDLED, None)
     truth = json.loads((BUNDLED / "truth.json").read_text())
     print(f"   hidden in it, for comparison: {', '.join(truth['hidden'])}\n")
 
     print(
-        "2. A hover controller designed on the bare and on the mended model (LQG, python-control),"
+        "2. A hover controller (LQG, python-control) designed on the bare and on the corrected model,"
     )
-    print("   both flown in CoaxHeli-v0 on the machine as it truly is, 20 episodes of 20 s:")
-    flown = fly(result, true_vehicle(truth), options.out)
-    save(result, options.out, flown)
+    print("   both flown in CoaxHeli-v0 on the true machine, 20 episodes of 20 s:")
+    scores = compare_controllers(result, true_vehicle(truth), options.out)
+    save(result, options.out, scores)
 
     if REAL.is_dir() and not options.no_real:
         print(
-            "\n3. Real flights of a Skybotix CoaX (M. Faessler, GRASP Lab, 2011): fitted on hover and"
+            "\n3. Real flights of a Skybotix CoaX (M. Faessler, GRASP Lab, 2011): fitted on hover"
         )
-        print("   vertical_sine, predicted on circles, which the fit has not seen.")
-        save(look("real", REAL, ["circles"]), options.out / "real")
+        print("   and vertical_sine, predicted on circles, which is held out of the fit.")
+        save(diagnose_and_print("real", REAL, ["circles"]), options.out / "real")
     print(f"\n{monotonic() - start:.0f} s in all. Open {options.out / 'report.html'} in a browser.")
 
 
-def look(name: str, flight: Path, hold_out: list[str] | None) -> Diagnosis:
-    """Diagnose a flight and print what was found."""
-    with command_line.progress(name) as say:
-        result = diagnose(read_flight(flight), hold_out=hold_out, progress=say)
+def diagnose_and_print(name: str, flight: Path, hold_out: list[str] | None) -> Diagnosis:
+    """Diagnose a flight and print the findings.
+
+    Args:
+        name: shown with the progress.
+        flight: its folder.
+        hold_out: runs on which the gain is measured; None: chosen by the diagnosis.
+    """
+    with command_line.progress(name) as report_progress:
+        result = diagnose(read_flight(flight), hold_out=hold_out, progress=report_progress)
     print_errors(result)
     print(indented(diagnose_script.summary(result)))
     return result
 
 
-def save(result: Diagnosis, out: Path, flown: FlownControllers | None = None) -> None:
-    """Write a diagnosis and its report."""
+def save(result: Diagnosis, out: Path, scores: ControllerScores | None = None) -> None:
+    """Write a diagnosis and its report.
+
+    Args:
+        result: of the diagnosis.
+        out: folder of the results.
+        scores: of controllers designed on both models.
+    """
     command = f"scripts/diagnose.py {result.flight.path} --out {out}"
-    diagnose_script.save(result, out, command, flown)
+    diagnose_script.save(result, out, command, scores)
     print(f"   report: {out / 'report.html'}")
 
 
 def print_errors(result: Diagnosis) -> None:
-    """Where the bare simulation departs, in one line."""
+    """The channels in which the bare model errs most, in one line."""
     gain = result.findings["gain"]
     worst = sorted(
         gain["channels"].items(),
         key=lambda item: -(item[1]["before"] or 0.0) / item[1]["noise"],
-    )[:4]
+    )[:CHANNELS_PRINTED]
     words = ", ".join(
         f"{plain_words.channel_name(c)} {e['before']:.2g} -> {e['after']:.2g} {e['unit']}"
         for c, e in worst
     )
-    print(f"   1 s prediction error on held-out runs, bare -> mended: {words}")
+    print(f"   1 s prediction error on held-out runs, bare -> corrected: {words}")
 
 
 def indented(text: str) -> str:
+    """Every line three columns to the right."""
     return "\n".join("   " + line for line in text.splitlines())
 
 
@@ -101,12 +115,18 @@ def true_vehicle(truth: dict) -> Vehicle:
     )
 
 
-def fly(result: Diagnosis, machine: Vehicle, out: Path) -> FlownControllers:
-    """LQG designed on each model, flown on the true machine."""
+def compare_controllers(result: Diagnosis, machine: Vehicle, out: Path) -> ControllerScores:
+    """Design an LQG on each model, fly both on the true machine, print and write the scores.
+
+    Args:
+        result: of the diagnosis, with both models.
+        machine: the true vehicle.
+        out: folder of the controllers and scores.
+    """
     bare = load_vehicle("lama400d")
-    flown = mended.before_and_after(bare, result.vehicle_after, machine)
+    designs = model_comparison.lqg_of_both(bare, result.vehicle_after, machine)
     rows = [["", "success", "cost", "height rms", "speed rms", "heading rms", "drift"]]
-    for name, (controller, score) in flown.items():
+    for name, (controller, score) in designs.items():
         controller.save(out / f"controller_{name}.json")
         write_json(out / f"score_{name}.json", score)
         rows.append(
@@ -121,7 +141,7 @@ def fly(result: Diagnosis, machine: Vehicle, out: Path) -> FlownControllers:
             ]
         )
     command_line.print_columns(rows)
-    return mended.flown_controllers(flown, "the machine as it truly is")
+    return model_comparison.controller_scores(designs, "the true machine")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Design a hover controller (LQR with integral action, and a Kalman filter) on a vehicle."""
 
+import argparse
 import shlex
 import sys
 
@@ -8,7 +9,7 @@ import command_line
 from coax_env.files import make_folder, write_text
 from coax_env.model.sensors import SUITES
 from coax_env.model.vehicle_file import load_vehicle
-from controllers import lqr
+from controllers import lqr, margins
 from controllers.design_report import (
     MARGIN_HEADER,
     design_page,
@@ -20,6 +21,49 @@ from controllers.evaluation import evaluate, evaluate_spread
 
 
 def main() -> None:
+    options = arguments()
+    vehicle = load_vehicle(options.vehicle)
+    controller = lqr.design(vehicle, options.nominal, options.sensors)
+    inputs, disk = margins.stability_margins(controller)
+    score = evaluate(controller, vehicle, episodes=50, seed=options.seed)
+    worst = evaluate_spread(controller, vehicle, options.vehicles, 5, seed=options.seed)
+    spread = margins.margins_over_spread(controller, vehicle, options.vehicles, options.seed)
+    page = design_page(
+        controller, vehicle, inputs, disk, score, worst, spread,
+        "scripts/design_lqr.py " + shlex.join(sys.argv[1:]),
+    )  # fmt: skip
+    make_folder(options.out)
+    path = controller.save(options.out / "controller.json")
+    write_text(options.out / "report.html", page)
+
+    print_margins(controller, inputs, disk)
+    print(
+        f"{score['episodes']} flights of {score['seconds']:.0f} s on this vehicle: "
+        f"{100 * score['success_rate']:.0f} % succeed, mean cost {score['mean_cost']:.3g}"
+    )
+    print(spread_in_words(worst, spread))
+    print(f"controller {path}, report {options.out / 'report.html'}")
+
+
+def print_margins(controller: lqr.LQG, inputs: list[margins.InputMargins], disk: float) -> None:
+    """Stability margins, and the states that the sensors do not show.
+
+    Args:
+        controller: the design.
+        inputs: margins of each input.
+        disk: margin of all inputs at once.
+    """
+    command_line.print_columns([MARGIN_HEADER, *margin_rows(inputs)])
+    gain, phase = disk_in_words(disk)
+    print(f"all inputs at once: disk margin {disk:.2f}, {gain} in gain or {phase} in phase")
+    hidden = controller.estimator.unobserved
+    print("not observable with these sensors, left out:", ", ".join(hidden) or "nothing")
+    if "theta" in hidden:
+        print("WARNING: without attitude or velocity no linear design can hold the hover")
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
     parser = command_line.parser("design_lqr", __doc__, seed=True)
     parser.add_argument("--vehicle", default="lama400d", help="shipped name or TOML file")
     parser.add_argument("--nominal", help="vehicle whose trim centres the action (default: bare)")
@@ -30,35 +74,7 @@ def main() -> None:
         "--vehicles", type=int, default=20,
         help="how many to draw from the file's spread for the worst case (default: %(default)s)",
     )  # fmt: skip
-    options = parser.parse_args()
-
-    vehicle = load_vehicle(options.vehicle)
-    controller = lqr.design(vehicle, options.nominal, options.sensors)
-    margins, disk = lqr.margins(controller)
-    score = evaluate(controller, vehicle, episodes=50, seed=options.seed)
-    worst = evaluate_spread(controller, vehicle, options.vehicles, 5, seed=options.seed)
-    spread = lqr.margins_over_spread(controller, vehicle, options.vehicles, options.seed)
-    page = design_page(
-        controller, vehicle, margins, disk, score, worst, spread,
-        "scripts/design_lqr.py " + shlex.join(sys.argv[1:]),
-    )  # fmt: skip
-    make_folder(options.out)
-    path = controller.save(options.out / "controller.json")
-    write_text(options.out / "report.html", page)
-
-    command_line.print_columns([MARGIN_HEADER, *margin_rows(margins)])
-    gain, phase = disk_in_words(disk)
-    print(f"all inputs at once: disk margin {disk:.2f}, {gain} in gain or {phase} in phase")
-    hidden = controller.estimator.unobserved
-    print("not shown by these sensors, left out:", ", ".join(hidden) or "nothing")
-    if "theta" in hidden:
-        print("WARNING: without attitude or velocity no linear design can hold the hover")
-    print(
-        f"{score['episodes']} flights of {score['seconds']:.0f} s on this vehicle: "
-        f"{100 * score['success_rate']:.0f} % succeed, mean cost {score['mean_cost']:.3g}"
-    )
-    print(spread_in_words(worst, spread))
-    print(f"controller {path}, report {options.out / 'report.html'}")
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

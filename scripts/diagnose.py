@@ -1,10 +1,11 @@
-"""Find what a vehicle's simulation gets wrong on measured flights, name the causes, extend it."""
+"""Find what a vehicle's simulation gets wrong on measured flights, name the causes, correct it."""
 
+import argparse
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import command_line
 
@@ -13,10 +14,37 @@ from coax_env.files import staged_folder, write_json, write_text
 
 if TYPE_CHECKING:
     from coax_env.diagnosis.diagnose import Diagnosis
-    from coax_env.report import FlownControllers
+    from coax_env.report import ControllerScores
 
 
 def main() -> None:
+    options = arguments()
+    for file in options.effect:
+        load_effect(file)
+    # compiles the kernel, with the catalogue as it is now
+    from coax_env.diagnosis.diagnose import diagnose
+
+    hold_out = None
+    if options.hold_out is not None:
+        hold_out = [] if options.hold_out == "none" else options.hold_out.split(",")
+    with command_line.progress("diagnosis") as report_progress:
+        result = diagnose(
+            options.flight,
+            options.vehicle,
+            hold_out=hold_out,
+            exclude=[e for e in options.exclude.split(",") if e],
+            progress=report_progress,
+            ceiling=options.ceiling,
+        )
+        scores = fly_both(result, report_progress) if options.fly else None
+    save(result, options.out, "scripts/diagnose.py " + shlex.join(sys.argv[1:]), scores)
+    print(summary(result))
+    print(f"findings {options.out / 'findings.json'}, corrected vehicle "
+          f"{options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")  # fmt: skip
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
     parser = command_line.parser("diagnose", __doc__)
     parser.add_argument("flight", type=Path, help="flight folder")
     parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
@@ -29,7 +57,7 @@ def main() -> None:
     )
     parser.add_argument(
         "--effect", action="append", default=[], type=Path, metavar="FILE",
-        help="Python file with an effect of your own (coax_env/user_effects.py); may be repeated",
+        help="Python file with an effect of your own (coax_env/model/user_effects.py); may be repeated",
     )  # fmt: skip
     parser.add_argument(
         "--ceiling", action="store_true",
@@ -37,52 +65,38 @@ def main() -> None:
     )  # fmt: skip
     parser.add_argument(
         "--fly", action="store_true",
-        help="also design a hover controller on the model before and after, and fly both",
+        help="also design a hover controller on the bare and on the corrected model, and fly both",
     )  # fmt: skip
-    options = parser.parse_args()
-    for file in options.effect:
-        load_effect(file)
-    # compiles the kernel, with the catalogue as it is now
-    from coax_env.diagnosis.diagnose import diagnose
-
-    held = None
-    if options.hold_out is not None:
-        held = [] if options.hold_out == "none" else options.hold_out.split(",")
-    with command_line.progress("diagnosis") as say:
-        result = diagnose(
-            options.flight,
-            options.vehicle,
-            hold_out=held,
-            exclude=[e for e in options.exclude.split(",") if e],
-            progress=say,
-            ceiling=options.ceiling,
-        )
-        flown = fly(result, say) if options.fly else None
-    save(result, options.out, "scripts/diagnose.py " + shlex.join(sys.argv[1:]), flown)
-    print(summary(result))
-    print(f"findings {options.out / 'findings.json'}, extended vehicle "
-          f"{options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")  # fmt: skip
+    return parser.parse_args()
 
 
-def fly(result: "Diagnosis", say: Callable[[str], None]) -> "FlownControllers":
-    """An LQG of each model, flown on the extended one: the machine itself is not at hand."""
-    from controllers import mended
+def fly_both(result: "Diagnosis", report_progress: Callable[[str], None]) -> "ControllerScores":
+    """An LQG of each model, flown on the corrected one: the machine itself is not at hand."""
+    from controllers import model_comparison
 
-    say("flying a controller of each model")
-    before, after = result.vehicle_before, result.vehicle_after
-    flown = mended.before_and_after(before, after, after)
-    return mended.flown_controllers(flown, "the extended model, the best guess at the machine")
+    report_progress("flying a controller of each model")
+    bare, corrected = result.vehicle_before, result.vehicle_after
+    designs = model_comparison.lqg_of_both(bare, corrected, corrected)
+    machine = "the corrected model, the best estimate of the machine"
+    return model_comparison.controller_scores(designs, machine)
 
 
 def save(
-    result: "Diagnosis", out: Path, command: str, flown: "FlownControllers | None" = None
+    result: "Diagnosis", out: Path, command: str, scores: "ControllerScores | None" = None
 ) -> None:
-    """findings.json, vehicle.toml and report.html, all or none; then the next flight's card."""
+    """findings.json, vehicle.toml and report.html, all or none; then the next flight's card.
+
+    Args:
+        result: of the diagnosis.
+        out: folder of the results.
+        command: what was typed.
+        scores: of controllers designed on both models.
+    """
     from coax_env import report
     from coax_env.design.flight_card import write_flight_card
     from coax_env.model.vehicle_file import vehicle_toml
 
-    page = report.diagnosis_page(result, command, flown)
+    page = report.diagnosis_page(result, command, scores)
     with staged_folder(out) as folder:
         write_json(folder / "findings.json", result.findings)
         write_text(folder / "vehicle.toml", vehicle_toml(result.vehicle_after))
@@ -92,21 +106,13 @@ def save(
 
 
 def summary(result: "Diagnosis") -> str:
-    """The finding in a few lines."""
+    """The findings in a few lines."""
     findings = result.findings
-    lines = [f"verdict: {findings['verdict']}"]
-    for cause in findings["causes"]:
-        values = ", ".join(
-            f"{name.split('.')[1]} {p['value']:.4g} +- {p['std']:.2g} {p['unit']}"
-            for name, p in cause["parameters"].items()
-        )
-        alike = ", ".join(cause["confusable_with"])
-        lines.append(
-            f"  {cause['effect']}: {values}; {cause['evidence']:.0f} nats"
-            + (f"; these flights cannot tell it from {alike}" if alike else "")
-        )
-    for left in findings["unexplained"]:
-        lines.append(f"  unexplained: {left['channel']} ({left['form']})")
+    lines = [f"verdict: {findings['verdict']}", *map(cause_line, findings["causes"])]
+    if findings["causes"]:
+        lines.append("  (nats: gain in log-likelihood by the cause; 5 nats are odds of 150 to 1)")
+    for term in findings["unexplained"]:
+        lines.append(f"  unexplained: {term['channel']} ({term['form']})")
     gain = findings["gain"]
     if gain and gain["error_removed_percent"] is not None:
         low, high = gain["ci95"]
@@ -118,9 +124,19 @@ def summary(result: "Diagnosis") -> str:
     following = findings["next_maneuver"]
     if following:
         lines.append(f"fly next: {following['maneuver']}: {following['why']}")
-    for remark in result.remarks:
-        lines.append(f"note: {remark}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"note: {remark}" for remark in result.remarks)])
+
+
+def cause_line(cause: Mapping[str, Any]) -> str:
+    """A cause of findings.json in one line."""
+    values = ", ".join(
+        f"{name.split('.')[1]} {p['value']:.4g} +- {p['std']:.2g} {p['unit']}"
+        for name, p in cause["parameters"].items()
+    )
+    line = f"  {cause['effect']}: {values}; {cause['evidence']:.0f} nats"
+    if cause["confusable_with"]:
+        line += f"; confounded alternatives: {', '.join(cause['confusable_with'])}"
+    return line
 
 
 if __name__ == "__main__":

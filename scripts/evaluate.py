@@ -1,4 +1,4 @@
-"""Fly a hover controller many times and judge it from true states; or compare all of them."""
+"""Fly a hover controller many times and score it from true states; or compare all of them."""
 
 import argparse
 import shlex
@@ -19,6 +19,22 @@ from controllers.loading import KINDS, Controller, make_controller
 
 
 def main() -> None:
+    options = arguments()
+    vehicle = load_vehicle(options.vehicle)
+    if options.compare:
+        compare(options, vehicle)
+        return
+    controller = make_controller(options.controller, vehicle, None, options.sensors)
+    score = fly(options, vehicle, controller)
+    path = write_json(options.out / "score.json", score)
+    command_line.print_columns(
+        [[n, words(v)] for n, v in score.items() if not isinstance(v, dict | list)]
+    )
+    print(f"score {path}")
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
     parser = command_line.parser("evaluate", __doc__, seed=True)
     parser.add_argument(
         "--controller", default="lqr", metavar="NAME|PATH",
@@ -45,23 +61,17 @@ def main() -> None:
         help="LQG, PPO, PID and LQI in hover, gusts, wind, on drawn vehicles, and to targets; "
         "--controller may give the policy",
     )  # fmt: skip
-    options = parser.parse_args()
-
-    vehicle = load_vehicle(options.vehicle)
-    if options.compare:
-        compare(options, vehicle)
-        return
-    controller = make_controller(options.controller, vehicle, None, options.sensors)
-    score = fly(options, vehicle, controller)
-    path = write_json(options.out / "score.json", score)
-    command_line.print_columns(
-        [[n, words(v)] for n, v in score.items() if not isinstance(v, dict | list)]
-    )
-    print(f"score {path}")
+    return parser.parse_args()
 
 
 def fly(options: argparse.Namespace, vehicle: Vehicle, controller: Controller) -> dict[str, Any]:
-    """The score, on the vehicle or on the worst of those drawn from its spread."""
+    """The score, on the vehicle or on the worst of those drawn from its spread.
+
+    Args:
+        options: of the command line.
+        vehicle: what is flown.
+        controller: what flies.
+    """
     env: dict[str, Any] = {"wind": options.wind, "task": options.task}
     if options.turbulence:
         env["turbulence"] = strength(options.turbulence)
@@ -82,9 +92,10 @@ def fly(options: argparse.Namespace, vehicle: Vehicle, controller: Controller) -
 def compare(options: argparse.Namespace, vehicle: Vehicle) -> None:
     """The comparison's table, compare.json and report.html."""
     policy = None if options.controller in KINDS else load_controller(options.controller)
-    with command_line.progress("compare") as say:
+    with command_line.progress("compare") as report_progress:
         content = comparison.compare(
-            vehicle, policy, options.episodes, options.seconds, options.vehicles, options.seed, say,
+            vehicle, policy, options.episodes, options.seconds, options.vehicles, options.seed,
+            report_progress,
             options.jobs, options.backend,
         )  # fmt: skip
     make_folder(options.out)
@@ -92,7 +103,7 @@ def compare(options: argparse.Namespace, vehicle: Vehicle) -> None:
     text = comparison.comparison_page(content, "scripts/evaluate.py " + shlex.join(sys.argv[1:]))
     page = write_text(options.out / "report.html", text)
     rows = comparison.rows(content["conditions"])
-    command_line.print_columns(comparison.printed(comparison.HEADER, rows))
+    command_line.print_columns(comparison.without_repeats(comparison.HEADER, rows))
     print(f"scores {path}, report {page}")
 
 

@@ -1,5 +1,6 @@
-"""Fit a vehicle's own numbers to a flight; the result is a vehicle file for the env."""
+"""Fit a vehicle's parameters to a flight; the result is a vehicle file for the env."""
 
+import argparse
 import shlex
 import sys
 from pathlib import Path
@@ -9,12 +10,68 @@ import command_line
 from coax_env import report
 from coax_env.estimation.prediction import pooled_rms
 from coax_env.files import staged_folder, write_text
-from coax_env.identification.identify import METHODS, identify
+from coax_env.identification.identify import METHODS, Identification, identify
 from coax_env.identification.two_step.method import TwoStep
 from coax_env.model.vehicle_file import vehicle_toml
 
 
 def main() -> None:
+    options = arguments()
+    with command_line.progress("identification") as report_progress:
+        result = identify(
+            options.flight,
+            options.vehicle,
+            options.method,
+            report_progress,
+            channels=None if options.channels is None else options.channels.split(","),
+            also=[name for name in options.also.split(",") if name],
+            hold_out=[name for name in options.hold_out.split(",") if name],
+        )
+    page = report_page(result, "scripts/identify.py " + shlex.join(sys.argv[1:]))
+    with staged_folder(options.out) as folder:
+        write_text(folder / "vehicle.toml", vehicle_toml(result.after))
+        write_text(folder / "report.html", page)
+    print_result(result)
+    print(f"vehicle {options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")
+
+
+def report_page(result: Identification | TwoStep, command: str) -> str:
+    """The report of either method; `command` is what was typed."""
+    if isinstance(result, TwoStep):
+        return report.two_step_page(result, command)
+    return report.identification_page(
+        result.before,
+        result.after,
+        result.fitted,
+        flight=result.flight,
+        replay_before=result.replay_before,
+        replay_after=result.replay_after,
+        remarks=result.remarks,
+        undetermined=result.undetermined,
+        directions=result.directions,
+        by_run=result.by_run,
+        command_line=command,
+    )
+
+
+def print_result(result: Identification | TwoStep) -> None:
+    """Parameters before and after, prediction errors, and what is not determined."""
+    for name in result.fitted:
+        old, new = result.before[name], result.after[name]
+        print(f"{name:32s} {old.value:11.5g} -> {new.value:11.5g} +- {new.std:.2g} {new.unit}")
+    if isinstance(result, Identification):
+        before, after = pooled_rms(result.replay_before), pooled_rms(result.replay_after)
+        moved = ", ".join(f"{c} {before[c]:.3g} -> {after[c]:.3g}" for c in after if c in before)
+        print(f"1 s prediction error on {', '.join(result.flight.run_names)}: {moved}")
+        if result.undetermined:
+            print("not determined by these flights:", ", ".join(result.undetermined))
+            print("undetermined combinations:", "; ".join(result.directions) or "each of them")
+    for remark in result.remarks:
+        print(remark)
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
     parser = command_line.parser("identify", __doc__)
     parser.add_argument("flight", type=Path, help="flight folder")
     parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
@@ -30,51 +87,7 @@ def main() -> None:
         "--hold-out", default="", metavar="RUN,RUN",
         help="runs not to fit; they are predicted before and after instead",
     )  # fmt: skip
-    options = parser.parse_args()
-
-    with command_line.progress("identification") as say:
-        result = identify(
-            options.flight,
-            options.vehicle,
-            options.method,
-            say,
-            channels=None if options.channels is None else options.channels.split(","),
-            also=[name for name in options.also.split(",") if name],
-            hold_out=[name for name in options.hold_out.split(",") if name],
-        )
-    command = "scripts/identify.py " + shlex.join(sys.argv[1:])
-    if isinstance(result, TwoStep):
-        page = report.two_step_page(result, command)
-    else:
-        page = report.identification_page(
-            result.before,
-            result.after,
-            result.fitted,
-            flight=result.flight,
-            replay_before=result.replay_before,
-            replay_after=result.replay_after,
-            remarks=result.remarks,
-            undetermined=result.undetermined,
-            directions=result.directions,
-            by_run=result.by_run,
-            command_line=command,
-        )
-    with staged_folder(options.out) as folder:
-        write_text(folder / "vehicle.toml", vehicle_toml(result.after))
-        write_text(folder / "report.html", page)
-    for name in result.fitted:
-        old, new = result.before[name], result.after[name]
-        print(f"{name:32s} {old.value:11.5g} -> {new.value:11.5g} +- {new.std:.2g} {new.unit}")
-    if not isinstance(result, TwoStep):
-        before, after = pooled_rms(result.replay_before), pooled_rms(result.replay_after)
-        moved = ", ".join(f"{c} {before[c]:.3g} -> {after[c]:.3g}" for c in after if c in before)
-        print(f"1 s prediction error on {', '.join(result.flight.run_names)}: {moved}")
-    if not isinstance(result, TwoStep) and result.undetermined:
-        print("not determined by these flights:", ", ".join(result.undetermined))
-        print("left open:", "; ".join(result.directions) or "each of them")
-    for remark in result.remarks:
-        print(remark)
-    print(f"vehicle {options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

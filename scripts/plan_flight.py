@@ -1,5 +1,6 @@
-"""Plan a flight: the maneuvers that tell most of a vehicle's numbers, safe in simulation first."""
+"""Plan a flight: maneuvers that determine a vehicle's parameters, proved safe in simulation."""
 
+import argparse
 from dataclasses import fields
 
 import command_line
@@ -20,6 +21,37 @@ LIMITS = {
 
 
 def main() -> None:
+    options = arguments()
+    envelope = Envelope(
+        **{name: getattr(options, name) * unit for name, (_, unit) in LIMITS.items()}
+    )
+
+    with command_line.progress("flight plan") as report_progress:
+        plan = plan_flight(
+            options.vehicle,
+            [name for name in options.learn.split(",") if name],
+            options.runs,
+            options.sensors,
+            envelope,
+            Gusts() if options.gusts else None,
+            options.seed,
+            report_progress,
+        )
+    folder = write_plan(plan, options.out)
+    for k, run in enumerate(plan.runs, 1):
+        print(f"{k:2d}. {run.maneuver.name}: {run.maneuver.summary} (+{run.gain:.1f} nats)")
+    for option, why in plan.refused:
+        print(f"left out: {option.name}, {option.summary}: {why}")
+    rows = [["parameter", "std now", "std after the flight", "left"]]
+    for name in plan.wanted:
+        now, then = plan.std_before[name], plan.std_after[name]
+        rows.append([name, f"{now:.3g}", f"{then:.3g}", f"{100 * then / now:.0f} %"])
+    command_line.print_columns(rows)
+    print(f"flight card {folder / 'card.toml'}, setpoints in {folder / 'asked_01.csv'} ...")
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
     parser = command_line.parser("plan_flight", __doc__, seed=True)
     parser.add_argument("--vehicle", default="lama400d", help="shipped name or TOML file")
     parser.add_argument(
@@ -37,35 +69,7 @@ def main() -> None:
             f"--{name}", type=float, default=usual[name] / unit, metavar="X",
             help=f"{what} (default: %(default).3g)",
         )  # fmt: skip
-    options = parser.parse_args()
-    envelope = Envelope(
-        **{name: getattr(options, name) * unit for name, (_, unit) in LIMITS.items()}
-    )
-
-    with command_line.progress("flight plan") as say:
-        plan = plan_flight(
-            options.vehicle,
-            [name for name in options.learn.split(",") if name],
-            options.runs,
-            options.sensors,
-            envelope,
-            Gusts() if options.gusts else None,
-            options.seed,
-            say,
-        )
-    folder = write_plan(plan, options.out)
-    for k, run in enumerate(plan.runs, 1):
-        print(f"{k:2d}. {run.maneuver.name}: {run.maneuver.summary} (+{run.gain:.1f} nats)")
-    for option, why in plan.refused:
-        print(f"left out: {option.name}, {option.summary}: {why}")
-    rows = [["to learn", "std now", "std after the flight", "left"]]
-    for name in plan.wanted:
-        now, then = plan.std_before[name], plan.std_after[name]
-        rows.append([name, f"{now:.3g}", f"{then:.3g}", f"{100 * then / now:.0f} %"])
-    command_line.print_columns(rows)
-    print(
-        f"flight card {folder / 'card.toml'}, what to hold and add in {folder / 'asked_01.csv'} ..."
-    )
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -21,8 +21,8 @@ def main() -> None:
     if not 0.05 <= options.horizon <= 60.0:
         raise InputError(f"--horizon must be between 0.05 and 60 s, found {options.horizon:g}")
 
-    with command_line.progress("replay") as say:
-        result = replay(options.flight, options.vehicle, options.horizon, say)
+    with command_line.progress("replay") as report_progress:
+        result = replay(options.flight, options.vehicle, options.horizon, report_progress)
     page = report.replay_page(result, "scripts/replay.py " + shlex.join(sys.argv[1:]))
     with staged_folder(options.out) as folder:
         write_json(folder / "replay.json", result.findings)

@@ -1,5 +1,6 @@
 """Fly maneuvers in simulation: a flight folder, a report, and the paper's doublet as a table."""
 
+import argparse
 import shlex
 import sys
 from dataclasses import replace
@@ -17,19 +18,7 @@ from coax_env.simulation.simulate import Gusts, doublet_remarks, doublet_table, 
 
 
 def main() -> None:
-    parser = command_line.parser("simulate", __doc__, seed=True)
-    parser.add_argument(
-        "--maneuver", default="lon_doublet", metavar="NAME,NAME",
-        help=f"what is flown, or all: {', '.join(MANEUVERS)} (default: %(default)s)",
-    )  # fmt: skip
-    parser.add_argument("--vehicle", default="lama400d", help="shipped name or TOML file")
-    parser.add_argument(
-        "--sensors", default="onboard", help=f"{', '.join(SUITES)} (default: %(default)s)"
-    )
-    parser.add_argument("--no-noise", action="store_true", help="log without sensor noise")
-    parser.add_argument("--gusts", action="store_true", help="fly in light gusts")
-    options = parser.parse_args()
-
+    options = arguments()
     vehicle = load_vehicle(options.vehicle)
     names = list(MANEUVERS) if options.maneuver == "all" else options.maneuver.split(",")
     gusts = Gusts() if options.gusts else None
@@ -55,6 +44,22 @@ def main() -> None:
     for track in tracks:
         print(track.maneuver.name + ":", f"{track.t[-1]:.1f} s", track.ended)
     print(f"flight {options.out / 'flight'}, report {options.out / 'report.html'}")
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
+    parser = command_line.parser("simulate", __doc__, seed=True)
+    parser.add_argument(
+        "--maneuver", default="lon_doublet", metavar="NAME,NAME",
+        help=f"what is flown, or all: {', '.join(MANEUVERS)} (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--vehicle", default="lama400d", help="shipped name or TOML file")
+    parser.add_argument(
+        "--sensors", default="onboard", help=f"{', '.join(SUITES)} (default: %(default)s)"
+    )
+    parser.add_argument("--no-noise", action="store_true", help="log without sensor noise")
+    parser.add_argument("--gusts", action="store_true", help="fly in light gusts")
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Train a hover policy with PPO on the Kalman filter's estimate. Ctrl-C keeps what is learnt."""
+"""Train a hover policy with PPO on the Kalman filter's estimate. Ctrl-C keeps the policy so far."""
 
 import argparse
 import json
@@ -20,11 +20,38 @@ from controllers import load_controller, ppo
 from controllers.evaluation import evaluate
 
 FLIGHTS = 100
-CHOSEN_ON, JUDGED_ON = 10_000, 20_000
-"""First seeds of the flights on which the best policy is chosen, and on which it is then judged."""
+SELECTION_SEED, TEST_SEED = 10_000, 20_000
+"""First seeds of the flights on which the best policy is selected, and on which it is then scored."""
 
 
 def main() -> None:
+    options = arguments()
+    if options.seeds < 1:
+        raise InputError(f"need at least one seed, found {options.seeds}")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
+
+    vehicle = load_vehicle(options.vehicle)
+    training: dict[str, Any] = {
+        "steps": round(options.steps), "nominal": options.nominal, "sensors": options.sensors,
+        "resume": options.resume, "tensorboard": options.tensorboard,
+        "command_line": shlex.join(["scripts/train_ppo.py", *sys.argv[1:]]),
+        "settings": dict(setting(text) for text in options.set),
+    }  # fmt: skip
+    if options.randomize:
+        training["randomize"] = options.randomize
+    if options.seeds == 1:
+        path = train_one(vehicle, options, training)
+        score = score_of(path, vehicle, SELECTION_SEED + options.seed)
+    else:
+        path = train_several(vehicle, options, training)
+        score = score_of(path, vehicle, TEST_SEED + options.seed)
+    write_json(options.out / "score.json", score)
+    print(in_words(score))
+    print(f"policy {path}, score {options.out / 'score.json'}")
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
     parser = command_line.parser("train_ppo", __doc__, seed=True)
     parser.add_argument("--vehicle", default="lama400d", help="shipped name or TOML file")
     parser.add_argument("--nominal", help="vehicle whose trim centres the action (default: bare)")
@@ -48,33 +75,17 @@ def main() -> None:
         help="policies from seed, seed + 1, ...: DIR/seed_K each, the best in DIR (default: 1)",
     )  # fmt: skip
     command_line.add_workers(parser, "seeds", 1)
-    options = parser.parse_args()
-    if options.seeds < 1:
-        raise InputError(f"need at least one seed, found {options.seeds}")
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
-
-    vehicle = load_vehicle(options.vehicle)
-    training: dict[str, Any] = {
-        "steps": round(options.steps), "nominal": options.nominal, "sensors": options.sensors,
-        "resume": options.resume, "tensorboard": options.tensorboard,
-        "command_line": shlex.join(["scripts/train_ppo.py", *sys.argv[1:]]),
-        "settings": dict(setting(text) for text in options.set),
-    }  # fmt: skip
-    if options.randomize:
-        training["randomize"] = options.randomize
-    if options.seeds == 1:
-        path = train_one(vehicle, options, training)
-        score = judged(path, vehicle, CHOSEN_ON + options.seed)
-    else:
-        path = train_several(vehicle, options, training)
-        score = judged(path, vehicle, JUDGED_ON + options.seed)
-    write_json(options.out / "score.json", score)
-    print(in_words(score))
-    print(f"policy {path}, score {options.out / 'score.json'}")
+    return parser.parse_args()
 
 
 def train_one(vehicle: Vehicle, options: argparse.Namespace, training: dict[str, Any]) -> Path:
-    """DIR/policy.zip, there from the first checkpoint on."""
+    """DIR/policy.zip, there from the first checkpoint on.
+
+    Args:
+        vehicle: what flies.
+        options: of the command line.
+        training: further arguments of `ppo.train`.
+    """
     with tqdm(total=training["steps"], unit="step", unit_scale=True, disable=None) as bar:
 
         def progress(steps: int, mean: dict[str, float]) -> None:
@@ -87,24 +98,36 @@ def train_one(vehicle: Vehicle, options: argparse.Namespace, training: dict[str,
 
 
 def train_several(vehicle: Vehicle, options: argparse.Namespace, training: dict[str, Any]) -> Path:
-    """DIR/seed_K/policy.zip and score.json of every seed, and a copy of the best in DIR."""
+    """DIR/seed_K/policy.zip and score.json of every seed, and a copy of the best in DIR.
+
+    Args:
+        vehicle: what flies.
+        options: of the command line.
+        training: further arguments of `ppo.train_seeds`.
+    """
     seeds = range(options.seed, options.seed + options.seeds)
     found: dict[int, tuple[Path, dict[str, Any]]] = {}
     trained = ppo.train_seeds(
         vehicle, options.out, seeds, options.jobs, options.backend, **training
     )
     for seed, path in tqdm(trained, total=len(seeds), unit="policy", disable=None):
-        found[seed] = path, judged(path, vehicle, CHOSEN_ON + options.seed)
+        found[seed] = path, score_of(path, vehicle, SELECTION_SEED + options.seed)
         write_json(path.with_name("score.json"), found[seed][1])
     for seed in seeds:
         print(f"seed {seed}: {in_words(found[seed][1])}")
     best = min(seeds, key=lambda s: (-found[s][1]["success_rate"], found[s][1]["mean_cost"]))
-    print(f"the best, seed {best}, on flights that it was not chosen on:")
+    print(f"the best, seed {best}, on flights that it was not selected on:")
     return write_bytes(options.out / "policy.zip", found[best][0].read_bytes())
 
 
-def judged(path: Path, vehicle: Vehicle, seed: int) -> dict[str, Any]:
-    """The score of a policy."""
+def score_of(path: Path, vehicle: Vehicle, seed: int) -> dict[str, Any]:
+    """The score of a policy.
+
+    Args:
+        path: of its policy.zip.
+        vehicle: what is flown.
+        seed: of the first flight.
+    """
     return evaluate(load_controller(path), vehicle, episodes=FLIGHTS, seed=seed)
 
 

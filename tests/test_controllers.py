@@ -19,7 +19,16 @@ from coax_env.env.fleet import DT
 from coax_env.errors import InputError
 from coax_env.model.dynamics import WORK_SIZE, kernel_input, step
 from coax_env.model.linear import sampled
-from controllers import comparison, load_controller, lqr, mended, pid, policy, state_feedback
+from controllers import (
+    comparison,
+    load_controller,
+    lqr,
+    margins,
+    model_comparison,
+    pid,
+    policy,
+    state_feedback,
+)
 from controllers.estimator import Tracker, design_estimator, integrated_readings
 from controllers.evaluation import evaluate, evaluate_spread
 from controllers.loading import make_controller
@@ -84,19 +93,19 @@ def test_the_regulators_weights_are_the_cost_every_controller_is_judged_by(exact
 def test_the_closed_loop_is_stable_and_has_the_margins_it_states(onboard):
     import control
 
-    loop = lqr.loop(onboard)
-    margins, disk = lqr.margins(onboard)
+    loop = margins.open_loop(onboard)
+    inputs, disk = margins.stability_margins(onboard)
 
     def stable(gains):
         closed = control.feedback(loop * control.ss([], [], [], np.diag(gains), DT), np.eye(4))
         return bool(np.abs(closed.poles()).max() < 1.0)
 
-    for k, one in enumerate(margins):
+    for k, one in enumerate(inputs):
         for factor in (1.0, 0.95, 1.05):
             gains = np.ones(4)
             gains[k] = one.gain_up * factor if factor != 1.0 else 1.0
             assert stable(gains) is (factor <= 1.0), one.input
-    assert min(m.phase_deg for m in margins) > 35.0 and disk > 0.5
+    assert min(m.phase_deg for m in inputs) > 35.0 and disk > 0.5
     factor = (2.0 - 0.99 * disk) / (2.0 + 0.99 * disk)
     rng = np.random.default_rng(0)
     for _ in range(8):  # any mix of gains inside the disk margin leaves it stable
@@ -106,9 +115,9 @@ def test_the_closed_loop_is_stable_and_has_the_margins_it_states(onboard):
 @pytest.mark.slow
 def test_margins_on_a_vehicle_without_spread_are_those_of_the_design(onboard):
     exact = LAMA.with_parameters({n: replace(p, std=0.0) for n, p in LAMA.parameters.items()})
-    _, disk = lqr.margins(onboard)
-    assert lqr.margins_over_spread(onboard, exact, draws=1) == pytest.approx([disk], rel=1e-6)
-    drawn = lqr.margins_over_spread(onboard, LAMA, draws=2)
+    _, disk = margins.stability_margins(onboard)
+    assert margins.margins_over_spread(onboard, exact, draws=1) == pytest.approx([disk], rel=1e-6)
+    drawn = margins.margins_over_spread(onboard, LAMA, draws=2)
     assert len(set(drawn)) == 2 and drawn.min() > 0.3
 
 
@@ -210,11 +219,11 @@ def test_what_the_design_did_not_know_is_integrated_away(onboard, effects):
     assert score["success_but_drift_rate"] == 1.0
 
 
-def test_a_design_on_the_mended_model_flies_a_lagging_machine_better(onboard):
+def test_a_design_on_the_corrected_model_flies_a_lagging_machine_better(onboard):
     late = LAMA.with_effect("motor_lag", upper=0.1, lower=0.1).with_effect("servo_lag", time=0.04)
     bare = evaluate(onboard, late, episodes=10, seconds=10.0)
-    mended = evaluate(lqr.design(late), late, episodes=10, seconds=10.0)
-    assert mended["mean_cost"] < 0.5 * bare["mean_cost"]
+    corrected = evaluate(lqr.design(late), late, episodes=10, seconds=10.0)
+    assert corrected["mean_cost"] < 0.5 * bare["mean_cost"]
 
 
 def test_one_flight_or_a_batch_get_the_same_actions(onboard):
@@ -461,11 +470,11 @@ def test_controllers_come_by_name_and_from_their_files(name, tmp_path):
 
 @pytest.mark.slow
 def test_a_design_on_the_diagnosed_model_halves_the_cost_of_flying_the_machine():
-    content, _, controllers = mended.compare_models(episodes=5)
+    content, _, controllers = model_comparison.compare_models(episodes=5)
     assert content["hidden"] == ["motor_lag", "rotor_drag", "torque_balance"]
     assert {"motor_lag", "rotor_drag"} <= set(content["found"])
     assert content["cost_ratio"]["lqg"] > 2.0
-    before, after = (controllers[f"lqg {model}"] for model in mended.MODELS)
+    before, after = (controllers[f"lqg {model}"] for model in model_comparison.MODELS)
     assert np.array_equal(before.nominal[0], after.nominal[0])  # no trim is given away
     json.dumps(content, allow_nan=False)
 
@@ -574,10 +583,10 @@ def _with_version(path, version):
 @pytest.mark.slow
 def test_ppo_hands_each_env_its_own_end(tmp_path):
     pytest.importorskip("stable_baselines3")
-    from controllers.ppo import hover_vec_env
+    from controllers.hover_vec_env import HoverVecEnv
 
     design = design_estimator(LAMA)
-    env = hover_vec_env(LAMA, design, 3, episode_s=0.3)
+    env = HoverVecEnv(LAMA, design, 3, episode_s=0.3)
     env.seed(4)
     env.reset()
     ends = 0
@@ -616,10 +625,10 @@ def test_ppo_trains_saves_resumes_and_is_judged(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_held_action_earns_the_sum_of_its_periods_and_ends_in_its_own_flight():
     pytest.importorskip("stable_baselines3")
-    from controllers.ppo import hover_vec_env
+    from controllers.hover_vec_env import HoverVecEnv
 
     design = design_estimator(LAMA)
-    held, each = (hover_vec_env(LAMA, design, 2, episode_s=0.1, hold=k) for k in (4, 1))
+    held, each = (HoverVecEnv(LAMA, design, 2, episode_s=0.1, hold=k) for k in (4, 1))
     for env in (held, each):
         env.seed(3)
         env.reset()

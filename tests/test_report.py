@@ -20,7 +20,7 @@ from coax_env.identification.maximum_likelihood import RunEstimate
 from coax_env.model import effects
 from coax_env.model.layout import STATES
 from coax_env.model.vehicle import Parameter
-from coax_env.report import consequences, figures
+from coax_env.report import consequences, figures, fit_figures, plot_style
 from coax_env.report.flight_view import flight_view
 from coax_env.report.page import figure, inline, table
 from coax_env.simulation import simulate as sim
@@ -149,8 +149,8 @@ def score(cost):
     }  # fmt: skip
 
 
-FLOWN = report.FlownControllers(
-    {"bare": score(1.75), "extended": score(0.5)}, "the machine itself", "An LQG of each."
+SCORES = report.ControllerScores(
+    {"bare": score(1.75), "corrected": score(0.5)}, "the machine itself", "An LQG of each."
 )
 
 
@@ -158,7 +158,7 @@ FLOWN = report.FlownControllers(
 def made(tmp_path_factory):
     """What scripts/diagnose.py writes for the diagnosis above, its controllers flown."""
     out = tmp_path_factory.mktemp("report") / "out"
-    diagnose_script.save(diagnosis(), out, "scripts/diagnose.py <flight>", FLOWN)
+    diagnose_script.save(diagnosis(), out, "scripts/diagnose.py <flight>", SCORES)
     return out
 
 
@@ -167,23 +167,24 @@ def test_diagnosis_page_says_what_was_found(made):
     text = Outline(page).text
     for words in (
         "Ground effect and axial damping explain what the simulation got wrong",
-        "71 % of the error of a 1 s prediction is gone on runs that the fit has not seen",
+        "71 % of the error of a 1 s prediction is gone on runs held out of the fit",
         "66 to 75 %, 95 % interval",
-        "0 %by refitting alone",
-        "46 %by a black boxof 270 generic terms",
+        "0 % by refitting alone",
+        "46 % by a black box of 270 generic terms",
         "Two runs of a lama400d",
         "the bare model misses height by 0.21 m (4.2 times the sensor's noise)",
         "+6.2 % (5.1 to 7.4) thrust at 0.25 m",
         "16 sigma, 123 nats",
-        "These flights cannot tell it from airframe drag",
-        "Cannot be mistaken for another effect",
-        "Axial damping cannot be told from airframe drag",
-        "Fly next: climb descend. It parts axial damping and airframe drag: W.",
-        "false cause through in 1 % of them",
-        "Nothing beyond noise and gusts is left",
+        "These flights cannot distinguish it from airframe drag",
+        "No other effect fits these flights equally well",
+        "Axial damping or airframe drag",
+        "5 nats are odds of 150 to 1",
+        "Fly next: climb descend. It separates axial damping and airframe drag: W.",
+        "a cause is named in 1 % of them",
+        "nothing but noise and gusts is left",
         "outliers in h removed: 12",
         "Flown on the machine itself, 20 flights of 20 s each",
-        "95 % with the bare model's and 95 % with the extended model's",
+        "95 % with the bare model's and 95 % with the corrected model's",
         "scripts/diagnose.py <flight>",
         "axial damping -> rotor drag",
     ):
@@ -381,8 +382,8 @@ def test_the_reader_chooses_light_or_dark(seen):
         grounds.append(sum(map(int, re.findall(r"\d+", seen[screen]["ground"])[:3])))
         inks.append({p["ink"] for p in seen[screen]["plots"]})
     assert grounds[0] > 700 and grounds[1] < 150 and grounds[2] > 700  # paper is white
-    assert inks[0] == inks[2] == {figures.template(False)["layout"]["font"]["color"]}
-    assert inks[1] == {figures.template(True)["layout"]["font"]["color"]}
+    assert inks[0] == inks[2] == {plot_style.plotly_template(False)["layout"]["font"]["color"]}
+    assert inks[1] == {plot_style.plotly_template(True)["layout"]["font"]["color"]}
 
 
 @pytest.mark.slow
@@ -407,7 +408,7 @@ def test_the_flight_is_replayed(seen):
     assert {n.split(" ")[0] for n in names} == {"hover", "low_hover"}
     assert "low_hover (held out of the fit)" in names and len(set(pictures)) == 2
     for text in words:
-        assert re.fullmatch(r"bare [\d.]+ m off, extended [\d.]+ m off", text)
+        assert re.fullmatch(r"bare [\d.]+ m off, corrected [\d.]+ m off", text)
 
 
 @pytest.mark.slow
@@ -455,7 +456,7 @@ def test_numbers_that_are_missing_do_not_break_the_page():
     result.findings["gain"] |= {"error_removed_percent": None, "ci95": [None, None]}
     nothing = replays(result.flight, np.nan, diverged=True)
     result = replace(result, replay_before=nothing, innovations_after={}, whiteness={})
-    assert "runs away in" in Outline(report.diagnosis_page(result)).text
+    assert "diverges in" in Outline(report.diagnosis_page(result)).text
 
 
 def test_simulation_page():
@@ -503,7 +504,7 @@ def test_two_step_page(two_steps):
     assert not outline.external and len(page.encode()) < 5e6
     text = " ".join(outline.text.split())
     assert "The paper's two steps on 1 run of lama400d" in text
-    assert "1 number found" in text and "Table VIII examined" in text
+    assert "1 parameter found" in text and "Table VIII examined" in text
     assert "C_m, α_l" in text and "hardly moves" in text
     assert "delta_lon" not in text.split("Longitudinal force")[1].split("Step 1")[0]
     moment = two_steps.modes[2].completed
@@ -524,39 +525,37 @@ def usual(name, side=1.0):
 
 @pytest.mark.parametrize("name", list(effects.CATALOGUE))
 def test_every_effect_reads_well(name):
-    """A number with its unit and interval, what it does, how sure that is: in one sentence."""
+    """What it does, with a number, its unit and interval."""
     parameters = effects.CATALOGUE[name].parameters
     for side in (1.0, -1.0):
         if side < 0.0 and any(p.lower > p.off - p.usual for p in parameters):
             continue
-        words = consequences.sentence(usual(name, side), LAMA, LAMA)
-        assert words.startswith(plain_words.title(name) + ": ")
-        assert words.endswith("; 16 sigma; cannot be mistaken on these flights.")
+        words = consequences.described(usual(name, side), LAMA, LAMA)
         assert "nan" not in words and "_" not in words and "inf" not in words
         number = r"[+−]?\d[\d.]*( ?(%|°|°/s|°/s²|ms|s|g|mm|m/s|m/s²))? \([−\d.]+ to [−\d.]+\)"
         assert re.search(number, words), words
-        assert len(words.split("; ")[0].split(" ")) > 8, words
+        assert len(words.split(" ")) > 6, words
     assert not consequences.outside_usual(name, {p.name: p.off for p in parameters})
 
 
 def stated(name, **values):
     """The numbers of an effect, in the catalogue's order."""
     size = len(values)
-    told = consequences.consequences(name, values, np.zeros((size, size)), LAMA)
-    return [s.value for s in told]
+    found = consequences.consequences(name, values, np.zeros((size, size)), LAMA)
+    return [c.value for c in found]
 
 
 AT_HOVER = [
-    ("torque_balance", {"scale": 0.05}, {}, "r", lambda told: -np.radians(told[1])),
-    ("ground_effect", {"gain": 0.3}, {"z": -0.25}, "w", lambda told: -9.804 * told[0] / 100),
-    ("ground_effect", {"gain": 0.3}, {"z": -0.5}, "w", lambda told: -9.804 * told[1] / 100),
-    ("axial_damping", {"coefficient": 0.1}, {"w": -1.0}, "w", lambda told: -9.804 * told[0] / 100),
-    ("rotor_drag", {"coefficient": 4e-4}, {"u": 1.0}, "u", lambda told: -told[0]),
-    ("airframe_drag", {"area_x": 0.02}, {"u": 3.0}, "u", lambda told: -told[0]),
-    ("airframe_drag", {"area_y": 0.01}, {"v": 3.0}, "v", lambda told: -told[1]),
-    ("yaw_damping", {"coefficient": 4e-3}, {"r": np.pi / 2}, "r", lambda told: -np.radians(told[0])),
-    ("rate_damping", {"coefficient": 4e-3}, {"p": np.pi / 2}, "p", lambda told: -np.radians(told[0])),
-    ("rate_damping", {"coefficient": 4e-3}, {"q": np.pi / 2}, "q", lambda told: -np.radians(told[1])),
+    ("torque_balance", {"scale": 0.05}, {}, "r", lambda found: -np.radians(found[1])),
+    ("ground_effect", {"gain": 0.3}, {"z": -0.25}, "w", lambda found: -9.804 * found[0] / 100),
+    ("ground_effect", {"gain": 0.3}, {"z": -0.5}, "w", lambda found: -9.804 * found[1] / 100),
+    ("axial_damping", {"coefficient": 0.1}, {"w": -1.0}, "w", lambda found: -9.804 * found[0] / 100),
+    ("rotor_drag", {"coefficient": 4e-4}, {"u": 1.0}, "u", lambda found: -found[0]),
+    ("airframe_drag", {"area_x": 0.02}, {"u": 3.0}, "u", lambda found: -found[0]),
+    ("airframe_drag", {"area_y": 0.01}, {"v": 3.0}, "v", lambda found: -found[1]),
+    ("yaw_damping", {"coefficient": 4e-3}, {"r": np.pi / 2}, "r", lambda found: -np.radians(found[0])),
+    ("rate_damping", {"coefficient": 4e-3}, {"p": np.pi / 2}, "p", lambda found: -np.radians(found[0])),
+    ("rate_damping", {"coefficient": 4e-3}, {"q": np.pi / 2}, "q", lambda found: -np.radians(found[1])),
 ]  # fmt: skip
 
 
@@ -585,11 +584,13 @@ def test_intervals_hold_what_the_covariance_says():
     """Against draws: 95 % of what the parameters' spread makes of a consequence."""
     values = {"gain": 0.5, "decay": 2.0}
     covariance = np.array([[0.02**2, 0.7 * 0.02 * 0.1], [0.7 * 0.02 * 0.1, 0.1**2]])
-    told = consequences.consequences("ground_effect", values, covariance, LAMA)[0]
+    found = consequences.consequences("ground_effect", values, covariance, LAMA)[0]
     draws = np.random.default_rng(0).multivariate_normal(list(values.values()), covariance, 20_000)
     rises = 100.0 * draws[:, 0] * np.exp(-draws[:, 1] * 0.25 / 0.25)
     low, high = np.percentile(rises, [2.5, 97.5])
-    assert (told.value - told.half, told.value + told.half) == pytest.approx((low, high), rel=0.03)
+    assert (found.value - found.half_width, found.value + found.half_width) == pytest.approx(
+        (low, high), rel=0.03
+    )
 
 
 def test_a_cause_s_interval_knows_its_correlation():
@@ -606,11 +607,11 @@ def test_a_cause_s_interval_knows_its_correlation():
 
 
 def test_what_an_interval_cannot_tell_from_zero_is_not_said():
-    words = consequences.told(finding("gyro_bias", x=1e-5, y=-0.012, z=0.0), LAMA, LAMA)
+    words = consequences.described(finding("gyro_bias", x=1e-5, y=-0.012, z=0.0), LAMA, LAMA)
     cause = finding("gyro_bias", x=1e-5, y=-0.012, z=0.0)
     cause["parameters"]["gyro_bias.x"]["std"] = 3e-4
     assert "roll" in words
-    words = consequences.told(cause, LAMA, LAMA)
+    words = consequences.described(cause, LAMA, LAMA)
     assert words == "the pitch gyro reads 0.69°/s (0.63 to 0.74) too low"
 
 
@@ -638,9 +639,9 @@ def test_simulations_start_on_the_measured_path(pushed):
 def test_the_true_model_stays_and_the_bare_one_leaves(pushed):
     _, _, paths = pushed
     ends = np.flatnonzero(paths[1].begins)[1:] - 1
-    bare, true = (paths[1].astray(m)[ends].mean() for m in ("bare", "true"))
+    bare, true = (paths[1].position_error(m)[ends].mean() for m in ("bare", "true"))
     assert bare > 3.0 * true and true < 0.3
-    assert paths[1].parted().max() > 0.3 and np.isfinite(paths[1].parted()).all()
+    assert paths[1].error_removed().max() > 0.3 and np.isfinite(paths[1].error_removed()).all()
 
 
 def test_the_measured_path_is_the_flight_s(pushed):
@@ -697,13 +698,15 @@ def test_rolling_rms_and_autocorrelation():
     t = np.arange(0.0, 100.0, 0.01)
     white = rng.standard_normal(len(t))
     white[::7] = np.nan
-    level = figures.rolling_rms(t, 2.0 * white, np.array([20.0, 50.0]), 20.0)
+    level = fit_figures.rolling_rms(t, 2.0 * white, np.array([20.0, 50.0]), 20.0)
     np.testing.assert_allclose(level, 2.0, rtol=0.1)
-    assert np.isnan(figures.rolling_rms(t, np.full(len(t), np.nan), t[:3], 1.0)).all()
+    assert np.isnan(fit_figures.rolling_rms(t, np.full(len(t), np.nan), t[:3], 1.0)).all()
     red = np.zeros(len(t))
     for k in range(1, len(t)):
         red[k] = 0.8 * red[k - 1] + rng.standard_normal()
-    np.testing.assert_allclose(figures.autocorrelation(red, 3), [1, 0.8, 0.64, 0.512], atol=0.06)
+    np.testing.assert_allclose(
+        fit_figures.autocorrelation(red, 3), [1, 0.8, 0.64, 0.512], atol=0.06
+    )
 
 
 def test_figures_are_plotly_figures():
@@ -714,10 +717,12 @@ def test_figures_are_plotly_figures():
         figures.plan_view(t, t, t),
         figures.prediction("h", (t, t), {"before": (t, t, 0 * t), "after": (t, t, t)}, 0.1),
         figures.gain_bars({"h": entry(0.2, 0.1, "m")}),
-        figures.innovations(t, np.sin(9 * t), np.cos(9 * t)),
-        figures.whiteness_bars({"h": (0.3, 0.01)}, 0.04),
-        figures.evidence_steps([("+ a", 3.0)]),
-        figures.parameter_moves({"mass": (1.0, 0.5)}),
+        fit_figures.innovations(t, np.sin(9 * t), np.cos(9 * t)),
+        fit_figures.whiteness_bars({"h": (0.3, 0.01)}, 0.04),
+        fit_figures.evidence_steps([("+ a", 3.0)]),
+        fit_figures.parameter_moves({"mass": (1.0, 0.5)}),
         figures.heat_map(["a"], ["b"], np.ones((1, 1)), [["1"]], "x", log=True),
     ):
-        go.Figure(fig).update_layout(template=figures.template())  # validates every property
+        go.Figure(fig).update_layout(
+            template=plot_style.plotly_template()
+        )  # validates every property

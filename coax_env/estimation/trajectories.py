@@ -37,13 +37,13 @@ class Trajectory:
     measured: np.ndarray
     simulated: Mapping[str, np.ndarray]
 
-    def astray(self, model: str) -> np.ndarray:
+    def position_error(self, model: str) -> np.ndarray:
         """Distance of a simulation from the measured path [m], (n,)."""
         return np.linalg.norm(self.simulated[model][:, :3] - self.measured[:, :3], axis=1)
 
-    def parted(self) -> np.ndarray:
-        """How much farther astray the first simulation is than the last of several [m], (n,)."""
-        first, *others = (np.nan_to_num(self.astray(model)) for model in self.simulated)
+    def error_removed(self) -> np.ndarray:
+        """How much smaller the last simulation's position error is than the first's [m], (n,)."""
+        first, *others = (np.nan_to_num(self.position_error(model)) for model in self.simulated)
         return first - others[-1] if others else first
 
 

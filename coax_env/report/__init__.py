@@ -1,16 +1,16 @@
-"""Reports: results as self-contained pages, the verdict first (page.py makes the HTML)."""
+"""Reports: results as self-contained pages, the verdict first; templates/ has their HTML."""
 
 from coax_env.report.diagnosis import diagnosis_page, headline, lead
+from coax_env.report.gain import ControllerScores
 from coax_env.report.identification import identification_page
 from coax_env.report.page import Section, page
 from coax_env.report.replay import replay_page
 from coax_env.report.simulation import DOUBLET_HEADER, doublet_rows, simulation_page
 from coax_env.report.two_step import two_step_page
-from coax_env.report.worth import FlownControllers
 
 __all__ = [
     "DOUBLET_HEADER",
-    "FlownControllers",
+    "ControllerScores",
     "Section",
     "diagnosis_page",
     "doublet_rows",

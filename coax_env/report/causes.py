@@ -1,4 +1,4 @@
-"""The causes on a page: each as a sentence with its number, interval and evidence; look-alikes."""
+"""The causes on a page: each with its size in words, interval, evidence and alternatives."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,57 +14,76 @@ from coax_env.plain_words import (
     title,
     unit_name,
 )
-from coax_env.report.consequences import NORMAL_95, outside_usual, sigmas, told
-from coax_env.report.page import Markup, bullets, callout, card, cards, datum, numbers_table, prose
+from coax_env.report.consequences import NORMAL_95, described, outside_usual, sigmas
+from coax_env.report.page import (
+    Markup,
+    bullets,
+    callout,
+    card,
+    cards,
+    datum,
+    folded_table,
+    inline,
+    prose,
+)
 
 Findings = Mapping[str, Any]
 
 
-def cause_blocks(findings: Findings, before: Vehicle, after: Vehicle) -> list[str]:
+def cause_blocks(findings: Findings, bare: Vehicle, corrected: Vehicle) -> list[str]:
     """Every cause in words, strongest first, and all its numbers.
 
-    before, after: the vehicle as given and the extended one.
+    Args:
+        findings: as in findings.json.
+        bare: the vehicle as given.
+        corrected: the vehicle with the causes in it.
     """
     causes = findings["causes"]
     alarms = prose(_false_alarms(findings.get("false_alarm_rate")))
     if not causes:
-        nothing = prose("Nothing that these flights can show: no effect of the catalogue is named.")
+        nothing = prose("No effect of the catalogue is named: these flights show none.")
         return [nothing, alarms]
     rows = [row for k, cause in enumerate(causes) for row in _rows(k, cause)]
     header = ["parameter", "value", "std", "95 % interval", "unit", "usual size"]
     return [
-        cards(_card(k, cause, before, after) for k, cause in enumerate(causes)),
         prose(
-            "In brackets: 95 % intervals. Sigma: the evidence (in nats, of the likelihood) as if it "
-            "were that of one number so many standard deviations from zero."
+            "In brackets: 95 % intervals. Evidence is the gain in log-likelihood over the best model "
+            "without the cause, in nats: 5 nats are odds of 150 to 1. In sigma it is that of one "
+            "number so many standard deviations from zero."
         ),
-        numbers_table("The numbers behind the sentences", header, rows),
+        cards(_card(k, cause, bare, corrected) for k, cause in enumerate(causes)),
+        folded_table("The parameters in numbers", header, rows),
         alarms,
     ]
 
 
-def _card(place: int, cause: Mapping[str, Any], before: Vehicle, after: Vehicle) -> str:
-    effect, twins = cause["effect"], cause["confusable_with"]
-    entry = effects.CATALOGUE.get(effect)
-    odd = entry is not None and outside_usual(effect, _values(cause))
-    evidence = cause["evidence"]
-    nats = datum(f"{number(evidence)} nats", f"causes/{place}/evidence", evidence)
-    doubt = (
-        f"**These flights cannot tell it from {and_list([plain(t) for t in twins])}.**"
-        if twins
-        else "Cannot be mistaken for another effect on these flights."
-    )
-    if odd:
-        doubt += " **Its size is outside the usual range: take the name with care.**"
+def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicle) -> str:
+    effect, alternatives = cause["effect"], cause["confusable_with"]
+    unusual = effect in effects.CATALOGUE and outside_usual(effect, _values(cause))
+    lines = [
+        f"**These flights cannot distinguish it from {_plain_list(alternatives)}.**"
+        if alternatives
+        else "No other effect fits these flights equally well."
+    ]
+    if unusual:
+        lines.append("**Its size is outside the usual range: the name is doubtful.**")
     if cause["channels"]:
-        doubt += f" Showed in {and_list([channel_name(c) for c in cause['channels']])}."
+        lines.append(f"Seen in {and_list([channel_name(c) for c in cause['channels']])}.")
+    evidence = cause["evidence"]
+    nats = datum(f"{number(evidence)} nats", f"causes/{index}/evidence", evidence)
     return card(
         title(effect),
-        capital(told(cause, before, after) or "An effect of your own, see the numbers below."),
-        [doubt],
-        badge=Markup(f"{sigmas(evidence):.0f} sigma, {nats}"),
-        kind="warning" if twins or odd else "",
+        capital(
+            described(cause, bare, corrected) or "An effect of your own, see the numbers below."
+        ),
+        [" ".join(lines)],
+        badge=Markup(f"{inline(f'{sigmas(evidence):.0f} sigma')}, {nats}"),
+        kind="warning" if alternatives or unusual else "",
     )
+
+
+def _plain_list(names: list[str]) -> str:
+    return and_list([plain(name) for name in names])
 
 
 def _values(cause: Mapping[str, Any]) -> dict[str, float]:
@@ -72,19 +91,19 @@ def _values(cause: Mapping[str, Any]) -> dict[str, float]:
     return {name.rpartition(".")[2]: p["value"] for name, p in cause["parameters"].items()}
 
 
-def _rows(place: int, cause: Mapping[str, Any]) -> list[list[str]]:
+def _rows(index: int, cause: Mapping[str, Any]) -> list[list[str]]:
     """A cause's parameters in a table."""
     entry = effects.CATALOGUE.get(cause["effect"])
     usual = {f"{entry.name}.{p.name}": p.usual for p in entry.parameters} if entry else {}
     result = []
     for name, p in cause["parameters"].items():
-        where, value, std = f"causes/{place}/parameters/{name}", p["value"], p["std"]
+        place, value, std = f"causes/{index}/parameters/{name}", p["value"], p["std"]
         ends = [number(value + side * NORMAL_95 * std) for side in (-1.0, 1.0)]
         result.append(
             [
                 capital(plain(name)),
-                datum(number(value), f"{where}/value", value),
-                datum(number(std, 2), f"{where}/std", std),
+                datum(number(value), f"{place}/value", value),
+                datum(number(std, 2), f"{place}/std", std),
                 " to ".join(ends),
                 unit_name(p["unit"]) or "1",
                 number(usual.get(name), 2),
@@ -93,34 +112,33 @@ def _rows(place: int, cause: Mapping[str, Any]) -> list[list[str]]:
     return result
 
 
-def look_alike_blocks(findings: Findings) -> list[str]:
-    """What these flights cannot tell apart, and the maneuver that would."""
-    tied = [c for c in findings["causes"] if c["confusable_with"]]
+def confounding_blocks(findings: Findings) -> list[str]:
+    """The confounded alternatives of the causes, and the maneuver that would separate them."""
+    confounded = [c for c in findings["causes"] if c["confusable_with"]]
     following = findings.get("next_maneuver")
-    blocks = []
-    if tied:
-        blocks.append(
+    blocks: list[str] = []
+    if confounded:
+        blocks += [
+            prose("Effects that would fit these flights about as well as the cause named:"),
             bullets(
-                f"**{title(c['effect'])}** cannot be told from "
-                f"{and_list([plain(t) for t in c['confusable_with']])} on these flights."
-                for c in tied
-            )
-        )
+                f"**{title(c['effect'])}** or {_plain_list(c['confusable_with'])}"
+                for c in confounded
+            ),
+        ]
     elif findings["causes"]:
         blocks.append(
-            callout("Every cause named here stands alone: nothing else would do.", "good")
+            callout("None: no other effect fits these flights as well as the causes named.", "good")
         )
     if following:
-        parted = and_list([plain(s) for s in following["separates"]])
         blocks.append(
             callout(
-                f"**Fly next: {plain(following['maneuver'])}.** It parts {parted}: "
-                f"{following['why'].rstrip('.')}."
+                f"**Fly next: {plain(following['maneuver'])}.** It separates "
+                f"{_plain_list(following['separates'])}: {following['why'].rstrip('.')}."
             )
         )
-    elif tied:
+    elif confounded:
         blocks.append(
-            callout("No maneuver is known that would part them at these sensors.", "note")
+            callout("No maneuver is known that would separate them at these sensors.", "note")
         )
     return blocks
 
@@ -129,6 +147,6 @@ def _false_alarms(rate: float | None) -> str:
     if rate is None:
         return "How often a cause is named where there is none has not been calibrated yet."
     return (
-        "**False alarms.** Calibrated on clean synthetic flights: the threshold lets a false cause "
-        f"through in {100 * rate:.2g} % of them."
+        "**False alarms.** The threshold is calibrated on synthetic flights without any effect: a "
+        f"cause is named in {100 * rate:.2g} % of them."
     )

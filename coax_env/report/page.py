@@ -1,8 +1,9 @@
 """One self-contained HTML page from blocks: prose, tables, figures, callouts, cards.
 
-Blocks are HTML text. Figures travel as JSON and are drawn by one script with plotly.js, which is in
-the page once, packed; without figures it is left out. Readable on a phone and on paper, light and
-dark. A number that a file holds too can be marked with its place there (`datum`).
+The HTML stands in templates/ (Jinja2, everything escaped that is not HTML already); here is what is
+computed for it. Figures travel as JSON and are drawn by one script with plotly.js, which is in the
+page once, packed; without figures it is left out. Readable on a phone and on paper, light and dark.
+A number that a file holds too can be marked with its place there (`datum`).
 """
 
 import base64
@@ -17,12 +18,20 @@ from importlib import resources
 from typing import Any
 
 from coax_env.errors import require
-from coax_env.report.figures import Figure, template
+from coax_env.report.plot_style import Figure, plotly_template
+
+
+class Markup(str):
+    """Text that is HTML already."""
+
+    def __html__(self) -> str:
+        """As Jinja2 asks for it."""
+        return self
 
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and the blocks under it."""
+    """A heading and the blocks under it, HTML each."""
 
     title: str
     blocks: Sequence[str]
@@ -35,151 +44,142 @@ def page(
 
     Args:
         title: of the page, the verdict if there is one.
-        lead: sentences that say it all; plain text.
+        lead: sentences that summarise it; plain text.
+        sections: in order; each gets an entry in the page's navigation.
         kicker: a short line above the title: what this is about.
         top: a block under the lead.
     """
-    parts = list(sections)
-    links = "".join(f'<a href="#{_anchor(s.title)}">{escape(s.title)}</a>' for s in parts)
-    body = "".join(
-        f'<section id="{_anchor(s.title)}"><h2>{escape(s.title)}</h2>{"".join(s.blocks)}</section>'
-        for s in parts
-    )
-    sentences = "".join(f"<p>{inline(s)}</p>" for s in lead)
-    above = f'<p class="kicker">{escape(kicker)}</p>' if kicker else ""
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{_file('page.css')}</style></head><body><main>"
-        f'<header>{above}<h1>{escape(title)}</h1><div class="lead">{sentences}</div>{top}</header>'
-        f"<nav>{links}</nav>{body}</main>{_scripts(body)}</body></html>\n"
-    )
+    sections = list(sections)
+    body = "".join(block for section in sections for block in section.blocks)
+    template = _templates().get_template("page.html")
+    text = template.render(
+        title=title, lead=lead, sections=sections, kicker=kicker, top=top,
+        style=_file("page.css"), scripts=_scripts(body),
+    )  # fmt: skip
+    return f"{text}\n"
 
 
-def _anchor(title: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+# --- text -----------------------------------------------------------------------------------------
 
 
-class Markup(str):
-    """Text that is HTML already."""
-
-
-def inline(text: str) -> str:
+def inline(text: str) -> Markup:
     """Plain text as HTML; ``**words**`` become bold and ```words``` code. Markup stays as it is."""
     if isinstance(text, Markup):
         return text
-    safe = _UNBROKEN.sub("\\1\u00a0\\2", escape(text))
+    safe = _NUMBER_AND_UNIT.sub("\\1\u00a0\\2", escape(text))
     safe = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)
-    return re.sub(r"`(.+?)`", r"<code>\1</code>", safe)
+    return Markup(re.sub(r"`(.+?)`", r"<code>\1</code>", safe))
 
 
-_UNBROKEN = re.compile(r"(\d) ((?:%|m/s²?|mm|ms|mN|N|rpm|nats|deg|kg|g|s|m)(?![\w]))")
+_NUMBER_AND_UNIT = re.compile(r"(\d) ((?:%|m/s²?|mm|ms|mN|N|rpm|nats|deg|kg|g|s|m|cm|rad)(?![\w]))")
+"""Not to be parted at the end of a line."""
 
 
-def prose(text: str) -> str:
+def prose(text: str) -> Markup:
     """Paragraphs, parted by empty lines."""
-    return "".join(f"<p>{inline(' '.join(p.split()))}</p>" for p in text.split("\n\n") if p.strip())
+    return _block("prose", [" ".join(p.split()) for p in text.split("\n\n") if p.strip()])
 
 
-def bullets(items: Iterable[str]) -> str:
+def bullets(items: Iterable[str]) -> Markup:
     """A list."""
-    return "<ul>" + "".join(f"<li>{inline(item)}</li>" for item in items) + "</ul>"
+    return _block("bullets", items)
 
 
 def datum(text: str, place: str, value: float | None) -> Markup:
     """A number in words, marked with its exact value and its place in findings.json.
 
     Args:
+        text: the number as it is read.
         place: ``gain/channels/h/after``; parts of lists by their position.
+        value: the number as it is in the file; None leaves the text unmarked.
     """
-    if value is None:
-        return Markup(inline(text))
-    return Markup(f'<data value="{value!r}" data-of="{escape(place)}">{inline(text)}</data>')
+    return inline(text) if value is None else _block("datum", text, place, repr(value))
 
 
-def command(text: str) -> str:
+def command(text: str) -> Markup:
     """A command line to copy."""
-    return f"<pre><code>{escape(text)}</code></pre>"
+    return _block("command", text)
 
 
-def callout(text: str, kind: str = "note") -> str:
+def callout(text: str, kind: str = "note") -> Markup:
     """A framed remark; kind is ``note``, ``good`` or ``warning``."""
-    return f'<aside class="callout {kind}">{inline(text)}</aside>'
+    return _block("callout", text, kind)
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> str:
-    """A table; the first column is a heading, the others numbers or words."""
-    head = "".join(f"<th>{inline(h)}</th>" for h in header)
-    body = "".join(
-        "<tr>"
-        + f"<th scope='row'>{inline(row[0])}</th>"
-        + "".join(
-            f'<td data-head="{escape(h)}">{inline(cell)}</td>'
-            for h, cell in zip(header[1:], row[1:], strict=True)
-        )
-        + "</tr>"
-        for row in rows
-    )
-    above = f'<p class="caption">{inline(caption)}</p>' if caption else ""
-    return (
-        f'{above}<div class="scroll"><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{body}</tbody></table></div>"
-    )
+# --- tables and cards -----------------------------------------------------------------------------
 
 
-def numbers_table(summary: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table to open; on paper it is open."""
-    body = f"<summary>{inline(summary)}</summary>{table(header, rows)}"
-    return f'<details class="numbers">{body}</details>'
+def table(header: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> Markup:
+    """A table.
+
+    Args:
+        header: one heading per column.
+        rows: as many cells each; the first is the row's heading, the others numbers or words.
+        caption: a line above it.
+    """
+    rows = list(rows)
+    for row in rows:
+        if len(row) != len(header):
+            raise ValueError(f"{len(header)} columns, but a row has {len(row)} cells: {row}")
+    return _block("table", header, rows, caption)
 
 
-def tiles(items: Sequence[tuple[str, str, str]]) -> str:
-    """Key numbers: (number, what it is, a remark)."""
-    return (
-        '<div class="tiles">'
-        + "".join(
-            f'<div class="tile"><b>{inline(big)}</b><span>{inline(what)}</span>'
-            f"<small>{inline(remark)}</small></div>"
-            for big, what, remark in items
-        )
-        + "</div>"
-    )
+def folded_table(summary: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> Markup:
+    """A table to be opened; on paper it is open.
+
+    Args:
+        summary: the line that opens it.
+        header: as in `table`.
+        rows: as in `table`.
+    """
+    return _block("folded_table", summary, header, list(rows))
 
 
-def card(title: str, big: str, lines: Iterable[str], badge: str = "", kind: str = "") -> str:
-    """One finding: a title, its size in words, and what to know about it."""
-    flag = f'<span class="badge">{inline(badge)}</span>' if badge else ""
-    text = "".join(f"<p>{inline(line)}</p>" for line in lines if line)
-    return (
-        f'<article class="card {kind}"><h3>{escape(title)}{flag}</h3>'
-        f'<p class="big">{inline(big)}</p>{text}</article>'
-    )
+def tiles(items: Iterable[tuple[str, str, str]]) -> Markup:
+    """Key numbers: (number, its meaning, a remark)."""
+    return _block("tiles", items)
 
 
-def cards(items: Iterable[str]) -> str:
+def card(title: str, size: str, lines: Iterable[str], badge: str = "", kind: str = "") -> Markup:
+    """One finding.
+
+    Args:
+        title: its name.
+        size: how large it is, in words.
+        lines: what else to know about it.
+        badge: a few words beside the title.
+        kind: ``warning``, or empty.
+    """
+    return _block("card", title, size, lines, badge, kind)
+
+
+def cards(items: Iterable[str]) -> Markup:
     """Cards side by side where there is room."""
-    return f'<div class="cards">{"".join(items)}</div>'
+    return _block("cards", items)
 
 
-def side_by_side(blocks: Iterable[str]) -> str:
+def side_by_side(blocks: Iterable[str]) -> Markup:
     """Blocks next to each other where there is room."""
-    return f'<div class="pair">{"".join(f"<div>{b}</div>" for b in blocks)}</div>'
+    return _block("side_by_side", blocks)
 
 
-def details(summary: str, *blocks: str) -> str:
-    """Something to open for those who want it."""
-    return f"<details><summary>{inline(summary)}</summary>{''.join(blocks)}</details>"
+def details(summary: str, *blocks: str) -> Markup:
+    """Blocks that are folded away under a summary."""
+    return _block("details", summary, blocks)
 
 
-def figure(fig: Figure, caption: str = "", label: str = "") -> str:
-    """A plotly figure with a caption; ``label`` describes it to those who cannot see it."""
-    height = fig["layout"]["height"]
-    below = f"<figcaption>{inline(caption)}</figcaption>" if caption else ""
-    return (
-        f'<figure><div class="plot" role="img" aria-label="{escape(label or caption)}" '
-        f'style="min-height:{height}px"></div>'
-        f"{data_script(fig)}{below}</figure>"
-    )
+# --- figures --------------------------------------------------------------------------------------
+
+
+def figure(content: Figure, caption: str = "", label: str = "") -> Markup:
+    """A plotly figure.
+
+    Args:
+        content: the figure, see plot_style.py; its layout has a height [px].
+        caption: a line below it.
+        label: describes it to those who cannot see it (default: the caption).
+    """
+    return _block("figure", content, caption, label)
 
 
 def chooser(
@@ -187,34 +187,53 @@ def chooser(
     caption: str = "",
     names: tuple[str, str] = ("run", "channel"),
 ) -> str:
-    """Figures of which one is shown, chosen by two lists.
+    """Figures of which one is shown, chosen by two lists; nothing where there is none.
 
     Args:
         options: (first, second) -> figure; the first entry is shown.
+        caption: a line below it.
+        names: of the two lists.
     """
-    if not options:
-        return ""
-    lists = []
-    for position, name in enumerate(names):
-        words = list(dict.fromkeys(key[position] for key in options))
-        entries = "".join(f"<option>{escape(w)}</option>" for w in words)
-        lists.append(f"<label>{escape(name)} <select>{entries}</select></label>")
-    shown = "".join(
-        f'<div class="choice" data-key="{escape(a)}|{escape(b)}"{"" if k == 0 else " hidden"}>'
-        f"{figure(fig, label=f'{a}, {b}')}</div>"
-        for k, ((a, b), fig) in enumerate(options.items())
-    )
-    below = f"<p class='caption'>{inline(caption)}</p>" if caption else ""
-    return (
-        f'<div class="chooser"><div class="lists">{"".join(lists)}</div>{shown}'
-        f'<p class="none" hidden>not measured in this run</p>{below}</div>'
-    )
+    return _block("chooser", options, caption, names) if options else ""
 
 
-def data_script(content: Any) -> str:
+def data_script(content: Any) -> Markup:
     """Data for a script of the page, as JSON that cannot end the script."""
     text = json.dumps(content, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
-    return f'<script type="application/json">{text}</script>'
+    return Markup(f'<script type="application/json">{text}</script>')
+
+
+# --- templates and scripts ------------------------------------------------------------------------
+
+
+def rendered(name: str, **values: Any) -> Markup:
+    """A file of templates/, filled in."""
+    return Markup(_templates().get_template(name).render(**values))
+
+
+def _block(name: str, *values: Any) -> Markup:
+    """A macro of templates/blocks.html, filled in."""
+    return Markup(getattr(_templates().get_template("blocks.html").module, name)(*values).strip())
+
+
+@cache
+def _templates() -> Any:
+    """The templates' environment; Jinja2 is needed only where a page is made."""
+    jinja2 = require("jinja2", "report")
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("coax_env.report"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters |= {"anchor": _anchor, "data_script": data_script, "inline": inline}
+    return environment
+
+
+def _anchor(title: str) -> str:
+    """A section's title as the name that a link points to."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def _file(name: str) -> str:
@@ -226,7 +245,7 @@ def _scripts(body: str) -> str:
     plots, flights = 'class="plot"' in body, 'class="flight"' in body
     if not (plots or flights):
         return ""
-    themes = json.dumps({"light": template(False), "dark": template(True)})
+    themes = json.dumps({"light": plotly_template(False), "dark": plotly_template(True)})
     code = f"const THEMES={themes};{_file('page.js')}" + (
         _file("flight_view.js") if flights else ""
     )

@@ -21,6 +21,9 @@ from coax_env.report.page import (
 )
 from coax_env.simulation.simulate import REDUCED_K_B, DoubletRow, Remark, Track
 
+Panel = tuple[str, dict[str, np.ndarray]]
+"""Axis title and curves by name."""
+
 POINTS = 3600
 """Per curve, all maneuvers of a page together: it is to stay under 6 MB."""
 
@@ -40,7 +43,11 @@ def simulation_page(
     """The report as HTML text.
 
     Args:
-        doublet, remarks: empty where the flight is not the paper's doublet.
+        tracks: what was flown, one per maneuver.
+        vehicle: what flew.
+        doublet: the paper's doublet as a table; empty where that was not flown.
+        remarks: the paper's statements about it, checked; empty likewise.
+        command_line: what was typed.
     """
     sentences = [f"{capital(t.maneuver.summary)}." for t in tracks]
     sentences += [f"**{capital(t.ended)}.**" for t in tracks if t.ended]
@@ -127,33 +134,9 @@ def _doublet(doublet: Sequence[DoubletRow], remarks: Sequence[Remark]) -> list[s
 
 
 def _track(track: Track, points: int) -> list[str]:
-    def degrees(*names: str) -> dict[str, np.ndarray]:
-        return {name: np.rad2deg(track[name]) for name in names}
-
-    rpm = track.command[:, :2] * RPM_PER_RAD_S
-    swash = np.rad2deg(track.command[:, 2:])
-    motion = figures.histories(
-        track.t,
-        [
-            ("rotors [rpm]", {"upper": rpm[:, 0], "lower": rpm[:, 1]}),
-            ("swash [deg]", {"lon": swash[:, 0], "lat": swash[:, 1]}),
-            ("velocity [m/s]", {name: track[name] for name in "uvw"}),
-            ("rates [deg/s]", degrees("p", "q", "r")),
-            ("attitude [deg]", degrees("phi", "theta", "psi")),
-        ],
-        points,
-    )
-    loads = figures.histories(
-        track.t,
-        [
-            ("lower flap [deg]", degrees("alpha_l", "beta_l")),
-            ("fly-bar [deg]", degrees("alpha_f", "beta_f")),
-            ("force / mass [m/s²]", {"a_x": track.reading("ax"), "a_y": track.reading("ay")}),
-            ("force / mass [m/s²]", {"a_z": track.reading("az")}),
-            ("position [m]", {"x": track["x"], "y": track["y"], "height": -track["z"]}),
-        ],
-        points,
-    )
+    """Histories of one maneuver, and its path from above."""
+    motion = figures.histories(track.t, _motion(track), points)
+    loads = figures.histories(track.t, _loads(track), points)
     above = figures.plan_view(track["x"], track["y"], -track["z"])
     return [
         side_by_side(
@@ -164,3 +147,29 @@ def _track(track: Track, points: int) -> list[str]:
         ),
         details("From above", figure(above, "The track over the ground, north up.")),
     ]
+
+
+def _motion(track: Track) -> list[Panel]:
+    rpm = track.command[:, :2] * RPM_PER_RAD_S
+    swash = np.rad2deg(track.command[:, 2:])
+    return [
+        ("rotors [rpm]", {"upper": rpm[:, 0], "lower": rpm[:, 1]}),
+        ("swash [deg]", {"lon": swash[:, 0], "lat": swash[:, 1]}),
+        ("velocity [m/s]", {name: track[name] for name in "uvw"}),
+        ("rates [deg/s]", _degrees(track, "p", "q", "r")),
+        ("attitude [deg]", _degrees(track, "phi", "theta", "psi")),
+    ]
+
+
+def _loads(track: Track) -> list[Panel]:
+    return [
+        ("lower flap [deg]", _degrees(track, "alpha_l", "beta_l")),
+        ("fly-bar [deg]", _degrees(track, "alpha_f", "beta_f")),
+        ("force / mass [m/s²]", {"a_x": track.reading("ax"), "a_y": track.reading("ay")}),
+        ("force / mass [m/s²]", {"a_z": track.reading("az")}),
+        ("position [m]", {"x": track["x"], "y": track["y"], "height": -track["z"]}),
+    ]
+
+
+def _degrees(track: Track, *names: str) -> dict[str, np.ndarray]:
+    return {name: np.rad2deg(track[name]) for name in names}

@@ -1,4 +1,4 @@
-"""What every report shows of a flight: its data, and predictions against measurements."""
+"""What reports show of a flight: its data, and predictions against measurements."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -10,17 +10,20 @@ from coax_env.model.layout import ANGLES, CHANNEL_UNITS, CHANNELS
 from coax_env.plain_words import channel_name, number, unit_name
 from coax_env.report import figures
 from coax_env.report.page import bullets, details, prose, table
+from coax_env.report.plot_style import MOST_POINTS, Figure
 
 POINTS_PER_PAGE = 30_000
 """Readings shown on one page, all its figures together."""
 
-_FIRST = ("h", "phi", "theta", "psi", "pn", "pe", "vn", "ve", "vd", "v", "p", "q", "r")
+_PILOTS_ORDER = ("h", "phi", "theta", "psi", "pn", "pe", "vn", "ve", "vd", "v", "p", "q", "r")
 
 
 def ordered(channels: Iterable[str]) -> list[str]:
     """Channels from what a pilot sees first; the rest in the contract's order."""
     have = set(channels)
-    return [c for c in (*_FIRST, *(c for c in CHANNELS if c not in _FIRST)) if c in have]
+    return [
+        c for c in (*_PILOTS_ORDER, *(c for c in CHANNELS if c not in _PILOTS_ORDER)) if c in have
+    ]
 
 
 def prediction_figure(
@@ -29,43 +32,52 @@ def prediction_figure(
     channel: str,
     replays: Mapping[str, RunReplay | None],
     noise: float | None,
-    points: int = figures.MOST_POINTS,
-) -> figures.Figure:
-    """One channel of one run, measured and as each model expects it.
+    points: int = MOST_POINTS,
+) -> Figure:
+    """One channel of one run, measured and as each model predicts it.
 
     Args:
-        replays: model's name -> the run flown again by it; None where it was not.
-        noise: std of the reading. points: at most so many per curve, see `points_each`.
+        flight: the measurements.
+        run: name of the run, or of the part of it that was held out.
+        channel: its name in the log.
+        replays: model's name -> the run predicted by it; None where it was not.
+        noise: std of the reading, in the channel's unit.
+        points: at most so many per curve, see `points_each`.
     """
     logged = _logged(flight, run)
-    times = np.concatenate([r.channels[channel].t for r in replays.values() if r is not None])
-    times = times[np.isfinite(times)]
-    near = np.ones(len(logged.t), bool)
-    if times.size:  # a run held out in part is shown in part
-        near = (logged.t >= times.min() - 2.0) & (logged.t <= times.max() + 1.0)
+    there = {
+        name: replay.channels[channel]
+        for name, replay in replays.items()
+        if replay is not None and channel in replay.channels
+    }
+    near = _rows_near(logged.t, np.concatenate([c.t for c in there.values()]))
     t = logged.t[near]
     measured = logged.measured.get(channel, np.full(len(logged.t), np.nan))[near].copy()
     good = np.isfinite(measured)
     if channel in ANGLES:
         measured[good] = np.unwrap(measured[good])
-    lines = {}
-    for name, replay in replays.items():
-        if replay is None or channel not in replay.channels:
-            continue
-        flown = replay.channels[channel]
-        there = np.isfinite(flown.t) & np.isfinite(flown.error)
-        at, error = flown.t[there], flown.error[there]
-        predicted = flown.predicted[there]
+    curves = {}
+    for name, replay in there.items():
+        finite = np.isfinite(replay.t) & np.isfinite(replay.error)
+        at, error, predicted = replay.t[finite], replay.error[finite], replay.predicted[finite]
         if channel in ANGLES and good.any():
             predicted = np.interp(at, t[good], measured[good]) + error
-        inside = _near(error, measured[good])
-        lines[name] = at, np.where(inside, predicted, np.nan), np.where(inside, error, np.nan)
-    return figures.prediction(channel, (t, measured), lines, noise, points)
+        drawn = _drawn(error, measured[good])
+        curves[name] = at, np.where(drawn, predicted, np.nan), np.where(drawn, error, np.nan)
+    return figures.prediction(channel, (t, measured), curves, noise, points)
+
+
+def _rows_near(t: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Rows of a log about the times that were predicted: a run held out in part is drawn in part."""
+    predicted = predicted[np.isfinite(predicted)]
+    if not predicted.size:
+        return np.ones(len(t), bool)
+    return (t >= predicted.min() - 2.0) & (t <= predicted.max() + 1.0)
 
 
 def points_each(count: int) -> int:
     """Points per curve where a page has so many figures and is to stay under 6 MB."""
-    return max(120, min(figures.MOST_POINTS, POINTS_PER_PAGE // max(count, 1)))
+    return max(120, min(MOST_POINTS, POINTS_PER_PAGE // max(count, 1)))
 
 
 def _logged(flight: Flight, run: str) -> Run:
@@ -76,8 +88,8 @@ def _logged(flight: Flight, run: str) -> Run:
     return flight.run(run)
 
 
-def _near(error: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Which errors to show: one start that runs away must not hide the others."""
+def _drawn(error: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Which errors are drawn: one start from which the model diverges must not hide the others."""
     if not error.size:
         return np.ones(0, bool)
     span = float(np.ptp(measured)) if measured.size else 0.0
@@ -87,13 +99,14 @@ def _near(error: np.ndarray, measured: np.ndarray) -> np.ndarray:
 def data_blocks(
     flight: Flight, remarks: Sequence[str] = (), noise: Mapping[str, float] | None = None
 ) -> list[str]:
-    """How the data were handled, and what there was.
+    """What the flight contains, and what was repaired while reading.
 
     Args:
+        flight: the measurements.
         remarks: instead of the flight's own notes.
-        noise: estimated std by channel; the card's where absent.
+        noise: estimated std by channel, in its unit; the card's where absent.
     """
-    notes = list(remarks or flight.notes) or ["Nothing had to be mended while reading."]
+    notes = list(remarks or flight.notes) or ["No reading had to be repaired."]
     rows = [
         [
             run.name,

@@ -1,7 +1,7 @@
-"""What mending the model is worth in flight: controllers of the bare and of the mended model.
+"""What the corrected model gains in flight: controllers designed on it and on the bare model.
 
 A machine with hidden effects flies maneuvers; the flights are diagnosed; an LQG is designed and a
-policy trained on the bare model and on the diagnosed one; all fly the machine itself, from the same
+policy trained on the bare model and on the corrected one; all fly the machine itself, from the same
 seeds. Designs differ in their model only: the same cost, integrals and disturbance estimator, and
 actions centred on the bare model's trim for all.
 """
@@ -15,9 +15,9 @@ from coax_env.errors import InputError
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from coax_env.report import figures
-from coax_env.report.page import Section, bullets, command, figure, page, prose, table
-from coax_env.report.worth import FlownControllers
+from coax_env.report import ControllerScores, figures
+from coax_env.report.page import Section, bullets, command, figure, page, table
+from coax_env.report.plot_style import AFTER, BEFORE, Figure
 from coax_env.simulation.simulate import simulate
 from controllers import lqr, ppo
 from controllers.comparison import HEADER, ratio, score_words
@@ -40,9 +40,11 @@ MANEUVERS = (
     "hover", "lon_3211", "lat_3211", "heave_3211", "yaw_3211", "climb_descend", "forward_run",
     "side_run", "lon_doublet", "lat_doublet", "heading_turn", "differential_rpm",
 )  # fmt: skip
-MODELS = ("bare", "mended")
-COLOURS = (figures.BEFORE, figures.AFTER)
+MODELS = ("bare", "corrected")
+COLOURS = (BEFORE, AFTER)
 ROW_HEADER = HEADER[1:]
+FIRST_TEST_SEED = 1_000_000
+"""Seeds of the flights that are scored begin so far above the one given: none was trained on."""
 
 
 def default_machine(bare: Vehicle) -> Vehicle:
@@ -62,41 +64,41 @@ def compare_models(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, Any], Diagnosis, dict[str, Controller]]:
-    """Diagnose a machine's flights, and fly it with controllers of the bare and the mended model.
+    """Diagnose a machine's flights, and fly it with controllers of the bare and the corrected model.
 
     Args:
-        machine: what truly flies; default `bare` with the HIDDEN effects.
+        machine: the true vehicle; default `bare` with the HIDDEN effects.
         bare: the model before the diagnosis.
         flight: the machine's flights; default MANEUVERS flown by it in simulation.
         out: folder of the policies.
+        episodes: flights per controller.
         ppo_steps: env steps of each policy's training; 0: LQG only.
+        seed: of the simulated flights, the training and the flights that are scored.
+        progress: called with what is being done.
 
     Returns:
-        models.json; the diagnosis; the controllers by ``"lqg bare"``, ``"lqg mended"``, ...
+        models.json; the diagnosis; the controllers by ``"lqg bare"``, ``"lqg corrected"``, ...
     """
-    say = progress or (lambda text: None)
+    report_progress = progress or (lambda text: None)
     bare = load_vehicle(bare)
     machine = default_machine(bare) if machine is None else load_vehicle(machine)
     if flight is None:
-        say("flying maneuvers")
+        report_progress("simulating maneuvers")
         flight = simulate(machine, MANEUVERS, seed=seed)
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
-    say("diagnosing")
-    result = diagnose(flight, bare, progress=lambda text: say(f"diagnosing: {text}"))
-    models = dict(zip(MODELS, (bare, result.vehicle_after), strict=True))
+    report_progress("diagnosing")
+    result = diagnose(flight, bare, progress=lambda text: report_progress(f"diagnosing: {text}"))
     controllers: dict[str, Controller] = {}
-    for name, model in models.items():
+    for name, model in zip(MODELS, (bare, result.vehicle_after), strict=True):
         controllers[f"lqg {name}"] = lqr.design(model, bare)
         if ppo_steps:
-            say(f"training on the {name} model")
+            report_progress(f"training on the {name} model")
             path = ppo.train(model, Path(out) / f"ppo_{name}", ppo_steps, seed, bare)
             controllers[f"ppo {name}"] = load_controller(path)
     scores = {}
     for name, controller in controllers.items():
-        say(f"flying {name}")
-        scores[name] = evaluate(controller, machine, episodes, seed=seed + 1_000_000)
-    kinds = ["lqg", "ppo"] if ppo_steps else ["lqg"]
-    gains = {k: ratio(scores[f"{k} bare"], scores[f"{k} mended"]) for k in kinds}
+        report_progress(f"evaluating {name}")
+        scores[name] = evaluate(controller, machine, episodes, seed=seed + FIRST_TEST_SEED)
     content = {
         "machine": machine.values(),
         "bare": bare.name,
@@ -104,33 +106,45 @@ def compare_models(
         "found": [cause["effect"] for cause in result.findings["causes"]],
         "verdict": result.findings["verdict"],
         "scores": scores,
-        "cost_ratio": gains,
+        "cost_ratio": _cost_ratios(scores),
     }
     return content, result, controllers
 
 
-def before_and_after(
-    bare: Vehicle, extended: Vehicle, machine: Vehicle, episodes: int = 20, seed: int = 0
+def _cost_ratios(scores: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Kind of controller -> mean cost on the bare model's design over that on the corrected one's."""
+    kinds = dict.fromkeys(name.split()[0] for name in scores)
+    return {k: ratio(scores[f"{k} bare"], scores[f"{k} corrected"]) for k in kinds}
+
+
+def lqg_of_both(
+    bare: Vehicle, corrected: Vehicle, machine: Vehicle, episodes: int = 20, seed: int = 0
 ) -> dict[str, tuple[lqr.LQG, dict[str, Any]]]:
-    """An LQG of the bare and one of the extended model, flown on one machine from the same seeds.
+    """An LQG designed on each model, both flown on one machine from the same seeds.
+
+    Args:
+        bare: the vehicle as given, whose trim centres both actions.
+        corrected: the vehicle with the causes in it.
+        machine: what they fly.
+        episodes: flights each.
+        seed: of the first flight.
 
     Returns:
         controller and score.json by MODELS.
     """
     result = {}
-    for name, model in zip(MODELS, (bare, extended), strict=True):
+    for name, model in zip(MODELS, (bare, corrected), strict=True):
         controller = lqr.design(model, bare)
         result[name] = controller, evaluate(controller, machine, episodes, seed=seed)
     return result
 
 
-def flown_controllers(
-    flown: Mapping[str, tuple[lqr.LQG, dict[str, Any]]], machine: str
-) -> FlownControllers:
-    """What a diagnosis' report shows of `before_and_after`; `machine` in words."""
-    scores = (score for _, score in flown.values())
-    return FlownControllers(
-        dict(zip(("bare", "extended"), scores, strict=True)),
+def controller_scores(
+    designs: Mapping[str, tuple[lqr.LQG, dict[str, Any]]], machine: str
+) -> ControllerScores:
+    """What a diagnosis' report shows of `lqg_of_both`; `machine` in words."""
+    return ControllerScores(
+        {name: score for name, (_, score) in designs.items()},
         machine,
         "An LQG (python-control) designed on each model, with the same cost and estimator.",
     )
@@ -147,26 +161,24 @@ def models_page(
     machine: Vehicle,
     command_line: str = "",
 ) -> str:
-    """The report as HTML text."""
-    scores, gains = content["scores"], content["cost_ratio"]
+    """The report as HTML text.
+
+    Args:
+        content: models.json.
+        controllers: of `compare_models`.
+        machine: the true vehicle.
+        command_line: what was typed.
+    """
+    gains = content["cost_ratio"]
     words = " and ".join(f"**{g:.1f} times** less with {k.upper()}" for k, g in gains.items())
     lead = [
-        f"The same machine costs {words} to fly where the controller comes from the mended model "
+        f"The same machine costs {words} to fly where the controller comes from the corrected model "
         "instead of the bare one.",
         f"Hidden in it: {', '.join(content['hidden'])}; named by the diagnosis: "
         f"{', '.join(content['found']) or 'nothing'}.",
     ]
-    kinds = list(gains)
-    bars = {m: [scores[f"{k} {m}"]["mean_cost"] for k in kinds] for m in MODELS}
-    heading = {m: [scores[f"{k} {m}"]["heading_rms_deg"] for k in kinds] for m in MODELS}
-    parts = [
-        Section("What it is worth", [
-            figure(figures.side_by_side([k.upper() for k in kinds], bars, "cost per step",
-                                        colours=COLOURS)),
-            figure(figures.side_by_side([k.upper() for k in kinds], heading,
-                                        "heading rms [deg]", colours=COLOURS)),
-            table(ROW_HEADER, rows(content), "On the true machine, from the same seeds"),
-        ]),
+    sections = [
+        Section("Scores", _score_blocks(content)),
         Section("One flight of each", [
             figure(_flights(controllers, machine), "Of the true machine, from the same start"),
         ]),
@@ -177,17 +189,27 @@ def models_page(
         ])]),
     ]  # fmt: skip
     if command_line:
-        parts.append(Section("How this was computed", [prose("One command:"),
-                                                       command(command_line)]))  # fmt: skip
-    return page("What a mended model is worth in flight", lead, parts, kicker="Controllers")
+        sections.append(Section("How this was computed", [command(command_line)]))
+    return page("What the corrected model gains in flight", lead, sections, kicker="Controllers")
 
 
-def _flights(controllers: Mapping[str, Controller], machine: Vehicle) -> figures.Figure:
+def _score_blocks(content: Mapping[str, Any]) -> list[str]:
+    """Cost and heading of every design as bars, and all scores as a table."""
+    kinds = list(content["cost_ratio"])
+    blocks: list[str] = []
+    for key, title in (("mean_cost", "cost per step"), ("heading_rms_deg", "heading rms [deg]")):
+        bars = {m: [content["scores"][f"{k} {m}"][key] for k in kinds] for m in MODELS}
+        groups = [k.upper() for k in kinds]
+        blocks.append(figure(figures.grouped_bars(groups, bars, title, colours=COLOURS)))
+    return [*blocks, table(ROW_HEADER, rows(content), "On the true machine, from the same seeds")]
+
+
+def _flights(controllers: Mapping[str, Controller], machine: Vehicle) -> Figure:
     """Heading and height of one flight with each controller."""
     panels: dict[str, dict[str, Any]] = {"heading [deg]": {}, "height [m]": {}}
     for name, controller in controllers.items():
-        t, found = step_response(controller, machine)
-        named = dict(found)
+        t, curves = step_response(controller, machine)
+        named = dict(curves)
         panels["heading [deg]"][name] = named["attitude [deg]"]["heading"]
         panels["height [m]"][name] = named["height [m]"]["height"]
     return figures.histories(t, list(panels.items()))

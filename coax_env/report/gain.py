@@ -1,4 +1,4 @@
-"""What mending the model is worth, on a page: in prediction, and in flight."""
+"""What the corrected model gains, on a page: in prediction, and in flight."""
 
 import math
 from collections.abc import Mapping
@@ -8,18 +8,22 @@ from typing import Any
 from coax_env.model.generic_terms import AXES, TERMS
 from coax_env.plain_words import and_list, channel_name, number, seconds, unit_name, whole_percent
 from coax_env.report import figures
-from coax_env.report.flown import ordered
-from coax_env.report.page import Markup, datum, figure, numbers_table, prose, table, tiles
+from coax_env.report.flight_data import ordered
+from coax_env.report.page import Markup, datum, figure, folded_table, prose, table, tiles
+from coax_env.report.plot_style import AFTER, BEFORE
 
-BLACK_BOX = len(AXES) * len(TERMS)
-"""Numbers of the black box that a diagnosis compares itself with."""
+BLACK_BOX_TERMS = len(AXES) * len(TERMS)
+"""Coefficients of the black box that a diagnosis compares itself with."""
 
 
 @dataclass(frozen=True)
-class FlownControllers:
-    """Controllers of the bare and of the extended model, flown on one machine.
+class ControllerScores:
+    """Controllers designed on the bare and on the corrected model, flown on one machine.
 
-    scores: name -> score.json. machine: in words, what flew them. design: in words, what they are.
+    Attributes:
+        scores: ``"bare"`` and ``"corrected"`` -> score.json.
+        machine: what they flew, in words.
+        design: what they are, in words.
     """
 
     scores: Mapping[str, Mapping[str, Any]]
@@ -39,17 +43,21 @@ def gain_tiles(findings: Mapping[str, Any]) -> str:
             datum(f"{end:.0f}".replace("-", "−"), f"gain/ci95/{k}", end)
             for k, end in enumerate((low, high))
         ]
-        interval = Markup(f"{ends[0]} to {ends[1]}&nbsp;%, 95&nbsp;% interval")
+        interval = Markup(f"{' to '.join(ends)}&nbsp;%, 95&nbsp;% interval")
     items = [
         (_percent(gain, "error_removed_percent"), f"of the {seconds(gain['horizon_s'])} prediction "
          "error removed", interval),
-        (_percent(gain, "noise_floor_percent"), "is the most possible", "with these sensors"),
+        (_percent(gain, "noise_floor_percent"), "is the most possible", "with these sensors' noise"),
         (_percent(gain, "refitted_base_percent"), "by refitting alone",
-         "the bare model's own numbers"),
+         "the bare model's own parameters"),
     ]  # fmt: skip
     if gain.get("black_box_percent") is not None:
         items.append(
-            (_percent(gain, "black_box_percent"), "by a black box", f"of {BLACK_BOX} generic terms")
+            (
+                _percent(gain, "black_box_percent"),
+                "by a black box",
+                f"of {BLACK_BOX_TERMS} generic terms",
+            )
         )
     return tiles(items)
 
@@ -64,24 +72,26 @@ def gain_blocks(findings: Mapping[str, Any]) -> list[str]:
     if not gain:
         return [prose("All runs were fitted (nothing held out): no gain can be measured.")]
     entries = gain["channels"]
-    channels = {c: entries[c] for c in sorted(ordered(entries), key=lambda c: _kept(entries[c]))}
+    channels = {
+        c: entries[c] for c in sorted(ordered(entries), key=lambda c: _error_left(entries[c]))
+    }
     caption = (
         f"Error of a {seconds(gain['horizon_s'])} prediction on the held-out runs "
         f"({and_list(gain['held_out'])}), as a share of the bare model's. Whisker: 95 % interval. "
-        "Green: the sensor's own noise, which is in every reading, so that no model gets below it. "
+        "Green: the sensor's noise, which is in every reading: no model gets below it. "
     )
     if gain.get("black_box_percent") is None:
         caption += "With `--ceiling` a black box is fitted too, for comparison."
-    header = ["channel", "unit", "bare", "refitted", "extended", "95 % interval", "sensor noise"]
+    header = ["channel", "unit", "bare", "refitted", "corrected", "95 % interval", "sensor noise"]
     return [
         figure(figures.gain_bars(channels), caption, "Prediction error by channel"),
-        numbers_table(
+        folded_table(
             "The same in numbers (rms)", header, [_row(c, e) for c, e in channels.items()]
         ),
     ]
 
 
-def _kept(entry: Mapping[str, Any]) -> float:
+def _error_left(entry: Mapping[str, Any]) -> float:
     """Share of the bare model's error that is left; large where it is not known."""
     before, after = entry["before"], entry["after"]
     return after / before if before and after is not None else math.inf
@@ -89,13 +99,13 @@ def _kept(entry: Mapping[str, Any]) -> float:
 
 def _row(channel: str, entry: Mapping[str, Any]) -> list[str]:
     """A channel of the gain in a table."""
-    where = f"gain/channels/{channel}"
+    place = f"gain/channels/{channel}"
 
     def shown(key: str) -> str:
-        return datum(number(entry[key]), f"{where}/{key}", entry[key])
+        return datum(number(entry[key]), f"{place}/{key}", entry[key])
 
     ends = [
-        datum(number(end), f"{where}/ci95/{k}", end)
+        datum(number(end), f"{place}/ci95/{k}", end)
         for k, end in enumerate(entry.get("ci95") or ())
     ]
     return [
@@ -109,7 +119,7 @@ def _row(channel: str, entry: Mapping[str, Any]) -> list[str]:
     ]
 
 
-_FIGURES = (
+_COLUMNS = (
     ("success", "success_rate", "{:.0f} %", 100.0),
     ("cost", "mean_cost", "{:.3g}", 1.0),
     ("height rms", "height_rms_m", "{:.1f} cm", 100.0),
@@ -117,47 +127,43 @@ _FIGURES = (
     ("heading rms", "heading_rms_deg", "{:.2f}°", 1.0),
     ("drift", "drift_m", "{:.2f} m", 1.0),
 )
-"""Heading, key of score.json, form and factor."""
+"""Heading, key of score.json, format and factor."""
 
 
-def controller_blocks(flown: FlownControllers) -> list[str]:
-    """Controllers before and after, on one machine from the same seeds."""
-    scores = flown.scores
+def controller_blocks(controllers: ControllerScores) -> list[str]:
+    """Controllers of both models, on one machine from the same seeds."""
+    scores = controllers.scores
     rows = [
-        [name, *(_score(score.get(key), form, by) for _, key, form, by in _FIGURES)]
+        [name, *(_formatted(score.get(key), form, by) for _, key, form, by in _COLUMNS)]
         for name, score in scores.items()
     ]
-    any_score = next(iter(scores.values()))
-    times = f"{any_score['episodes']} flights of {any_score['seconds']:.0f} s"
-    drawn = [
-        (words, key) for words, key, *_ in _FIGURES if any_score.get(key) and key != "success_rate"
-    ]
-    bars = {
-        name: [100.0 * score[key] / any_score[key] for _, key in drawn]
-        for name, score in scores.items()
+    first_name, first = next(iter(scores.items()))
+    bars = [(title, key) for title, key, *_ in _COLUMNS[1:] if first.get(key)]
+    percent = {
+        name: [100.0 * score[key] / first[key] for _, key in bars] for name, score in scores.items()
     }
     successes = [
-        f"**{_score(score.get('success_rate'), '{:.0f} %', 100.0)}** with the {name} model's"
+        f"**{_formatted(score.get('success_rate'), '{:.0f} %', 100.0)}** with the {name} model's"
         for name, score in scores.items()
     ]
     return [
         prose(
-            f"{flown.design} Flown on {flown.machine}, {times} each from the same seeds: success "
-            f"{and_list(successes)}."
+            f"{controllers.design} Flown on {controllers.machine}, {first['episodes']} flights of "
+            f"{first['seconds']:.0f} s each from the same seeds: success {and_list(successes)}."
         ),
         figure(
-            figures.side_by_side(
-                [words for words, _ in drawn],
-                bars,
-                f"% of {next(iter(scores))}",
-                colours=(figures.BEFORE, figures.AFTER),
+            figures.grouped_bars(
+                [title for title, _ in bars],
+                percent,
+                f"% of {first_name}",
+                colours=(BEFORE, AFTER),
             ),
             "Less is better.",
-            "Controllers of the bare and of the extended model",
+            "Controllers of the bare and of the corrected model",
         ),
-        table(["designed on", *(words for words, *_ in _FIGURES)], rows),
+        table(["designed on", *(title for title, *_ in _COLUMNS)], rows),
     ]
 
 
-def _score(value: float | None, form: str, factor: float) -> str:
+def _formatted(value: float | None, form: str, factor: float) -> str:
     return "–" if value is None else form.format(factor * value)
