@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.env.fleet import DT
+from coax_env.env.period import DT
 from coax_env.env.scene import (
     LOWER,
     PICTURE,

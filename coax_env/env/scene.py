@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.env.fleet import DT, Fleet
+from coax_env.env.fleet import Fleet
+from coax_env.env.period import DT
 from coax_env.env.tasks import TASKS
 from coax_env.model import parameters as P
 from coax_env.model.layout import POSITION

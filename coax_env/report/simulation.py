@@ -19,7 +19,8 @@ from coax_env.report.page import (
     side_by_side,
     table,
 )
-from coax_env.simulation.simulate import REDUCED_K_B, DoubletRow, Remark, Track
+from coax_env.simulation.paper_doublet import REDUCED_K_B, DoubletRow, Remark
+from coax_env.simulation.simulate import Track
 
 POINTS = 3600
 """Per curve, all maneuvers of a page together: it is to stay under 6 MB."""

@@ -18,8 +18,9 @@ _DIAGNOSIS = "coax_env/diagnosis/"
 PARTS: dict[str, tuple[str, ...]] = {
     "model": (f"{_MODEL}dynamics.py", f"{_MODEL}effects.py", f"{_ENV}turbulence.py",
               f"{_MODEL}linear.py", f"{_MODEL}vehicle.py"),
-    "sensors": (f"{_MODEL}sensors.py", f"{_MODEL}actuators.py", f"{_ENV}period.py",
-                f"{_ENV}fleet.py", f"{_ENV}hover.py", f"{_ENV}tasks.py"),
+    "sensors": (f"{_MODEL}sensors.py", f"{_MODEL}sampling.py", f"{_MODEL}actuators.py",
+                f"{_ENV}period.py", f"{_ENV}flight_loop.py", f"{_ENV}fleet.py", f"{_ENV}hover.py",
+                f"{_ENV}tasks.py"),
     "estimator": (f"{_ESTIMATION}kalman.py", f"{_ESTIMATION}helicopter.py",
                   "controllers/estimator.py"),
     "regression": (f"{_ESTIMATION}fit.py", f"{_ESTIMATION}whiteness.py", f"{_TWO_STEP}method.py",
