@@ -58,7 +58,10 @@ def log_readings(
 
 
 @compiled()
-def _log_rows(truth, sensors, bias, noise, chance, past, log):
+def _log_rows(
+    truth: np.ndarray, sensors: np.ndarray, bias: np.ndarray, noise: np.ndarray,
+    chance: np.ndarray, past: np.ndarray, log: np.ndarray,
+) -> None:  # fmt: skip
     """`log_readings` with its random numbers drawn: truth (n, 18) to the log (n, n_sensors).
 
     Args:
