@@ -24,6 +24,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "estimator": (f"{_ESTIMATION}kalman.py", f"{_ESTIMATION}helicopter.py",
                   "controllers/estimator.py"),
     "regression": (f"{_ESTIMATION}fit.py", f"{_ESTIMATION}whiteness.py", f"{_TWO_STEP}method.py",
+                   f"{_TWO_STEP}columns.py", f"{_TWO_STEP}loads.py",
                    f"{_TWO_STEP}modes.py", f"{_TWO_STEP}processing.py",
                    f"{_TWO_STEP}reconstruction.py", f"{_TWO_STEP}regression.py"),
 }  # fmt: skip

@@ -53,6 +53,8 @@ OWN: dict[str, tuple[str, ...]] = {
     ),
     "coax_env/estimation/fit.py": ("tests/test_estimation.py",),
     "coax_env/estimation/whiteness.py": ("tests/test_estimation.py",),
+    "coax_env/identification/two_step/columns.py": ("tests/test_two_step.py",),
+    "coax_env/identification/two_step/loads.py": ("tests/test_two_step.py",),
     "coax_env/identification/two_step/method.py": ("tests/test_two_step.py",),
     "coax_env/identification/two_step/modes.py": ("tests/test_two_step.py",),
     "coax_env/identification/two_step/processing.py": ("tests/test_two_step.py",),
