@@ -74,7 +74,7 @@ def _register() -> None:
         register(
             id="CoaxHeli-v0",
             entry_point="coax_env.env.gym_env:CoaxEnv",
-            vector_entry_point="coax_env.env.gym_env:CoaxVectorEnv",
+            vector_entry_point="coax_env.env.vector_env:CoaxVectorEnv",
             max_episode_steps=2000,
         )
 

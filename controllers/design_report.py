@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from coax_env.env import hover
-from coax_env.env.gym_env import CoaxVectorEnv
+from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.model.layout import ATTITUDE, FULL_STATES, N_STATES, STATES
 from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import unit_name

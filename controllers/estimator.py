@@ -20,12 +20,15 @@ import numpy as np
 from scipy.linalg import schur
 
 from coax_env.env import hover
-from coax_env.env.fleet import DT, Nominal, action_map
+from coax_env.env.actions import Nominal, action_map
+from coax_env.env.period import DT
 from coax_env.errors import InputError
+from coax_env.kernel.angles import wrap_angle, wrap_angles
 from coax_env.kernel.compilation import compiled
 from coax_env.model.layout import CHANNELS, FULL_STATES, N_COMMANDS
 from coax_env.model.linear import sampled
-from coax_env.model.sensors import BASE_RATE, Sensor, is_new, slow_instruments, suite
+from coax_env.model.sampling import is_new
+from coax_env.model.sensors import BASE_RATE, Sensor, slow_instruments, suite
 from coax_env.model.vehicle import Vehicle
 from controllers.feedback import Feedback
 from controllers.target import TargetView, turned
@@ -278,7 +281,7 @@ class Tracker:
             "x": forward,
             "y": right,
             "z": moved[:, 2],
-            "psi": (moved[:, 3] + math.pi) % (2.0 * math.pi) - math.pi,
+            "psi": wrap_angles(moved[:, 3]),
         }
         for name, change in changes.items():
             if name in self.design.states:
@@ -332,12 +335,6 @@ class Estimating(Feedback):
         return actions
 
 
-@compiled()
-def _wrapped(angle):
-    """An angle [rad] within -pi .. pi."""
-    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
-
-
 @compiled(fastmath={"contract"})
 def _add_product(transposed, vector, total):
     """total += transposed' vector, column by column: fast without another order of the sums."""
@@ -382,12 +379,12 @@ def _correct(
                 y[k] = expected[k]
                 continue
             if k == heading:
-                y[k] = _wrapped(y[k])
+                y[k] = wrap_angle(y[k])
             if flags[k] >= 0 and observations[i, flags[k]] <= 0.5:
                 continue
             innovation = y[k] - expected[k]
             if k == heading:
-                innovation = _wrapped(innovation)
+                innovation = wrap_angle(innovation)
             for j in range(n):
                 x[j] += gain[k, j] * innovation
 
@@ -406,7 +403,7 @@ def _predict(command, A_by_state, B_by_command, turn, state):
         _add_product(A_by_state, before, state[i])
         _add_product(B_by_command, command[i], state[i])
         if turn >= 0:
-            state[i, turn] = _wrapped(state[i, turn])
+            state[i, turn] = wrap_angle(state[i, turn])
 
 
 def _trim_readings(vehicle: Vehicle, x: np.ndarray, u: np.ndarray) -> np.ndarray:

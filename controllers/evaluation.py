@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from coax_env.env import hover, tasks
-from coax_env.env.gym_env import CoaxVectorEnv
+from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.errors import InputError
 from coax_env.model.layout import PLACE
 from coax_env.model.vehicle import Vehicle

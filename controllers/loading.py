@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from coax_env.env.fleet import Nominal
+from coax_env.env.actions import Nominal
 from coax_env.errors import InputError
 from coax_env.model.vehicle import Vehicle
 from controllers.feedback import FORMAT, VERSION

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from coax_env.env import hover
-from coax_env.env.fleet import DT, Nominal, action_map
+from coax_env.env.actions import Nominal, action_map
+from coax_env.env.period import DT
 from coax_env.errors import InputError
 from coax_env.model.sensors import suite
 from coax_env.model.vehicle import Vehicle

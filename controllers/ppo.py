@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from coax_env.env import hover
-from coax_env.env.fleet import DT, Nominal
+from coax_env.env.actions import Nominal
+from coax_env.env.period import DT
 from coax_env.errors import InputError, require
 from coax_env.files import make_folder, write_bytes
 from coax_env.model.vehicle import Vehicle

@@ -32,7 +32,7 @@ class TargetView:
 
     def aims(self, observations: np.ndarray) -> bool:
         """Whether observations (count, n) have a target in them."""
-        return observations.shape[1] == self.width + tasks.N_AIM
+        return observations.shape[1] == self.width + tasks.N_WAY
 
     def as_hover(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Observations (count, n), with or without a target, as those of a hover.

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from coax_env.env.gym_env import CoaxVectorEnv
+from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.errors import InputError, require
 
 _base = require("stable_baselines3.common.vec_env", "rl")

@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from coax_env import load_vehicle
-from coax_env.env.gym_env import CoaxVectorEnv
+from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.errors import InputError
 from coax_env.files import write_json
 from coax_env.model.effects import CATALOGUE

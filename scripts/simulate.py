@@ -14,7 +14,8 @@ from coax_env.logs.flight import write_flight
 from coax_env.model.sensors import SUITES, log_suite
 from coax_env.model.vehicle_file import load_vehicle, shipped_vehicles
 from coax_env.simulation.maneuvers import MANEUVERS
-from coax_env.simulation.simulate import Gusts, doublet_remarks, doublet_table, fly_all, log_flight
+from coax_env.simulation.paper_doublet import doublet_remarks, doublet_table
+from coax_env.simulation.simulate import Gusts, fly_all, log_flight
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ import pytest
 
 import coax_env
 from coax_env.env import hover, tasks
-from coax_env.env.fleet import DT
+from coax_env.env.period import DT
 from coax_env.errors import InputError
 from coax_env.model.dynamics import WORK_SIZE, kernel_input, step
 from coax_env.model.linear import sampled

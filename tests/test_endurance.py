@@ -6,7 +6,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from test_world import WORLDS
 
-from coax_env.env.gym_env import CoaxVectorEnv
+from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.model.effects import CATALOGUE
 
 NO_NUMBERS = (np.nan, np.inf, -np.inf)

@@ -13,13 +13,16 @@ from gymnasium.vector import AutoresetMode
 
 import coax_env
 from coax_env.env import hover
-from coax_env.env.fleet import DT, action_map, nominal_for
-from coax_env.env.gym_env import CoaxVectorEnv
+from coax_env.env.actions import action_map, nominal_for
+from coax_env.env.period import DT
 from coax_env.env.spaces import action_table, observation_table, observed
+from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.errors import InputError
 from coax_env.kernel.random_streams import stream_key, two_normals, uniform
 from coax_env.model.dynamics import WORK_SIZE, kernel_input, step
-from coax_env.model.sensors import SUITES, is_new, log_readings, log_suite
+from coax_env.model.sampling import is_new
+from coax_env.model.sensors import SUITES, log_suite
+from coax_env.simulation.log import log_readings
 
 LAMA = coax_env.load_vehicle("lama400d")
 DELAYED = LAMA.with_effect("servo_delay", time=0.027).with_effect("rotor_drag", coefficient=4e-4)

@@ -11,11 +11,12 @@ import pytest
 
 from coax_env import hover_trim, load_vehicle
 from coax_env.env import hover
-from coax_env.env.fleet import DT
+from coax_env.env.period import DT
 from coax_env.kernel.random_streams import stream_key
 from coax_env.model.dynamics import derivative
 from coax_env.model.layout import CHANNELS, FULL_STATES
-from coax_env.model.sensors import is_new, suite
+from coax_env.model.sampling import is_new
+from coax_env.model.sensors import suite
 from controllers import estimator
 from controllers.estimator import BIAS_STD, Tracker, delay_as_lag, design_estimator
 
@@ -46,7 +47,7 @@ def test_the_first_spread_is_that_of_the_tasks_starts(spreads):
     stream = np.array([stream_key(np.uint64(1)), 0], dtype=np.uint64)
     starts = np.zeros((4000, 26))
     for x in starts:
-        hover.start(stream, TRIM[1], x)
+        hover.random_start(stream, TRIM[1], x)
     found = (starts - starts.mean(axis=0)).std(axis=0)
     drawn = [X[n] for n in ("u", "v", "w", "p", "q", "r", "phi", "theta", "psi", "z")]
     np.testing.assert_allclose(spreads[0][drawn], found[drawn], rtol=0.05)

@@ -105,7 +105,7 @@ def test_starts_are_uniform_about_hover_and_settled():
     command, own = np.array([210.0, 225.0, 0.01, -0.02]), stream(1)
     starts = np.full((3000, 26), 7.0)
     for x in starts:
-        hover.start(own, command, x)
+        hover.random_start(own, command, x)
     centre = np.zeros(26)
     centre[15], centre[16:20] = -1.5, command
     half = np.zeros(26)
@@ -131,7 +131,7 @@ def test_the_way_to_the_target_is_in_the_headings_axes(name, seed):
     held = rng.standard_normal(len(sensors))
     psi = held[places[3]] = rng.uniform(-3.0, 3.0)
     target, out = rng.uniform(-3, 3, 4), np.zeros(4)
-    tasks.point(held, places, tasks.height_sign("position", sensors), target, out)
+    tasks.way_to_target(held, places, tasks.height_sign("position", sensors), target, out)
     north, east = target[:2] - held[places[:2]]
     bearing, distance = math.atan2(east, north) - psi, math.hypot(north, east)
     height = held[places[2]] if name == "mocap" else -held[places[2]]
@@ -146,7 +146,7 @@ def test_the_way_is_held_within_its_bounds():
     places, out = tasks.places("position", sensors), np.zeros(4)
     for side in (-1.0, 1.0):
         target = side * np.array([1e3, 1e3, -1e3, 0.0])
-        tasks.point(np.zeros(len(sensors)), places, -1.0, target, out)
+        tasks.way_to_target(np.zeros(len(sensors)), places, -1.0, target, out)
         np.testing.assert_allclose(out, side * np.array([50.0, 50.0, 10.0, 0.0]))
 
 
@@ -160,7 +160,7 @@ def test_drawn_targets_fill_their_box(name):
     box, own = tasks.box(name), stream(3)
     drawn = np.zeros((2000, 4))
     for target in drawn:
-        tasks.aim(own, np.empty((0, 4)), box, 0, target)
+        tasks.next_target(own, np.empty((0, 4)), box, 0, target)
     low, high = box.min(axis=0), box.max(axis=0)
     assert (drawn >= low).all() and (drawn <= high).all()
     np.testing.assert_allclose(drawn.mean(axis=0), (low + high) / 2, atol=4 * np.ptp(box) / 150)
@@ -172,7 +172,7 @@ def test_a_course_is_flown_in_order_and_its_last_target_stays():
     course = np.arange(12.0).reshape(3, 4)
     target = np.zeros(4)
     for reached, row in ((0, 0), (1, 1), (2, 2), (3, 2), (9, 2)):
-        tasks.aim(stream(), course, np.zeros((2, 4)), reached, target)
+        tasks.next_target(stream(), course, np.zeros((2, 4)), reached, target)
         assert np.array_equal(target, course[row])
 
 
@@ -192,7 +192,7 @@ def test_a_waypoint_is_reached_after_a_dwell_within_its_reach(away, there):
     for name, size in away.items():
         x[X[name]] += size
     progress = np.zeros(2, dtype=np.int64)
-    came = [bool(tasks.arrive(x, AT, 5, progress, np.empty((0, 4)))) for _ in range(12)]
+    came = [bool(tasks.reaches(x, AT, 5, progress, np.empty((0, 4)))) for _ in range(12)]
     assert [k for k, it in enumerate(came) if it] == ([4, 9] if there else [])
     assert progress[tasks.REACHED] == (2 if there else 0)
 
@@ -202,9 +202,9 @@ def test_leaving_begins_the_dwell_anew_and_a_course_ends():
     x[13:16], x[12] = AT[:3], AT[3]
     progress, course = np.zeros(2, dtype=np.int64), np.array([AT, AT])
     track = [x] * 4 + [away] + [x] * 30
-    came = [bool(tasks.arrive(at, AT, 5, progress, course)) for at in track]
+    came = [bool(tasks.reaches(at, AT, 5, progress, course)) for at in track]
     assert [k for k, it in enumerate(came) if it] == [9, 14], "two targets, and no more"
-    assert not any(tasks.arrive(x, AT, 0, progress, course) for _ in range(20)), "no dwell: never"
+    assert not any(tasks.reaches(x, AT, 0, progress, course) for _ in range(20)), "no dwell: never"
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from gymnasium.utils.env_checker import check_env
 
 import coax_env
 from coax_env.env import scene
-from coax_env.env.gym_env import CoaxEnv, CoaxVectorEnv
+from coax_env.env.gym_env import CoaxEnv
+from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.errors import InputError
 
 pygame = pytest.importorskip("pygame")

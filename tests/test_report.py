@@ -24,6 +24,7 @@ from coax_env.report import consequences, figures, fit_figures, plot_style
 from coax_env.report.flight_view import flight_view
 from coax_env.report.page import figure, inline, table
 from coax_env.simulation import simulate as sim
+from coax_env.simulation.paper_doublet import doublet_remarks, doublet_table
 
 LAMA = load_vehicle("lama400d")
 CHANNELS = ("h", "phi", "az")
@@ -461,9 +462,7 @@ def test_numbers_that_are_missing_do_not_break_the_page():
 
 def test_simulation_page():
     track = sim.fly("lama400d", "lon_doublet")
-    text = Outline(
-        report.simulation_page([track], LAMA, sim.doublet_table(), sim.doublet_remarks())
-    ).text
+    text = Outline(report.simulation_page([track], LAMA, doublet_table(), doublet_remarks())).text
     assert "16 of 16 quantities agree with its equations, 6 miss what it prints" in text
     assert "K_b = 0.67" in text and "Does not hold" not in text
 

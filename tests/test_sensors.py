@@ -8,12 +8,14 @@ import pytest
 
 from coax_env import load_vehicle
 from coax_env.env import period
-from coax_env.env.fleet import action_map
+from coax_env.env.actions import action_map
 from coax_env.kernel.random_streams import stream_key
 from coax_env.model.actuators import limit, limits
 from coax_env.model.layout import CHANNELS
 from coax_env.model.parameters import GUST_MEMORY
-from coax_env.model.sensors import is_new, log_readings, shake, suite
+from coax_env.model.sampling import add_vibration, is_new, measured_quantities, sensor_table
+from coax_env.model.sensors import suite
+from coax_env.simulation.log import log_readings
 
 LAMA = load_vehicle("lama400d")
 TIME = np.arange(0.0, 20.0, 0.01)
@@ -93,7 +95,7 @@ def test_a_bias_of_its_flight_is_the_same_in_all_its_rows():
 def test_an_unbalance_turns_with_the_rotor(azimuth):
     """Its push lies in the rotor's plane, of one size, a quarter turn ahead in y; all else is still."""
     readings = np.arange(18.0)
-    shake(readings, azimuth, 0.3)
+    add_vibration(readings, azimuth, 0.3)
     change = dict(zip(CHANNELS, readings - np.arange(18.0), strict=True))
     assert math.hypot(change["ax"], change["ay"]) == pytest.approx(0.3)
     assert math.atan2(change["ax"], change["ay"]) == pytest.approx(azimuth)
@@ -104,7 +106,7 @@ def test_an_unbalance_turns_with_the_rotor(azimuth):
 def test_a_rotor_turns_by_its_speed_within_a_turn():
     azimuth, whole = 0.0, 0.0
     for _ in range(100):
-        azimuth, whole = period.turned(azimuth, 210.0), whole + 2.1
+        azimuth, whole = period.next_azimuth(azimuth, 210.0, 0.01), whole + 2.1
         assert 0.0 <= azimuth < 2.0 * math.pi
         assert math.cos(azimuth - whole) == pytest.approx(1.0)
 
@@ -159,7 +161,7 @@ def test_gusts_are_stationary_with_their_memory():
     history = np.empty((60_000, 6))
     for row in history:
         x[20:] *= fade
-        period.blow(x, p, np.array([0.3, 0.02]), own)
+        period.add_gusts(x, p, np.array([0.3, 0.02]), own)
         row[:] = x[20:]
     std = history.std(axis=0)
     np.testing.assert_allclose(std, [0.3] * 3 + [0.02] * 3, rtol=0.12)
@@ -170,23 +172,17 @@ def test_gusts_are_stationary_with_their_memory():
     assert np.abs(np.corrcoef(history.T) - np.eye(6)).max() < 0.15
     assert not x[:20].any()
     still = np.zeros(26)
-    period.blow(still, p, np.array([0.0, 0.02]), own)
+    period.add_gusts(still, p, np.array([0.0, 0.02]), own)
     assert not still[20:23].any() and still[23:].all()
 
 
 # --- readings -------------------------------------------------------------------------------------
 
 
-def table_of(*sensors, flags=()) -> np.ndarray:
-    from coax_env.env.fleet import _sensor_table
-
-    return _sensor_table(sensors, flags)
-
-
 def test_sensors_look_at_their_own_place():
     readings, x, out = np.arange(18.0), 100.0 + np.arange(26.0), np.zeros(2)
     (height,) = (s for s in suite("state") if s.name == "z")
-    period.seen(x, readings, table_of(sensor("h"), height), out)
+    measured_quantities(x, readings, sensor_table((sensor("h"), height)), out)
     assert out.tolist() == [CHANNELS.index("h"), 115.0]
 
 
@@ -194,13 +190,13 @@ def test_a_reading_has_its_noise_and_its_bias_and_stays_until_the_next():
     """Two gyros, a sonar at 20 Hz with a flag, a heading that runs round."""
     sensors = (sensor("p", noise=0.3), sensor("q", noise=0.1), sensor("h", noise=0.0, low=-9.0),
                sensor("psi", noise=0.0, rate=100.0))  # fmt: skip
-    table = table_of(*sensors, flags=("sonar",))
+    table = sensor_table(sensors, ("sonar",))
     values, bias = np.array([1.0, -2.0, 1.5, 3.0]), np.array([0.5, 0.0, 0.25, 1.0])
     own, held = stream(1), np.zeros(5)
     history = np.empty((4000, 5))
     for row in range(4000):
         values[2] = row
-        period.read(values, row, table, bias, own, 1, held)
+        period.take_samples(values, row, table, bias, own, 1, held)
         history[row] = held
     noise = history[:, :2] - [1.5, -2.0]
     np.testing.assert_allclose(noise.std(axis=0), [0.3, 0.1], rtol=0.05)
@@ -216,11 +212,11 @@ def test_a_reading_has_its_noise_and_its_bias_and_stays_until_the_next():
 
 def test_lost_samples_are_held_and_not_new():
     one = sensor("h", noise=0.0, dropout=0.3, low=-1e9, high=1e9)
-    table, held, own = table_of(one, flags=("sonar",)), np.zeros(2), stream(2)
+    table, held, own = sensor_table((one,), ("sonar",)), np.zeros(2), stream(2)
     fresh = []
     for row in range(20_000):
         before = held[0]
-        period.read(np.array([float(row)]), row, table, np.zeros(1), own, 1, held)
+        period.take_samples(np.array([float(row)]), row, table, np.zeros(1), own, 1, held)
         assert held[0] == (row if held[1] else before)
         fresh.append(held[1])
     due = np.arange(20_000) % 5 == 0
@@ -229,7 +225,7 @@ def test_lost_samples_are_held_and_not_new():
 
 
 def test_a_reading_that_is_no_number_leaves_the_last():
-    table, held, own = table_of(sensor("p", noise=0.0)), np.zeros(1), stream(4)
+    table, held, own = sensor_table((sensor("p", noise=0.0),)), np.zeros(1), stream(4)
     for value, shown in ((0.5, 0.5), (math.nan, 0.5), (1e9, sensor("p").high), (math.inf, None)):
-        period.read(np.array([value]), 0, table, np.zeros(1), own, 0, held)
+        period.take_samples(np.array([value]), 0, table, np.zeros(1), own, 0, held)
         assert held[0] == (sensor("p").high if shown is None else shown)

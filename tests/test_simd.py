@@ -8,7 +8,7 @@ import pytest
 
 import coax_env
 from coax_env.env import fleet
-from coax_env.env.gym_env import CoaxVectorEnv
+from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.kernel import simd
 from coax_env.kernel.random_streams import normals_of
 from coax_env.kernel.simd import SIMD_WIDTH, simd_view, simd_view_uint64
@@ -207,7 +207,7 @@ def test_rows_go_into_lanes_and_back_to_where_they_were(columns, kind):
 
 def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str, np.ndarray]:
     """A flight of a batch through ends and resets: what came, (steps, count, ...)."""
-    monkeypatch.setattr(fleet, "LANES_FROM", 2 if side_by_side else 10**9)
+    monkeypatch.setattr(fleet, "SIMD_FROM", 2 if side_by_side else 10**9)
     env = CoaxVectorEnv(count, max_episode_steps=90, threads=1, **arguments)
     env.reset(seed=7)
     rng = np.random.default_rng(2)

@@ -9,6 +9,7 @@ from coax_env import InputError, load_vehicle, read_flight, simulate, write_flig
 from coax_env.model import dynamics
 from coax_env.model.layout import CHANNELS
 from coax_env.model.sensors import SUITES
+from coax_env.simulation import paper_doublet
 from coax_env.simulation import simulate as sim
 from coax_env.simulation.maneuvers import MANEUVERS, Maneuver, maneuver
 
@@ -29,7 +30,7 @@ EQUATIONS = {
 
 @pytest.fixture(scope="module")
 def table():
-    return {row.quantity: row for row in sim.doublet_table()}
+    return {row.quantity: row for row in paper_doublet.doublet_table()}
 
 
 @pytest.mark.parametrize("quantity", list(EQUATIONS))
@@ -52,14 +53,14 @@ def test_reduced_linkage_gain_meets_the_text(table):
     assert table["height lost"].reduced[0] == pytest.approx(0.68, rel=0.02)
 
 
-@pytest.mark.parametrize("remark", sim.doublet_remarks(), ids=lambda r: r.statement[:40])
+@pytest.mark.parametrize("remark", paper_doublet.doublet_remarks(), ids=lambda r: r.statement[:40])
 def test_remarks_about_the_doublet_hold(remark):
     assert remark.holds, remark
 
 
 def test_effects_do_not_enter_the_papers_table(table):
     extended = LAMA.with_effect("rotor_drag", coefficient=4e-4)
-    assert sim.doublet_table(extended)[0].run == table["u"].run
+    assert paper_doublet.doublet_table(extended)[0].run == table["u"].run
 
 
 # --- maneuvers ----------------------------------------------------------------------------------

@@ -6,18 +6,26 @@ import numpy as np
 import pytest
 from scipy.signal import welch
 
-from coax_env.env.fleet import DT
-from coax_env.env.turbulence import FOOT, SEVERITIES, dryden, settle, spectrum, stir, wind_at_6m
+from coax_env.env.period import DT
+from coax_env.env.turbulence import (
+    FOOT,
+    SEVERITIES,
+    draw_filters,
+    dryden,
+    spectrum,
+    turbulence_step,
+    wind_at_6m,
+)
 from coax_env.errors import InputError
 from coax_env.kernel.random_streams import stream_key
 
 
-def eddies_of(seed: int, rows: int, height: float, wind: float) -> np.ndarray:
+def turbulence_of(seed: int, rows: int, height: float, wind: float) -> np.ndarray:
     stream = np.array([stream_key(np.uint64(seed)), 0], dtype=np.uint64)
     state, air, history = np.zeros(5), np.zeros(3), np.empty((rows, 3))
-    settle(stream, state)
+    draw_filters(stream, state)
     for row in range(rows):
-        stir(stream, state, height, wind, DT, air)
+        turbulence_step(stream, state, height, wind, DT, air)
         history[row] = air
     return history
 
@@ -38,14 +46,14 @@ def test_turbulence_starts_and_stays_at_its_variance():
     sigma, sigma_w, *_ = dryden(2.0, 3.0)
     wanted = np.array([sigma, sigma, sigma_w])
     for rows in (1, 150):
-        ends = np.array([eddies_of(seed, rows, 2.0, 3.0)[-1] for seed in range(1500)])
+        ends = np.array([turbulence_of(seed, rows, 2.0, 3.0)[-1] for seed in range(1500)])
         assert np.allclose(ends.std(axis=0) / wanted, 1.0, atol=0.08)
         assert np.abs(ends.mean(axis=0) / wanted).max() < 0.12
         assert np.abs(np.corrcoef(ends.T) - np.eye(3)).max() < 0.1
 
 
 def test_turbulence_has_drydens_spectrum():
-    history = eddies_of(1, 300_000, 1.5, 4.0)
+    history = turbulence_of(1, 300_000, 1.5, 4.0)
     sigma, sigma_w, tau, tau_w = dryden(1.5, 4.0)
     for axis, (s, t) in enumerate(((sigma, tau), (sigma, tau), (sigma_w, tau_w))):
         f, power = welch(history[:, axis], 1.0 / DT, nperseg=16384)

@@ -22,14 +22,9 @@ from coax_env import identify, load_vehicle, simulate
 from coax_env.errors import InputError
 from coax_env.files import write_text
 from coax_env.identification.two_step import method, modes
-from coax_env.identification.two_step.modes import (
-    MODES,
-    PHYSICS,
-    fit_mode,
-    fit_physics,
-    joined,
-    rows_of,
-)
+from coax_env.identification.two_step.columns import DRAWS, IMU, columns_of, joined, rows_of
+from coax_env.identification.two_step.loads import coefficients, loads
+from coax_env.identification.two_step.modes import MODES, PHYSICS, fit_mode, fit_physics
 from coax_env.identification.two_step.processing import (
     even_grid,
     integrated,
@@ -479,9 +474,10 @@ def test_a_tilted_thrust_lifts_by_its_upright_share():
     rng = np.random.default_rng(12)
     alpha, beta = rng.uniform(-0.5, 0.5, (2, 20))
     vectors = np.stack([-np.tan(alpha), np.tan(beta), -np.ones(20)])
-    np.testing.assert_allclose(
-        modes._upright(alpha, beta), -(vectors / np.linalg.norm(vectors, axis=0))[2]
-    )
+    unit = vectors / np.linalg.norm(vectors, axis=0)
+    flown = loads(LAMA, 0.0, 210.0, (0.0, alpha), (0.0, beta))
+    found = np.stack([flown.X, flown.Y, flown.Z]) / flown.T_l
+    np.testing.assert_allclose(found, unit, rtol=1e-12)
 
 
 def test_the_filters_transition_is_the_slope_of_its_own_prediction():
@@ -751,22 +747,22 @@ def clean_runs():
     ).runs  # fmt: skip
 
 
-def columns_of(run):
-    dt, t, signals = even_grid(run, (*modes.IMU, "rpm_upper", "rpm_lower"))
-    return modes._columns(signals, run.command[: len(t)], dt, LAMA)
+def columns_of_run(run):
+    dt, t, signals = even_grid(run, (*IMU, "rpm_upper", "rpm_lower"))
+    return columns_of(signals, run.command[: len(t)], dt, LAMA)
 
 
 def test_columns_of_a_clean_flight_obey_the_model(clean_runs):
     """Each response is what its law, and its pooled regressors, say: (15)-(20), (26)-(37)."""
     told: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for run in clean_runs:
-        columns = columns_of(run)
-        for response, law in modes._LAWS.items():
-            told.setdefault(response, []).append((columns[response], law(columns, LAMA)))
+        columns = columns_of_run(run)
+        for response, law in coefficients(columns, LAMA).items():
+            told.setdefault(response, []).append((columns[response], law))
         for physics in PHYSICS:
             pooled = sum(columns[name] for name in physics.regressors)
             told.setdefault(physics.response, []).append((columns[physics.response], pooled))
-    assert set(told) == set(modes._LAWS) | {physics.response for physics in PHYSICS}
+    assert set(told) == {form.response for form in (*MODES, *PHYSICS)}
     for response, pairs in told.items():
         measured, law = max(pairs, key=lambda pair: pair[0][50:-50].std())
         measured, law = (low_pass(column, 0.01)[50:-50] for column in (measured, law))
@@ -783,14 +779,18 @@ def test_the_laws_are_the_kernels_equations(seed):
     x[6:10] = rng.uniform(-0.02, 0.02, 4)
     command = np.array([*rng.uniform(180.0, 220.0, 2), 0.0, 0.0])
     v = LAMA.values()
-    T_u, T_l, Q_u, Q_l = modes.thrusts(LAMA, *command[:2])
+    area = v["air_density"] * np.pi * v["rotor_radius"] ** 4
+    T_u, T_l = (
+        v[f"thrust_coefficient_{name}"] * area * omega**2
+        for name, omega in zip(("upper", "lower"), command, strict=False)
+    )
     columns = {
-        "T_u": T_u, "T_l": T_l, "Q_u": Q_u, "Q_l": Q_l, "p": x[3], "q": x[4], "r": x[5],
+        "T_u": T_u, "T_l": T_l, "p": x[3], "q": x[4],
         "alpha_l": x[6], "beta_l": x[7], "alpha_u": v["flybar_to_rotor_lon"] * x[8],
         "beta_u": v["flybar_to_rotor_lat"] * x[9],
     }  # fmt: skip
     rates = coax_env.derivative(x, command, LAMA)
-    force = 0.5 * v["air_density"] * np.pi * v["rotor_radius"] ** 4 * command[0] ** 2
+    force = 0.5 * area * command[0] ** 2
     moment = force * v["rotor_radius"]
     felt = dynamics.readings(x, command, LAMA)
     expected = {
@@ -802,8 +802,8 @@ def test_the_laws_are_the_kernels_equations(seed):
         "C_n": v["inertia_zz"] * rates[5] / moment,
     }
     for response, value in expected.items():
-        found = modes._LAWS[response](columns, LAMA)
-        assert found == pytest.approx(value, rel=1e-3, abs=1e-6), response
+        found = coefficients(columns, LAMA)[response]
+        assert found == pytest.approx(value, rel=1e-9, abs=1e-12), response
 
 
 def test_a_run_stirs_what_its_commands_move():
@@ -813,13 +813,13 @@ def test_a_run_stirs_what_its_commands_move():
     command[:, 0] += [10.0, -10.0] * 4
     command[:, 1] += [5.0, -5.0] * 4
     run = Run("moving", np.arange(8.0), command, {})
-    assert modes.stir(run, "delta_lon") == pytest.approx(0.01)
-    assert modes.stir(run, "delta_lat") == pytest.approx(0.02)
-    assert modes.stir(run, "collective") == pytest.approx(0.05)
-    assert modes.stir(run, "differential") == pytest.approx(0.0, abs=1e-12)
+    assert modes.movement(run, "delta_lon") == pytest.approx(0.01)
+    assert modes.movement(run, "delta_lat") == pytest.approx(0.02)
+    assert modes.movement(run, "collective") == pytest.approx(0.05)
+    assert modes.movement(run, "differential") == pytest.approx(0.0, abs=1e-12)
     command[:, 1] -= [10.0, -10.0] * 4
-    assert modes.stir(run, "differential") == pytest.approx(0.05)
-    assert modes.stir(run, "collective") == pytest.approx(0.0, abs=1e-12)
+    assert modes.movement(run, "differential") == pytest.approx(0.05)
+    assert modes.movement(run, "collective") == pytest.approx(0.0, abs=1e-12)
 
 
 def test_errors_of_a_row_are_what_the_sensors_noise_does(clean_runs):
@@ -827,19 +827,19 @@ def test_errors_of_a_row_are_what_the_sensors_noise_does(clean_runs):
     (run,) = (run for run in clean_runs if run.name.startswith("lon_3211"))
     rng = np.random.default_rng(20)
     rows = rows_of(run, LAMA, NOISE, 5.0, seed=1)
-    clean = columns_of(run)
+    clean = columns_of_run(run)
     scatter = {name: [] for name in rows.errors}
     for _ in range(12):
         shaken = {
             c: v + NOISE.get(c, 0.0) * rng.standard_normal(v.shape) for c, v in run.measured.items()
         }
-        noisy = columns_of(replace(run, measured=shaken))
+        noisy = columns_of_run(replace(run, measured=shaken))
         for name, values in scatter.items():
             values.append(low_pass(noisy[name] - clean[name], 0.01)[50:-50])
     for name in ("q", "alpha_u", "alpha_l", "T_u", "C_X", "C_Z", "C_m", "driven_y"):
         ratio = rows.errors[name].std() / np.std(scatter[name])
         assert ratio == pytest.approx(1.0, abs=0.15), name
-        assert rows.errors[name].shape == (len(rows.t), modes.DRAWS)
+        assert rows.errors[name].shape == (len(rows.t), DRAWS)
     assert rows.t[0] == pytest.approx(0.5, abs=0.01) and rows.lengths == (len(rows.t),)
 
 
@@ -865,14 +865,14 @@ def test_the_noise_record_is_the_run_that_moves_least(clean_runs):
     hover = simulate(LAMA, "hover", sensors="state").runs[0]
     assert method._noise_record([*clean_runs, hover]) is hover
     still = method._still(hover, 5.0, 2.0)
-    assert set(still) == set(modes.IMU) and {len(v) for v in still.values()} == {202}
+    assert set(still) == set(IMU) and {len(v) for v in still.values()} == {202}
 
 
 def test_the_doublet_ties_what_equation_26_ties():
     """Noise-free, unfiltered, as in design/paper.md: 33, 24, 8, 1.5; and the cost of no p term."""
     (run,) = simulate(LAMA, "lon_doublet", sensors="state").runs
-    dt, t, signals = even_grid(run, modes.IMU)
-    columns = modes._columns(signals, run.command[: len(t)], dt, LAMA)
+    dt, t, signals = even_grid(run, IMU)
+    columns = columns_of(signals, run.command[: len(t)], dt, LAMA)
     names = ("alpha_u", "alpha_l", "q", "delta_lon")
     tied = collinearity(np.column_stack([columns[n] for n in names]), names)
     expected = {"alpha_l": 33.0, "delta_lon": 24.0, "alpha_u": 8.0, "q": 1.5}
@@ -933,7 +933,7 @@ def test_pooled_regressions_are_one_where_the_file_is_right():
         for physics in PHYSICS:
             used = [
                 run for run in flight.runs
-                if any(modes.stir(run, axis) > modes.STIR[axis] for axis in physics.axes)
+                if any(modes.excites(run, axis) for axis in physics.axes)
             ]  # fmt: skip
             rows = joined([rows_of(run, LAMA, NOISE, 5.0, k) for k, run in enumerate(used)])
             fit = fit_physics(physics, rows)

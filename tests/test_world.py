@@ -11,16 +11,17 @@ from gymnasium.utils.env_checker import check_env
 
 import coax_env
 from coax_env.env import hover, tasks
-from coax_env.env.fleet import DT
-from coax_env.env.gym_env import CoaxEnv, CoaxVectorEnv
+from coax_env.env.gym_env import CoaxEnv
+from coax_env.env.period import DT
 from coax_env.env.turbulence import dryden
+from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.errors import InputError
 from coax_env.model import dynamics, effects
 from coax_env.model.actuators import limit, limits
 from coax_env.model.layout import CHANNELS
 from coax_env.model.sensors import SUITES, log_suite, suite
 from coax_env.model.vehicle_file import load_vehicle, vehicle_toml
-from coax_env.simulation.simulate import _SwashDelay, fly
+from coax_env.simulation.simulate import fly
 
 LAMA = load_vehicle("lama400d")
 DRAGGED = LAMA.with_effect("rotor_drag", coefficient=4e-4)
@@ -238,6 +239,19 @@ def usual(effect: str) -> coax_env.Vehicle:
     return base.with_effect(effect, **{p.name: p.off + p.usual for p in entry.parameters})
 
 
+def flown_by_hand(x, commands, k, delay, begin, p, work) -> np.ndarray:
+    """Fly row k in place: the plate's command arrives `delay` later; the one in force at the end."""
+    whole = math.floor(delay / DT + 1e-9)
+    rest = delay - whole * DT
+    for back, seconds in ((whole + 1, rest), (whole, DT - rest)):
+        held = commands[k].copy()
+        held[2:] = commands[k - back, 2:]
+        if seconds > 1e-9:
+            dynamics.step(x, dynamics.kernel_input(held, begin), seconds, p, work, x)
+            begin += seconds
+    return held
+
+
 @pytest.mark.parametrize("effect", effects.CATALOGUE)
 def test_every_effect_flies_in_the_env_as_in_the_scalar_simulation(effect):
     vehicle = usual(effect)
@@ -262,16 +276,14 @@ def test_every_effect_flies_in_the_env_as_in_the_scalar_simulation(effect):
         np.array_equal(states, bare_states) and np.array_equal(observations, bare_observations)
     )
     x, work = start.copy(), np.zeros(dynamics.WORK_SIZE)
-    delay = _SwashDelay(vehicle.vector, env.fleet.trim, DT)
+    given = np.vstack([np.zeros((4, 4)), actions(2, 100, 4, size=0.3)]).astype(float)
+    commands = env.fleet.trim + env.fleet.scale * given
+    delay = vehicle.values().get("servo_delay.time", 0.0)
     readings = np.empty(len(CHANNELS))
     rates = [CHANNELS.index(c) for c in ("p", "q", "r")]
     seen = [env.observation_names.index(c) for c in ("p", "q", "r")]
-    for row, action in enumerate(actions(2, 100, 4, size=0.3)):
-        command = env.fleet.trim + env.fleet.scale * action.astype(float)
-        begin = row * DT
-        for seconds, held in delay.pieces(command):
-            dynamics.step(x, dynamics.kernel_input(held, begin), seconds, vehicle.vector, work, x)
-            begin += seconds
+    for row in range(100):
+        held = flown_by_hand(x, commands, row + 4, delay, row * DT, vehicle.vector, work)
         assert np.allclose(states[row], x, rtol=1e-9, atol=1e-12)
         now = dynamics.kernel_input(held, (row + 1) * DT)
         dynamics.measure(x, now, vehicle.vector, work, readings)
@@ -287,16 +299,30 @@ def test_a_servos_delay_splits_the_period_where_it_must(delay):
     x = dynamics.full_state(*TRIM, LAMA)
     given = np.vstack([np.zeros((4, 4)), actions(4, 40, 4, size=0.3)]).astype(float)
     commands = fleet.trim + fleet.scale * given
-    whole = math.floor(delay / DT + 1e-9)
-    rest = delay - whole * DT
     for k in range(4, len(given)):
         state = env.step(given[k])[4]["state"]
-        for back, seconds in ((whole + 1, rest), (whole, DT - rest)):
-            command = commands[k].copy()
-            command[2:] = commands[k - back, 2:]
-            if seconds > 1e-9:
-                dynamics.step(x, dynamics.kernel_input(command), seconds, LAMA.vector, work, x)
+        flown_by_hand(x, commands, k, delay, 0.0, LAMA.vector, work)
         np.testing.assert_allclose(state[:16], x[:16], atol=1e-9)
+
+
+LOGGED = (
+    LAMA.with_effect("servo_delay", time=0.013)
+    .with_effect("motor_lag", upper=0.1, lower=0.12)
+    .with_actuators(swash_travel=0.06, swash_rate=1.0)
+)
+
+
+@pytest.mark.parametrize("vehicle", [LAMA, LOGGED], ids=["bare", "slow actuators"])
+@pytest.mark.parametrize("name", ["lat_doublet", "climb_descend"])
+def test_what_is_logged_is_what_is_flown(vehicle, name):
+    """The commands of a simulated maneuver, given to the env row by row, fly the same flight."""
+    track = fly(vehicle, name, closed_loop=True, tremor=0.5)
+    env = CoaxEnv(vehicle, nominal=vehicle)
+    env.reset(seed=0, options={"state": track.state[0]})
+    given = (track.command - env.fleet.trim) / env.fleet.scale
+    assert np.abs(given).max() < 1.0
+    states = np.array([env.step(action)[4]["state"] for action in given[:-1]])
+    np.testing.assert_allclose(states, track.state[1:], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [3, 19], ids=["one by one", "in lanes"])
@@ -675,7 +701,7 @@ def test_a_row_flies_as_a_single_env_in_any_world(world):
 
 def test_an_unlimited_bare_world_costs_no_memory():
     fleet = CoaxVectorEnv(64).fleet
-    assert fleet.past.size == 0 and fleet.swash.shape[1] == 1 and len(fleet.params) == 1
-    arrays = (v for v in vars(fleet).values() if isinstance(v, np.ndarray) and len(v) == 64)
-    assert sum(array.nbytes for array in arrays) / 64 < 1000
+    own = fleet.helicopters
+    assert own.past.size == 0 and own.swash_ring.shape[1] == 1 and len(own.params) == 1
+    assert sum(array.nbytes for array in (fleet.x, *own) if len(array) == 64) / 64 < 1000
     assert len(tasks.TASKS["hover"].terms) == hover.N_TERMS

@@ -1,17 +1,17 @@
-"""The batch kernel for helicopters without effects: SIMD_WIDTH rows of the fleet at a time, in lanes.
+"""The batch for helicopters without effects: SIMD_WIDTH rows of the fleet at a time.
 
-The same control period as fleet.py's for one row, made of the same parts (period.py); here each part
-is compiled for lanes. Any active rows make a group; the last group is filled up with copies, whose
-results are dropped.
+The same control period as flight_loop.py's for one row, made of the same parts (period.py); here each
+part is compiled for SIMD_WIDTH helicopters side by side. Any active rows make a group; the last group
+is filled up with copies, whose results are dropped.
 """
 
 import numpy as np
 
 from coax_env.env import hover
-from coax_env.env.period import BIAS, BIAS_STD, DT, blow, command, read, rest, seen, turned
+from coax_env.env.period import DT, add_gusts, command, copy_row, next_azimuth, take_samples
 from coax_env.env.threads import in_threads
 from coax_env.errors import InputError
-from coax_env.kernel.compilation import compiled
+from coax_env.kernel.compilation import compiled, looked_up_once
 from coax_env.kernel.simd import (
     SIMD_WIDTH,
     gather,
@@ -23,9 +23,11 @@ from coax_env.kernel.simd import (
 )
 from coax_env.model import effects
 from coax_env.model import parameters as P
+from coax_env.model import state as S
 from coax_env.model.actuators import limit
 from coax_env.model.dynamics import WORK_SIZE, measure_bare, step_bare
 from coax_env.model.layout import N_CHANNELS, N_FULL, N_INPUTS, N_STATES, TIME
+from coax_env.model.sampling import BIAS, BIAS_STD, measured_quantities
 from coax_env.model.vehicle import Vehicle
 
 CHUNK = 512
@@ -41,7 +43,7 @@ _N_SINGLES = 4
 
 @compiled()
 def _next_group(i, last, active, which):
-    """The next SIMD_WIDTH active rows from row `i` on into `which`; how many they are, and the row after."""
+    """The next SIMD_WIDTH active rows from row `i` on, into `which`; how many, and the row after."""
     n = 0
     while i < last and n < SIMD_WIDTH:
         if active[i]:
@@ -75,26 +77,28 @@ def _by_phase(first, last, active, rows, order):
 def _step_of(own):
     """Command, flight and judgement, for parameters of each row's own, or for one vehicle."""
 
-    def step_rows(
-        first, last, active, actions, trim, scale, params, limits, gust, weights, scales,
-        x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
-    ):  # fmt: skip
-        """Fly the active rows first..last-1 for one control period. See fleet.Fleet for the arrays."""
+    def step_rows(first, last, active, actions, x, flown, heli, world, mission, outcome):
+        """Fly the active rows first..last-1 for one control period; arguments as `_fly_of`."""
+        # names outside the loop: numba counts a reference each time it takes an array from a tuple
+        u, rows, azimuth, streams, params = heli[:5]
+        last_commands, targets = heli.last_commands, heli.targets
+        trim, scale, gust, limits = world.trim, world.scale, world.gust, world.limits[0]
+        weights, scales = mission.weights, mission.scales
+        rewards, terms, over = outcome.rewards, outcome.terms, outcome.over
         which = np.empty(SIMD_WIDTH, np.int64)
         x_block, u_block = np.empty((N_FULL, SIMD_WIDTH)), np.empty((N_INPUTS, SIMD_WIDTH))
-        action_block, asked_block = np.empty((4, SIMD_WIDTH)), np.empty((4, SIMD_WIDTH))
-        target_block, term_block = np.empty((4, SIMD_WIDTH)), np.zeros((len(weights), SIMD_WIDTH))
-        stream_block, row_block = (
-            np.empty((2, SIMD_WIDTH), np.uint64),
-            np.empty((_N_SINGLES, SIMD_WIDTH)),
-        )
+        action_block, last_block = np.empty((4, SIMD_WIDTH)), np.empty((4, SIMD_WIDTH))
+        target_block = np.empty((4, SIMD_WIDTH))
+        term_block = np.zeros((len(weights), SIMD_WIDTH))
+        stream_block = np.empty((2, SIMD_WIDTH), np.uint64)
+        single_block = np.empty((_N_SINGLES, SIMD_WIDTH))
         x_, u_, action_ = simd_view(x_block), simd_view(u_block), simd_view(action_block)
-        asked_, target_, terms_ = (
-            simd_view(asked_block),
+        last_, target_, terms_ = (
+            simd_view(last_block),
             simd_view(target_block),
             simd_view(term_block),
         )
-        single_, stream_ = simd_view(row_block), simd_view_uint64(stream_block)
+        single_, stream_ = simd_view(single_block), simd_view_uint64(stream_block)
         work, flown_ = simd_scratch(WORK_SIZE), simd_scratch(N_FULL)
         if own:
             p_block = np.empty((_N_PARAMETERS, SIMD_WIDTH))
@@ -111,34 +115,34 @@ def _step_of(own):
             if own:
                 gather(params, which, p_block)
             for j in range(SIMD_WIDTH):
-                row_block[_ROW, j] = rows[which[j]]
-                row_block[_AZIMUTH, j] = azimuth[which[j]]
+                single_block[_ROW, j] = rows[which[j]]
+                single_block[_AZIMUTH, j] = azimuth[which[j]]
             command(action_, trim, scale, u_)
             if limited:
-                gather(asked, which, asked_block)
-                limit(u_, asked_, limits, DT)
-                scatter(asked_block, which, n, asked)
+                gather(last_commands, which, last_block)
+                limit(u_, last_, limits, DT)
+                scatter(last_block, which, n, last_commands)
             if gusty:
                 gather(streams, which, stream_block)
-                blow(x_, p, gust, stream_)
+                add_gusts(x_, p, gust, stream_)
                 scatter(stream_block, which, n, streams)
             u_[TIME] = single_[_ROW] * DT
             step_bare(x_, u_, DT, p, work, flown_)
             for k in range(N_FULL):
                 x_[k] = flown_[k]
             u_[TIME] = (single_[_ROW] + 1.0) * DT
-            single_[_AZIMUTH] = turned(single_[_AZIMUTH], x_[16])
+            single_[_AZIMUTH] = next_azimuth(single_[_AZIMUTH], x_[S.OMEGA_U], DT)
             single_[_REWARD] = hover.reward(x_, action_, target_, weights, scales, terms_)
             single_[_OVER] = select(hover.is_over(x_), 1.0, 0.0)
             scatter(x_block, which, n, flown)
             scatter(u_block, which, n, u)
             scatter(term_block, which, n, terms)
             for j in range(n):
-                row = which[j]
-                rows[row] += 1
-                azimuth[row] = row_block[_AZIMUTH, j]
-                rewards[row] = row_block[_REWARD, j]
-                over[row] = row_block[_OVER, j] != 0.0
+                i = which[j]
+                rows[i] += 1
+                azimuth[i] = single_block[_AZIMUTH, j]
+                rewards[i] = single_block[_REWARD, j]
+                over[i] = single_block[_OVER, j] != 0.0
             n, after = _next_group(after, last, active, which)
 
     return compiled(makes_arrays=True)(step_rows)
@@ -147,14 +151,15 @@ def _step_of(own):
 def _sense_of(own):
     """Readings, for parameters of each row's own, or for one vehicle."""
 
-    def sense_rows(
-        first, last, active, params, sensors, flags, x, rows, streams, bias, held, observations,
-    ):  # fmt: skip
-        """New readings of the active rows first..last-1. See fleet.Fleet for the arrays."""
+    def sense_rows(first, last, active, x, heli, world, observations):
+        """New readings of the active rows first..last-1, at the states `x` (n, 26)."""
+        rows, streams, params = heli.rows, heli.streams, heli.params
+        bias, held, sensors, flags = heli.bias, heli.held, world.sensors[0], world.flags
         which, order = np.empty(SIMD_WIDTH, np.int64), np.empty(last - first, np.int64)
         count = len(sensors)
         x_block, reading_block = np.empty((N_FULL, SIMD_WIDTH)), np.empty((N_CHANNELS, SIMD_WIDTH))
-        held_block, row_block = np.empty((held.shape[1], SIMD_WIDTH)), np.empty((1, SIMD_WIDTH))
+        held_block = np.empty((held.shape[1], SIMD_WIDTH))
+        row_block = np.empty((1, SIMD_WIDTH))
         bias_block, value_block = np.zeros((count, SIMD_WIDTH)), np.empty((count, SIMD_WIDTH))
         stream_block, work = np.empty((2, SIMD_WIDTH), np.uint64), simd_scratch(WORK_SIZE)
         x_, held_, row_ = simd_view(x_block), simd_view(held_block), simd_view(row_block)
@@ -186,8 +191,8 @@ def _sense_of(own):
                 row_block[0, j] = rows[which[j]]
             # without effects the actuators are where they were sent, and time has no part
             measure_bare(x_, x_[N_STATES:], p, work, readings_)
-            seen(x_, readings_, sensors, values_)
-            read(values_, row_[0], sensors, bias_, stream_, flags, held_)
+            measured_quantities(x_, readings_, sensors, values_)
+            take_samples(values_, row_[0], sensors, bias_, stream_, flags, held_)
             scatter(held_block, which, n, held)
             scatter(held_block, which, n, observations)
             scatter(stream_block, which, n, streams)
@@ -195,51 +200,43 @@ def _sense_of(own):
     return compiled(makes_arrays=True)(sense_rows)
 
 
+# numba's cache wants what a compiled function calls as global names
 _step_shared, _step_own = _step_of(False), _step_of(True)
 _sense_shared, _sense_own = _sense_of(False), _sense_of(True)
 
 
 def _fly_of(own):
-    """The batch kernel for parameters of each row's own, or for one vehicle."""
+    """One control period, for parameters of each row's own, or for one vehicle."""
 
-    def fly(
-        first, last, active, actions, trim, scale, params, sensors, limits, gust, flags,
-        weights, scales, x, u, rows, azimuth, streams, asked, bias, targets, held, flown,
-        observations, rewards, terms, over,
-    ):  # fmt: skip
-        """One control period of the active rows first..last-1. See fleet.Fleet for the arrays."""
+    def fly(first, last, active, actions, x, flown, heli, world, mission, outcome):
+        """One control period of the active rows first..last-1.
+
+        Args:
+            first, last: the share of the rows. active: which of them fly, (n,) bool.
+            actions: (n, 4). x: full states, (n, 26). flown: where those after the period are put.
+            heli, world, mission, outcome: the batch's arrays, arrays.py.
+        """
+        observations = outcome.observations
         for start in range(first, last, CHUNK):
             end = min(start + CHUNK, last)
             if own:
-                _step_own(
-                    start, end, active, actions, trim, scale, params, limits, gust, weights, scales,
-                    x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
-                )  # fmt: skip
+                _step_own(start, end, active, actions, x, flown, heli, world, mission, outcome)
             else:
-                _step_shared(
-                    start, end, active, actions, trim, scale, params, limits, gust, weights, scales,
-                    x, u, rows, azimuth, streams, asked, targets, flown, rewards, terms, over,
-                )  # fmt: skip
+                _step_shared(start, end, active, actions, x, flown, heli, world, mission, outcome)
             for i in range(start, end):
                 if not active[i]:
-                    rest(x[i], flown[i])
-                    rest(held[i], observations[i])
-                    for k in range(terms.shape[1]):
-                        terms[i, k] = 0.0
-                    rewards[i] = 0.0
-                    over[i] = False
+                    copy_row(x[i], flown[i])
+                    copy_row(heli.held[i], observations[i])
+                    for k in range(outcome.terms.shape[1]):
+                        outcome.terms[i, k] = 0.0
+                    outcome.rewards[i] = 0.0
+                    outcome.over[i] = False
             if own:
-                _sense_own(
-                    start, end, active, params, sensors, flags, flown, rows, streams, bias, held,
-                    observations,
-                )  # fmt: skip
+                _sense_own(start, end, active, flown, heli, world, observations)
             else:
-                _sense_shared(
-                    start, end, active, params, sensors, flags, flown, rows, streams, bias, held,
-                    observations,
-                )  # fmt: skip
+                _sense_shared(start, end, active, flown, heli, world, observations)
 
-    return compiled(makes_arrays=True)(fly)
+    return looked_up_once(compiled(makes_arrays=True)(fly))
 
 
 fly_shared = _fly_of(False)
@@ -272,5 +269,7 @@ def fly_dynamics(x: np.ndarray, u: np.ndarray, vehicle: Vehicle, threads: int = 
         x: full states, (count, 26). u: commands and time, (count, 5).
     """
     if vehicle.vector[effects.SWITCHES].any():
-        raise InputError(f"vehicle {vehicle.name!r} has effects: lanes are for those without")
+        raise InputError(
+            f"vehicle {vehicle.name!r} has effects: the SIMD batch is for those without"
+        )
     in_threads(lambda a, b: _dynamics_rows(a, b, x, u, vehicle.vector), len(x), threads)

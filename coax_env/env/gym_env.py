@@ -1,19 +1,20 @@
-"""CoaxHeli-v0: a small coaxial helicopter for Gymnasium, one or many.
+"""CoaxHeli-v0: a small coaxial helicopter for Gymnasium.
 
-Both envs are thin shells over the same batch kernel (fleet.py); `CoaxEnv` is a fleet of one.
+`CoaxEnv` is a thin shell over a fleet of one (fleet.py), as `CoaxVectorEnv` (vector_env.py) is over one
+of many.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 
 from coax_env.env import hover, tasks
-from coax_env.env.fleet import Fleet, Nominal
+from coax_env.env.actions import Nominal
+from coax_env.env.fleet import Fleet
 from coax_env.env.randomisation import Randomize
+from coax_env.env.screen import RENDER_MODES, Screen, checked_render_mode
 from coax_env.env.spaces import action_space, observation_space, observed
 from coax_env.errors import InputError
 from coax_env.model.layout import N_FULL, N_STATES
@@ -139,7 +140,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     - v0: first.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": _FPS}  # noqa: RUF012
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": _FPS}  # noqa: RUF012
 
     def __init__(
         self,
@@ -154,7 +155,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         task: str = "hover",
         target: Any = None,
     ) -> None:
-        self.render_mode = _render_mode(render_mode)
+        self.render_mode = checked_render_mode(render_mode)
         self.fleet = Fleet(
             1, vehicle, nominal, sensors, wind, gusts, randomize,
             turbulence=turbulence, task=task, target=target,
@@ -165,7 +166,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_names = tuple(entry.name for entry in entries)
         self.observation_units = tuple(entry.unit for entry in entries)
         self._terms = self.fleet.task.terms
-        self._screen = _Screen(self.fleet, render_mode)
+        self._screen = Screen(self.fleet, render_mode)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -177,9 +178,9 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self.fleet.seed(0, seed)
         elif fresh:
             self.fleet.seed(0, int(self.np_random.integers(2**63)))
-        observation = self.fleet.restart(_ALL, _start_states(options, 1))[0]
-        self._screen.moved()
-        info = self._told()
+        observation = self.fleet.restart(_ALL, start_states(options, 1))[0]
+        self._screen.update()
+        info = self._info()
         if self.fleet.draws.random:
             drawn = self.fleet.drawn[0].tolist()
             info["vehicle"] = dict(zip(self.fleet.draws.names, drawn, strict=True))
@@ -189,8 +190,8 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """One control period of 0.01 s."""
         outcome = self.fleet.fly(np.array(action, dtype=np.float64).reshape(1, 4), _ALL)
         if self.render_mode is not None:
-            self._screen.moved()
-        info = self._told()
+            self._screen.update()
+        info = self._info()
         terms = outcome.terms.tolist()[0]
         info["reward_terms"] = dict(zip(self._terms, terms))  # noqa: B905 - strict is slow
         reward, over = outcome.rewards.item(), outcome.over.item()
@@ -204,225 +205,18 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Close the window, if there is one."""
         self._screen.close()
 
-    def _told(self) -> dict[str, Any]:
+    def _info(self) -> dict[str, Any]:
         fleet = self.fleet
         info: dict[str, Any] = {"state": fleet.x[0].copy()}
-        if fleet.task.aims:
+        if fleet.task.shows_target:
             info["target"] = fleet.targets[0].copy()
         if fleet.task.moves_on:
             info["reached"] = int(fleet.progress[0, tasks.REACHED])
         return info
 
 
-class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Many `CoaxEnv` in one compiled batch; row i seeded s flies as a single env seeded s + i.
-
-    Arguments are those of `CoaxEnv`, and
-
-    - ``num_envs``: number of helicopters.
-    - ``max_episode_steps``: the time limit; None for none.
-    - ``autoreset_mode``: NEXT_STEP (default), SAME_STEP (``info["final_obs"]`` and
-      ``info["final_info"]`` then hold what the flight ended with, row by row) or DISABLED (an ended
-      row stays as it is until ``reset(options={"reset_mask": mask})``).
-    - ``threads``: at most so many; default one per 256 rows and processor.
-
-    Infos are those of `CoaxEnv` with a first axis of num_envs, and masks ``_NAME`` as Gymnasium has
-    them: ``info["state"]`` is (num_envs, 26) and read-only, ``info["reward_terms"]`` and
-    ``info["vehicle"]`` (where rows have started anew) are dicts of (num_envs,). ``render`` gives one
-    picture per row.
-    """
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        vehicle: str | Vehicle = "lama400d",
-        nominal: Nominal = None,
-        sensors: str = "onboard",
-        wind: float | Sequence[float] | None = None,
-        gusts: tuple[float, float] | None = None,
-        randomize: Randomize = None,
-        render_mode: str | None = None,
-        max_episode_steps: int | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        threads: int | None = None,
-        turbulence: float | str | None = None,
-        task: str = "hover",
-        target: Any = None,
-    ) -> None:
-        if num_envs < 1:
-            raise InputError(f"num_envs must be at least 1, found {num_envs}")
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {**CoaxEnv.metadata, "autoreset_mode": self.autoreset_mode}
-        self.render_mode = _render_mode(render_mode)
-        self.num_envs = num_envs
-        self.max_episode_steps = max_episode_steps
-        self.fleet = Fleet(
-            num_envs, vehicle, nominal, sensors, wind, gusts, randomize, threads,
-            turbulence, task, target,
-        )  # fmt: skip
-        entries = observed(self.fleet)
-        self.single_observation_space = observation_space(entries)
-        self.single_action_space = action_space()
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_names = tuple(entry.name for entry in entries)
-        self.observation_units = tuple(entry.unit for entry in entries)
-        self._ended = np.zeros(num_envs, dtype=np.bool_)
-        self._every = np.ones(num_envs, dtype=np.bool_)
-        self._seeded = False
-        self._screen = _Screen(self.fleet, render_mode)
-
-    def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start new flights in all rows, or in those of ``options["reset_mask"]``.
-
-        Args:
-            seed: row i gets the stream of seed + i, or of seed[i]; None: streams go on.
-        """
-        which = np.asarray((options or {}).get("reset_mask", self._every), dtype=np.bool_)
-        if which.shape != (self.num_envs,):
-            raise InputError(f"reset_mask must have shape ({self.num_envs},), found {which.shape}")
-        first = seed if isinstance(seed, int | np.integer) else None
-        super().reset(seed=first)
-        if seed is None and not self._seeded:
-            first = int(self.np_random.integers(2**62))
-        if first is not None:
-            seeds: list[int | None] = [int(first) + i for i in range(self.num_envs)]
-        else:
-            seeds = [None] * self.num_envs if seed is None else list(seed)  # type: ignore[arg-type]
-        if len(seeds) != self.num_envs:
-            raise InputError(f"seed must be one number or {self.num_envs}, found {len(seeds)}")
-        for i, row_seed in enumerate(seeds):
-            if row_seed is None and not self._seeded:
-                row_seed = int(self.np_random.integers(2**62))
-            if row_seed is not None and (which[i] or not self._seeded):
-                self.fleet.seed(i, row_seed)
-        self._seeded = True
-        self._ended &= ~which
-        self.fleet.x = self.fleet.x.copy()
-        observations = self.fleet.restart(which, _start_states(options, self.num_envs))
-        self._screen.moved()
-        return observations, self._told(which) | self._vehicles(which)
-
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One control period of every row; ended rows as `autoreset_mode` says."""
-        fleet, ended = self.fleet, self._ended
-        waiting = ended.any()
-        active = ~ended if waiting else self._every
-        anew = ended if waiting and self.autoreset_mode == AutoresetMode.NEXT_STEP else None
-        commands = np.array(actions, dtype=np.float64).reshape(self.num_envs, 4)
-        outcome = fleet.fly(commands, active, anew)
-        terminated = outcome.over
-        truncated = np.zeros(self.num_envs, dtype=np.bool_)
-        if self.max_episode_steps is not None:
-            truncated = (fleet.rows >= self.max_episode_steps) & active
-        observations = outcome.observations
-        info: dict[str, Any] = {}
-        done = terminated | truncated
-        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
-            if waiting:
-                info |= self._vehicles(ended)
-            self._ended = done
-        elif self.autoreset_mode == AutoresetMode.DISABLED:
-            terminated = terminated | ended
-            self._ended = ended | done
-        elif done.any():
-            info["final_obs"] = observations.copy()
-            info["final_info"] = self._step_info(outcome.terms)
-            info["_final_obs"] = info["_final_info"] = done
-            fleet.x = fleet.x.copy()
-            fleet.restart(done, observations=observations)
-            info |= self._vehicles(done)
-        info |= self._step_info(outcome.terms)
-        self._screen.moved()
-        return observations, outcome.rewards, terminated, truncated, info
-
-    def render(self) -> tuple[np.ndarray, ...] | None:
-        """One picture per row in mode ``rgb_array``; ``human`` shows the first row's."""
-        rows = range(self.num_envs)
-        return self._screen.pictures(rows) if self.render_mode == "rgb_array" else None
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Close the window, if there is one."""
-        self._screen.close()
-
-    def _step_info(self, terms: np.ndarray) -> dict[str, Any]:
-        named = {name: terms[:, k] for k, name in enumerate(self.fleet.task.terms)}
-        every = self._every.copy()
-        return self._told(every) | {"reward_terms": _masked(named, every), "_reward_terms": every}
-
-    def _told(self, which: np.ndarray) -> dict[str, Any]:
-        fleet = self.fleet
-        state = fleet.x.view()
-        state.flags.writeable = False
-        info: dict[str, np.ndarray] = {"state": state}
-        if fleet.task.aims:
-            info["target"] = fleet.targets.copy()
-        if fleet.task.moves_on:
-            info["reached"] = fleet.progress[:, tasks.REACHED].copy()
-        return _masked(info, which.copy())
-
-    def _vehicles(self, which: np.ndarray) -> dict[str, Any]:
-        """What the rows of a mask drew, where vehicles are drawn."""
-        draws = self.fleet.draws
-        if not draws.random:
-            return {}
-        drawn, which = self.fleet.drawn.copy(), which.copy()
-        named = {name: drawn[:, k] for k, name in enumerate(draws.names)}
-        return {"vehicle": _masked(named, which), "_vehicle": which}
-
-
-def _masked(info: Mapping[str, np.ndarray], which: np.ndarray) -> dict[str, Any]:
-    """Gymnasium's form of a batch's info: with every key, which rows have it."""
-    return {**info, **{f"_{name}": which for name in info}}
-
-
-def _render_mode(render_mode: str | None) -> str | None:
-    modes = CoaxEnv.metadata["render_modes"]
-    if render_mode not in (None, *modes):
-        raise InputError(f"render_mode must be None, {' or '.join(modes)}, found {render_mode!r}")
-    return render_mode
-
-
-class _Screen:
-    """Pictures of a fleet, where they are wanted; drawing is imported with the first of them."""
-
-    def __init__(self, fleet: Fleet, render_mode: str | None) -> None:
-        self._fleet, self._mode = fleet, render_mode
-        self._renderer: Any = None
-        self._traces: Any = None
-        if render_mode is not None:
-            from coax_env.env.rendering import Renderer
-            from coax_env.env.scene import Traces
-
-            self._renderer, self._traces = Renderer(), Traces(fleet)
-
-    def moved(self) -> None:
-        """The fleet has reset or flown a row: remember it, and show it on a screen now and then."""
-        if self._mode is None:
-            return
-        from coax_env.env.rendering import HUMAN_EVERY
-
-        self._traces.record()
-        if self._mode == "human" and self._fleet.rows[0] % HUMAN_EVERY == 0:
-            self._renderer.show(self._traces.view(0))
-
-    def pictures(self, rows: Iterable[int]) -> tuple[np.ndarray, ...]:
-        """One picture of each row."""
-        return tuple(self._renderer.picture(self._traces.view(row)) for row in rows)
-
-    def close(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-
-
-def _start_states(options: dict[str, Any] | None, count: int) -> np.ndarray | None:
+def start_states(options: dict[str, Any] | None, count: int) -> np.ndarray | None:
+    """``options["state"]`` of a reset for so many helicopters, (count, 16 or 26); None without."""
     if not options or "state" not in options:
         return None
     states = np.asarray(options["state"], dtype=float)

@@ -11,10 +11,12 @@ import math
 
 import numpy as np
 
+from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled
 from coax_env.kernel.random_streams import uniform
 from coax_env.kernel.simd import negated, select
-from coax_env.model.layout import N_FULL, PLACE, RATE, VELOCITY
+from coax_env.model import state as S
+from coax_env.model.layout import N_COMMANDS, N_FULL, PLACE, RATE, VELOCITY
 
 HEIGHT = 1.5  # [m] of the centre of gravity above ground
 CONTROL_PERIOD = 0.01  # [s]
@@ -77,38 +79,40 @@ _RATE, _VELOCITY, _RISE = START["rate"], START["velocity"], START["height"]
 
 
 @compiled()
-def start(stream, command, x):
+def random_start(stream, command, x):
     """A random start into the full state `x` (26,): rotors and swash settled on `command` (4,)."""
     for i in range(N_FULL):
         x[i] = 0.0
     for i in range(3):
-        x[i] = uniform(stream, -_VELOCITY, _VELOCITY)
-        x[3 + i] = uniform(stream, -_RATE, _RATE)
-    x[10] = uniform(stream, -_TILT, _TILT)
-    x[11] = uniform(stream, -_TILT, _TILT)
-    x[12] = uniform(stream, -_HEADING, _HEADING)
-    x[15] = -HEIGHT - uniform(stream, -_RISE, _RISE)
-    for i in range(4):
-        x[16 + i] = command[i]
+        x[S.U + i] = uniform(stream, -_VELOCITY, _VELOCITY)
+        x[S.P + i] = uniform(stream, -_RATE, _RATE)
+    x[S.PHI] = uniform(stream, -_TILT, _TILT)
+    x[S.THETA] = uniform(stream, -_TILT, _TILT)
+    x[S.PSI] = uniform(stream, -_HEADING, _HEADING)
+    x[S.Z] = -HEIGHT - uniform(stream, -_RISE, _RISE)
+    for i in range(N_COMMANDS):
+        x[S.OMEGA_U + i] = command[i]
 
 
 @compiled()
 def reward(x, action, target, weights, scales, terms):
-    """Sum of the weighted reward terms at a full state (26,) after an action (4,).
+    """Sum of the weighted reward terms; they are all zero where the state is not finite.
 
-    `target` is x y z psi, (4,); `weights` and `scales`, (N_TERMS,), are in REWARD_TERMS' order. The
-    weighted terms go into `terms` (N_TERMS,); all are zero where the state is not finite.
+    Args:
+        x: full state, (26,). action: (4,). target: x y z psi, (4,).
+        weights, scales: in REWARD_TERMS' order, (N_TERMS,) or more.
+        terms: the weighted terms are put here, (N_TERMS,) or more.
     """
-    north, east, turn = x[13] - target[0], x[14] - target[1], x[12] - target[3]
-    heading = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
-    up = x[15] - target[2]
+    north, east = x[S.X] - target[0], x[S.Y] - target[1]
+    heading = wrap_angle(x[S.PSI] - target[3])
+    up = x[S.Z] - target[2]
     # errors squared, in REWARD_TERMS' order
     terms[0] = 0.0  # alive
     terms[1] = up * up
     terms[2] = north * north + east * east
-    terms[3] = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
+    terms[3] = x[S.U] * x[S.U] + x[S.V] * x[S.V] + x[S.W] * x[S.W]
     terms[4] = heading * heading
-    terms[5] = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]
+    terms[5] = x[S.P] * x[S.P] + x[S.Q] * x[S.Q] + x[S.R] * x[S.R]
     terms[6] = (
         action[0] * action[0] + action[1] * action[1]
         + action[2] * action[2] + action[3] * action[3]
@@ -117,10 +121,10 @@ def reward(x, action, target, weights, scales, terms):
     for k in range(N_TERMS):
         terms[k] = weights[k] * scales[k] / (scales[k] + math.sqrt(terms[k]))
         total += terms[k]
-    fine = math.isfinite(total)
+    finite = math.isfinite(total)
     for k in range(N_TERMS):
-        terms[k] = select(fine, terms[k], 0.0)
-    return select(fine, total, 0.0)
+        terms[k] = select(finite, terms[k], 0.0)
+    return select(finite, total, 0.0)
 
 
 @compiled()
@@ -131,11 +135,11 @@ def is_over(x):
         nought += 0.0 * x[i]  # NaN where a state is not finite
     inside = (
         (nought == 0.0)
-        & (-x[15] > LOWEST)
-        & (-x[15] < HIGHEST)
-        & (math.cos(x[10]) * math.cos(x[11]) > _COS_STEEPEST)
-        & (x[13] * x[13] + x[14] * x[14] < FARTHEST * FARTHEST)
-        & (x[0] * x[0] + x[1] * x[1] + x[2] * x[2] < FASTEST * FASTEST)
+        & (-x[S.Z] > LOWEST)
+        & (-x[S.Z] < HIGHEST)
+        & (math.cos(x[S.PHI]) * math.cos(x[S.THETA]) > _COS_STEEPEST)
+        & (x[S.X] * x[S.X] + x[S.Y] * x[S.Y] < FARTHEST * FARTHEST)
+        & (x[S.U] * x[S.U] + x[S.V] * x[S.V] + x[S.W] * x[S.W] < FASTEST * FASTEST)
     )
     return negated(inside)  # a comparison with NaN is false
 
@@ -151,9 +155,9 @@ def squared_errors(states: np.ndarray, targets: np.ndarray | None = None) -> dic
         height, position (horizontal), speed, heading, rates: each of shape (...).
     """
     goal = np.array([0.0, 0.0, -HEIGHT, 0.0]) if targets is None else targets
-    heading = (states[..., 12] - goal[..., 3] + math.pi) % (2.0 * math.pi) - math.pi
+    heading = (states[..., S.PSI] - goal[..., 3] + math.pi) % (2.0 * math.pi) - math.pi
     return {
-        "height": (states[..., 15] - goal[..., 2]) ** 2,
+        "height": (states[..., S.Z] - goal[..., 2]) ** 2,
         "position": ((states[..., PLACE] - goal[..., 0:2]) ** 2).sum(-1),
         "speed": (states[..., VELOCITY] ** 2).sum(-1),
         "heading": heading**2,

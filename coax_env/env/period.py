@@ -1,12 +1,18 @@
-"""One control period of a helicopter, in parts: command, gusts, judgement and readings.
+"""One control period of one helicopter, in parts::
 
-Each part takes one helicopter's rows of numbers, or SIMD_WIDTH helicopters' rows of lanes (simd.py), and
-is compiled for what it is given. fleet.py and fleet_simd.py put the parts together.
+    command -> give_command (limits, the servos' delay) -> add_gusts -> fly_period (dynamics.step)
+            -> true_readings (dynamics.measure, vibration) -> take_samples (sampling.py)
+
+The batch (flight_loop.py), the SIMD batch (fleet_simd.py) and simulated maneuvers (simulation/) put the
+same parts together, so that what is logged is what is flown. Each part takes one helicopter's rows of
+numbers; those that the SIMD batch uses also take the rows of SIMD_WIDTH helicopters (simd.py), and are
+compiled for what they are given.
 """
 
 import math
 
 from coax_env.env import hover
+from coax_env.kernel.angles import TURN
 from coax_env.kernel.compilation import compiled
 from coax_env.kernel.random_streams import (
     bits_ahead,
@@ -17,18 +23,35 @@ from coax_env.kernel.random_streams import (
     two_normals,
 )
 from coax_env.kernel.simd import anywhere, select
+from coax_env.model import effects
 from coax_env.model import parameters as P
-from coax_env.model.layout import N_CHANNELS
-from coax_env.model.sensors import new_samples
+from coax_env.model import state as S
+from coax_env.model.actuators import limit
+from coax_env.model.dynamics import measure, step
+from coax_env.model.layout import TIME
+from coax_env.model.sampling import (
+    DROPOUT,
+    FLAG,
+    HIGH,
+    INSTRUMENT,
+    LOW,
+    NOISE,
+    RATE,
+    WRAPS,
+    add_vibration,
+    new_samples,
+    received,
+    within_a_turn,
+)
 
 DT = hover.CONTROL_PERIOD
 
-# columns of the sensor table the kernel reads
-(
-    INDEX, NOISE, RATE, LOW, HIGH, WRAPS, FLAG, LATE, DROPOUT, INSTRUMENT, BIAS, BIAS_STD
-) = range(12)  # fmt: skip
+_DELAY = effects.parameter_index("servo_delay.time")
+_VIBRATION = effects.parameter_index("vibration.amplitude")
+_LON, _LAT = 2, 3  # the swash commands, of the four
 
-_TURN = 2.0 * math.pi
+
+# --- commands -----------------------------------------------------------------------------------------
 
 
 @compiled()
@@ -41,47 +64,135 @@ def command(action, trim, scale, u):
         u[k] = trim[k] + scale[k] * action[k]
 
 
+def delay_slots(delay: float, dt: float = DT) -> int:
+    """Slots of the ring of swash commands for a servo delay of up to so many seconds."""
+    return 2 + math.ceil(delay / dt) if delay > 0.0 else 1
+
+
 @compiled()
-def blow(x, p, gust, stream):
+def give_command(u, last, limits, ring, row, dt):
+    """The command of a row, in `u`, after the actuators' limits: on its way to them from now on.
+
+    Args:
+        u: commands and time since the flight's start, (5,), in place.
+        last: the command given in the row before, (4,); this one afterwards.
+        limits: `actuators.limits`, (3, 4).
+        ring: swash commands given in the last rows, (slots, 2), see `delay_slots`.
+        row: control periods flown so far. dt: seconds per row.
+    """
+    limit(u, last, limits, dt)
+    slot = row % len(ring)
+    ring[slot, 0], ring[slot, 1] = u[_LON], u[_LAT]
+    u[TIME] = row * dt
+
+
+@compiled()
+def _split(delay, slots, dt):
+    """A servo delay [s] as whole rows, and the seconds of a row for which the command before holds."""
+    whole = min(int(delay / dt + 1e-9), slots - 2)
+    rest = min(max(delay - whole * dt, 0.0), dt)
+    return whole, rest if rest > 1e-9 else 0.0
+
+
+@compiled()
+def arrive_at_servos(u, p, ring, row, dt):
+    """Put into `u` the swash command that is in force as a row begins; arguments as `give_command`."""
+    slots = len(ring)
+    if p[_DELAY] <= 0.0 or slots == 1:
+        return
+    whole, rest = _split(p[_DELAY], slots, dt)
+    _take_swash(ring, row - whole - (1 if rest > 0.0 else 0), u)
+
+
+@compiled()
+def _take_swash(ring, row, u):
+    """The swash command that was given in a row, into `u`."""
+    slot = row % len(ring)
+    u[_LON], u[_LAT] = ring[slot, 0], ring[slot, 1]
+
+
+# --- flight -------------------------------------------------------------------------------------------
+
+
+@compiled()
+def fly_period(x, u, p, ring, row, dt, work):
+    """Fly one control period in place, after `give_command`.
+
+    A pure delay of the servos is a look-up of the command that was given that long ago; where it is
+    no whole number of periods, the period is split. Leaves in `u` the command in force at the end.
+
+    Args:
+        x: full state, (26,). u, ring, row, dt: as in `give_command`. p: parameter vector.
+        work: scratch, (dynamics.WORK_SIZE,).
+    """
+    slots = len(ring)
+    if p[_DELAY] <= 0.0 or slots == 1:
+        step(x, u, dt, p, work, x)
+        return
+    whole, rest = _split(p[_DELAY], slots, dt)
+    if rest > 0.0:
+        _take_swash(ring, row - whole - 1, u)
+        step(x, u, rest, p, work, x)
+        u[TIME] += rest
+    _take_swash(ring, row - whole, u)
+    if dt - rest > 1e-9:
+        step(x, u, dt - rest, p, work, x)
+
+
+@compiled()
+def next_azimuth(azimuth, speed, dt):
+    """Azimuth [rad] of a rotor of this speed [rad/s] after `dt` seconds, within a turn."""
+    azimuth = azimuth + dt * speed
+    return azimuth - TURN * math.floor(azimuth / TURN)
+
+
+@compiled()
+def gust_growth(dt, memory):
+    """What a gust of unit std gains over `dt` seconds to stay of unit std, as a std."""
+    return math.sqrt(1.0 - math.exp(-2.0 * dt / memory))
+
+
+@compiled()
+def add_gusts(x, p, gust, stream):
     """Move the gust states on by one period: exponential memory, stationary std `gust` (2,)."""
-    share = math.sqrt(1.0 - math.exp(-2.0 * DT / p[P.GUST_MEMORY]))
+    share = gust_growth(DT, p[P.GUST_MEMORY])
     for half in range(2):
         if gust[half] > 0.0:
+            first = S.GUST_X + 3 * half
             a, b = two_normals(stream)
             c, _ = two_normals(stream)
-            x[20 + 3 * half] += share * gust[half] * a
-            x[21 + 3 * half] += share * gust[half] * b
-            x[22 + 3 * half] += share * gust[half] * c
+            x[first] += share * gust[half] * a
+            x[first + 1] += share * gust[half] * b
+            x[first + 2] += share * gust[half] * c
+
+
+# --- readings -----------------------------------------------------------------------------------------
 
 
 @compiled()
-def turned(azimuth, speed):
-    """Azimuth [rad] of a rotor of this speed [rad/s] after one period, within a turn."""
-    azimuth = azimuth + DT * speed
-    return azimuth - _TURN * math.floor(azimuth / _TURN)
+def true_readings(x, u, p, azimuth, work, readings):
+    """Every channel without its sensor's errors, (18,), into `readings`; the vibration is in them.
+
+    Args:
+        x, u, p, work: as in `fly_period`. azimuth: of the upper rotor [rad].
+    """
+    measure(x, u, p, work, readings)
+    if p[_VIBRATION] != 0.0:
+        add_vibration(readings, azimuth, p[_VIBRATION])
 
 
 @compiled()
-def seen(x, readings, sensors, out):
-    """What the sensors look at, of the readings (18,) and the state (26,), into `out`."""
-    for k in range(len(sensors)):
-        index = int(sensors[k, INDEX])
-        out[k] = readings[index] if index < N_CHANNELS else x[index - N_CHANNELS]
-
-
-@compiled()
-def rest(row, out):
-    """One row of numbers into another: of a helicopter that does not fly."""
-    for k in range(len(row)):
-        out[k] = row[k]
-
-
-@compiled()
-def read(values, row, sensors, bias, stream, flags, held):
+def take_samples(values, row, sensors, bias, stream, flags, held):
     """New readings where they are due, into `held`: readings, then this many flags.
 
     A sensor's noise, and an instrument's chance of losing a sample, have their own places in the
     stream of random numbers: every row takes twice as many as there are sensors.
+
+    Args:
+        values: what the sensors measure, without errors, (n_sensors,).
+        row: control periods since the flight's start.
+        sensors: `sampling.sensor_table`. bias: of this flight, (n_sensors,).
+        stream: key and counter, (2,) uint64. flags: how many. held: (n_sensors + flags or more,).
     """
     n = len(sensors)
     for k in range(n, n + flags):
@@ -107,12 +218,11 @@ def read(values, row, sensors, bias, stream, flags, held):
                 pair = here
                 first, second = normals_of(bits_ahead(place, pair))
             value += noise * (first if even else second)
-        if sensors[k, WRAPS] != 0.0:
-            value -= _TURN * math.floor((value + math.pi) / _TURN)
+        value = within_a_turn(value, sensors[k, WRAPS])
         got = new
         if sensors[k, DROPOUT] > 0.0:
             chance = chance_of(bits_ahead(place, n + int(sensors[k, INSTRUMENT])))
-            got = select((row <= 0) | (chance >= sensors[k, DROPOUT]), got, 0.0)
+            got = received(new, row, chance, sensors[k, DROPOUT])
         before = held[k]
         value = select(math.isfinite(value), value, before)
         value = select(got < 1.0, before, value)
@@ -121,3 +231,10 @@ def read(values, row, sensors, bias, stream, flags, held):
         if flag >= 0:
             held[flag] = max(held[flag], min(got, 1.0))
     skip(stream, 2 * n)
+
+
+@compiled()
+def copy_row(row, out):
+    """One row of numbers into another."""
+    for k in range(len(row)):
+        out[k] = row[k]

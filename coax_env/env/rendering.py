@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.env.fleet import DT
+from coax_env.env.period import DT
 from coax_env.env.scene import (
     LOWER,
     PICTURE,
@@ -27,7 +27,9 @@ from coax_env.env.scene import (
     flybar,
 )
 from coax_env.errors import InputError, require
+from coax_env.kernel.angles import wrap_angle
 from coax_env.model import parameters as P
+from coax_env.model import state as S
 from coax_env.model.layout import ATTITUDE, PLACE, POSITION, RPM_PER_RAD_S, VELOCITY
 
 SIMD_WIDTH, HEIGHT = PICTURE
@@ -237,7 +239,7 @@ class Renderer:
         self._polyline(_TRACE, [spot(*point) for point in view.trace[:, :2]], 2)
         if view.target is not None:
             self._heading_mark(_TARGET, spot(*view.target[:2]), view.target[3], 9.0)
-        self._heading_mark(_BODY, spot(*view.state[PLACE]), view.state[12], 12.0)
+        self._heading_mark(_BODY, spot(*view.state[PLACE]), view.state[S.PSI], 12.0)
         north, east = view.air[:2]
         speed = math.hypot(north, east)
         if speed >= 0.05:
@@ -272,15 +274,15 @@ class Renderer:
         x = view.state
         speed = float(np.linalg.norm(x[VELOCITY]))
         lines = [
-            ("t", f"{view.seconds:.2f} s", "height", f"{-x[15]:.2f} m"),
-            ("speed", f"{speed:.2f} m/s", "heading", f"{round(math.degrees(_wrapped(x[12])))}°"),
+            ("t", f"{view.seconds:.2f} s", "height", f"{-x[S.Z]:.2f} m"),
+            ("speed", f"{speed:.2f} m/s", "heading", f"{round(math.degrees(wrap_angle(x[S.PSI])))}°"),
             (
-                "roll", f"{math.degrees(x[10]):+.1f}°",
-                "pitch", f"{math.degrees(x[11]):+.1f}°",
+                "roll", f"{math.degrees(x[S.PHI]):+.1f}°",
+                "pitch", f"{math.degrees(x[S.THETA]):+.1f}°",
             ),
             (
-                "upper", f"{x[16] * RPM_PER_RAD_S:.0f} rpm",
-                "lower", f"{x[17] * RPM_PER_RAD_S:.0f} rpm",
+                "upper", f"{x[S.OMEGA_U] * RPM_PER_RAD_S:.0f} rpm",
+                "lower", f"{x[S.OMEGA_L] * RPM_PER_RAD_S:.0f} rpm",
             ),
         ]  # fmt: skip
         for k, (first, one, second, two) in enumerate(lines):
@@ -365,7 +367,3 @@ class Renderer:
 def _whole(middle: float, half: float, step: float) -> tuple[int, int]:
     """Range of the multiples of `step` within `half` of the middle."""
     return math.ceil((middle - half) / step), math.floor((middle + half) / step) + 1
-
-
-def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.env.fleet import DT, Fleet
+from coax_env.env.fleet import Fleet
+from coax_env.env.period import DT
 from coax_env.env.tasks import TASKS
 from coax_env.model import parameters as P
+from coax_env.model import state as S
 from coax_env.model.layout import POSITION
 
 PICTURE = (960, 540)  # [px] width and height of a picture
@@ -155,10 +157,10 @@ class Disc:
 def discs(view: View) -> tuple[Disc, Disc]:
     """Lower disc as the swash plate has tilted it, upper as the fly-bar has, (30)-(31)."""
     p, x = view.params, view.state
-    lower = Disc(float(x[6]), float(x[7]), True, LOWER)
+    lower = Disc(float(x[S.ALPHA_L]), float(x[S.BETA_L]), True, LOWER)
     upper = Disc(
-        float(p[P.FLYBAR_TO_ROTOR_LON] * x[8]),
-        float(p[P.FLYBAR_TO_ROTOR_LAT] * x[9]),
+        float(p[P.FLYBAR_TO_ROTOR_LON] * x[S.ALPHA_F]),
+        float(p[P.FLYBAR_TO_ROTOR_LAT] * x[S.BETA_F]),
         False,
         UPPER,
     )
@@ -167,7 +169,7 @@ def discs(view: View) -> tuple[Disc, Disc]:
 
 def flybar(view: View) -> np.ndarray:
     """The stabiliser bar, tip to tip, across the upper blades, (2, 3)."""
-    bar = Disc(float(view.state[8]), float(view.state[9]), False, UPPER)
+    bar = Disc(float(view.state[S.ALPHA_F]), float(view.state[S.BETA_F]), False, UPPER)
     return bar.blades(view.azimuth + 0.5 * math.pi)
 
 

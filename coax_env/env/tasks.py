@@ -17,8 +17,10 @@ import numpy as np
 
 from coax_env.env import hover
 from coax_env.errors import InputError
+from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled
 from coax_env.kernel.random_streams import uniform
+from coax_env.model import state as S
 from coax_env.model.layout import PLACE
 from coax_env.model.sensors import Sensor
 
@@ -45,7 +47,8 @@ class Task:
     """One task. Weights and scales have the same keys, but for ``alive`` and ``reached``.
 
     ``lowest`` and ``highest``: the box targets are drawn from, (north, east, height, heading).
-    ``aims``: whether the target is in the observation; ``moves_on``: whether one follows the other.
+    ``shows_target``: whether the way to the target is observed; ``moves_on``: whether one target
+    follows the other.
     """
 
     summary: str
@@ -53,7 +56,7 @@ class Task:
     scales: Mapping[str, float]
     lowest: tuple[float, float, float, float]
     highest: tuple[float, float, float, float]
-    aims: bool = True
+    shows_target: bool = True
     moves_on: bool = False
 
     @property
@@ -67,7 +70,7 @@ HOVER_TARGET = (0.0, 0.0, hover.HEIGHT, 0.0)
 TASKS: dict[str, Task] = {
     "hover": Task(
         "stay at 1.5 m over the start, heading north",
-        hover.REWARD_WEIGHTS, hover.REWARD_SCALES, HOVER_TARGET, HOVER_TARGET, aims=False,
+        hover.REWARD_WEIGHTS, hover.REWARD_SCALES, HOVER_TARGET, HOVER_TARGET, shows_target=False,
     ),
     "position": Task(
         "go to a position and a heading, and stay there",
@@ -91,16 +94,16 @@ TASKS: dict[str, Task] = {
 }  # fmt: skip
 """The tasks by name. ``reached`` is paid once per waypoint: more than moving on costs at first."""
 
-AIM = (
+WAY = (
     ("target_forward", "m", 50.0), ("target_right", "m", 50.0), ("target_up", "m", 10.0),
     ("heading_error", "rad", math.pi),
 )  # fmt: skip
-"""Name, unit and bound of what a task's target adds to the observation.
+"""Name, unit and bound of the way to the target, which such a task appends to the observation.
 
 Target minus *measured* position, turned by the measured heading; target minus measured heading.
 """
-N_AIM = len(AIM)
-_BOUNDS = np.array([bound for *_, bound in AIM])
+N_WAY = len(WAY)
+_BOUNDS = np.array([bound for *_, bound in WAY])
 
 WITHIN, REACHED = range(2)
 """Columns of a helicopter's progress: rows spent at the target so far, and targets reached."""
@@ -153,12 +156,12 @@ def box(name: str) -> np.ndarray:
 
 
 def places(name: str, sensors: Sequence[Sensor]) -> np.ndarray:
-    """Where the observation has north, east, height and heading, (4,); empty without an aim.
+    """Where the observation has north, east, height and heading, (4,); empty where no target is shown.
 
     Raises:
         InputError: the task needs a position that these sensors do not measure.
     """
-    if not task(name).aims:
+    if not task(name).shows_target:
         return np.empty(0, dtype=np.int64)
     names = [sensor.name for sensor in sensors]
     for wanted in (["x", "y", "z", "psi"], ["pn", "pe", "h", "psi"]):
@@ -176,8 +179,13 @@ def height_sign(name: str, sensors: Sequence[Sensor]) -> float:
 
 
 @compiled()
-def aim(stream, course, box, reached, target):
-    """The target after `reached` ones into `target` (4,): from the course, or drawn."""
+def next_target(stream, course, box, reached, target):
+    """The target after `reached` ones: from the course, or drawn.
+
+    Args:
+        stream: key and counter, (2,) uint64. course: targets given, x y z psi, (k, 4).
+        box: lowest and highest of those drawn, (2, 4). target: is put here, (4,).
+    """
     if len(course) > 0:
         k = min(reached, len(course) - 1)
         for i in range(4):
@@ -188,11 +196,15 @@ def aim(stream, course, box, reached, target):
 
 
 @compiled()
-def arrive(x, target, dwell, progress, course):
-    """Count a row at the target; whether this row completes it. `dwell` rows do, none where 0."""
-    east, north, down = x[14] - target[1], x[13] - target[0], x[15] - target[2]
-    turn = x[12] - target[3]
-    turn -= 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+def reaches(x, target, dwell, progress, course):
+    """Count a row at the target; whether this row completes it.
+
+    Args:
+        x: full state, (26,). target: x y z psi, (4,). dwell: rows that complete it; 0: none do.
+        progress: WITHIN and REACHED, (2,), in place. course: targets given, (k, 4).
+    """
+    east, north, down = x[S.Y] - target[1], x[S.X] - target[0], x[S.Z] - target[2]
+    turn = wrap_angle(x[S.PSI] - target[3])
     there = (
         north * north + east * east + down * down < RADIUS * RADIUS
         and abs(turn) < HEADING_TOLERANCE
@@ -207,17 +219,21 @@ def arrive(x, target, dwell, progress, course):
 
 
 @compiled()
-def point(held, places, height_sign, target, out):
-    """What the readings `held` say of the way to the target, AIM, into `out` (4,), within bounds."""
+def way_to_target(held, places, height_sign, target, out):
+    """The way to the target by the readings, WAY, within its bounds.
+
+    Args:
+        held: readings. places, height_sign: from the functions of these names.
+        target: x y z psi, (4,). out: is put here, (4,).
+    """
     psi = held[places[3]]
     north = target[0] - held[places[0]]
     east = target[1] - held[places[1]]
-    turn = target[3] - psi
     out[0] = math.cos(psi) * north + math.sin(psi) * east
     out[1] = math.cos(psi) * east - math.sin(psi) * north
     out[2] = height_sign * held[places[2]] - target[2]
-    out[3] = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
-    for i in range(N_AIM):
+    out[3] = wrap_angle(target[3] - psi)
+    for i in range(N_WAY):
         out[i] = min(max(out[i], -_BOUNDS[i]), _BOUNDS[i])
 
 

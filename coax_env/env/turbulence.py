@@ -10,7 +10,7 @@ and the forming filters of white noise, with tau = L/V, are::
     u: sigma sqrt(2 tau) / (1 + tau s)     v, w: sigma sqrt(tau) (1 + sqrt(3) tau s) / (1 + tau s)^2
 
 u lies along the mean wind, v across it, w is vertical. The model is stated from 10 ft (3 m) up; below,
-its values at 10 ft are taken. V is the speed at which the mean wind carries the eddies past: W by the
+its values at 10 ft are taken. V is the speed at which the mean wind carries turbulence past: W by the
 logarithmic law (roughness 0.15 ft, the standard's for take-off and landing); the machine's own speed
 is left out. Each filter is a state of unit variance or two, discretised exactly over a period.
 """
@@ -31,8 +31,8 @@ ROUGHNESS = 0.15 * FOOT  # [m]
 SEVERITIES = {"light": 15.0 * _KNOT, "moderate": 30.0 * _KNOT, "severe": 45.0 * _KNOT}
 """Wind at 6 m [m/s] of MIL-F-8785C's three severities."""
 
-N_EDDIES = 5
-"""States: one of u, two of v, two of w."""
+N_FILTERS = 5
+"""States of the forming filters: one of u, two of v, two of w."""
 
 _ROOT_3 = math.sqrt(3.0)
 
@@ -62,7 +62,7 @@ def wind_at_6m(turbulence: float | str | None) -> float:
 
 @compiled()
 def dryden(height, wind):
-    """Std and memory of the eddies at a height [m] with a mean wind at 6 m [m/s].
+    """Std and memory of turbulence at a height [m] with a mean wind at 6 m [m/s].
 
     Returns:
         sigma of u and v, and of w [m/s]; tau of u and v, and of w [s].
@@ -75,30 +75,35 @@ def dryden(height, wind):
 
 
 @compiled()
-def settle(stream, eddies):
-    """Draw the eddies (N_EDDIES,) as they are in turbulence that has always been there.
+def draw_filters(stream, filters):
+    """Draw the filters' states (N_FILTERS,) from their stationary distribution.
 
     A first-order state has variance 1; of a pair, the covariance is [[1, 1/2], [1/2, 1/2]].
     """
-    eddies[0], _ = two_normals(stream)
+    filters[0], _ = two_normals(stream)
     for k in (1, 3):
         first, second = two_normals(stream)
-        eddies[k] = first
-        eddies[k + 1] = 0.5 * (first + second)
+        filters[k] = first
+        filters[k + 1] = 0.5 * (first + second)
 
 
 @compiled()
-def stir(stream, eddies, height, wind, dt, air):
-    """Move the eddies on by `dt` seconds; the turbulent velocity u v w [m/s] into `air` (3,).
+def turbulence_step(stream, filters, height, wind, dt, air):
+    """Move the forming filters on by `dt` seconds.
 
     With z1' = (n - z1)/tau and z2' = (z1 - z2)/tau the second-order filter is
     sigma/sqrt(2) (sqrt(3) z1 + (1 - sqrt(3)) z2), n white so that z1 has variance 1.
+
+    Args:
+        stream: key and counter, (2,) uint64. filters: their states, (N_FILTERS,), in place.
+        height: [m]. wind: mean wind at 6 m [m/s]. dt: seconds.
+        air: the turbulent velocity u v w along, across and down [m/s], (3,), is put here.
     """
     sigma, sigma_w, tau, tau_w = dryden(height, wind)
     a, _ = two_normals(stream)
     keep = math.exp(-dt / tau)
-    eddies[0] = keep * eddies[0] + math.sqrt(1.0 - keep * keep) * a
-    air[0] = sigma * eddies[0]
+    filters[0] = keep * filters[0] + math.sqrt(1.0 - keep * keep) * a
+    air[0] = sigma * filters[0]
     for axis in (1, 2):
         s = dt / (tau if axis == 1 else tau_w)
         k = 2 * axis - 1
@@ -108,11 +113,11 @@ def stir(stream, eddies, height, wind, dt, air):
         l11 = math.sqrt(1.0 - square)
         l21 = (0.5 - square * (s + 0.5)) / l11
         l22 = math.sqrt(max(0.5 - square * (s * s + s + 0.5) - l21 * l21, 0.0))
-        first, second = eddies[k], eddies[k + 1]
-        eddies[k] = keep * first + l11 * a
-        eddies[k + 1] = keep * (s * first + second) + l21 * a + l22 * b
+        first, second = filters[k], filters[k + 1]
+        filters[k] = keep * first + l11 * a
+        filters[k + 1] = keep * (s * first + second) + l21 * a + l22 * b
         level = (sigma if axis == 1 else sigma_w) / math.sqrt(2.0)
-        air[axis] = level * (_ROOT_3 * eddies[k] + (1.0 - _ROOT_3) * eddies[k + 1])
+        air[axis] = level * (_ROOT_3 * filters[k] + (1.0 - _ROOT_3) * filters[k + 1])
 
 
 def spectrum(frequency: np.ndarray, sigma: float, tau: float, along: bool) -> np.ndarray:

@@ -17,7 +17,10 @@ from typing import Any
 import numba
 
 PACKAGE = Path(__file__).parents[1]
-TABLES = ("model/layout.py", "model/parameters.py", "model/workspace.py")
+TABLES = tuple(
+    f"model/{name}.py"
+    for name in ("channels", "inputs", "layout", "parameters", "state", "workspace")
+)
 """Places and sizes that compiled code has as constants; these files compile nothing themselves."""
 
 
@@ -124,3 +127,20 @@ def pointer(signature: Any) -> Callable[[Callable], Any]:
             return numba.cfunc(signature, **settings)(function)
 
     return decorate
+
+
+def looked_up_once(function: Any) -> Callable:
+    """A compiled function whose machine code is found at its first call and then called as it is.
+
+    numba looks at the types of all arguments at every call: microseconds where they are tuples of many
+    arrays. For functions that are always called with arguments of the same types (number of axes, type
+    of numbers, contiguous): nothing checks them any more.
+    """
+    found: list[Callable] = []
+
+    def call(*arguments: Any) -> Any:
+        if not found:
+            found.append(function.compile(tuple(numba.typeof(a) for a in arguments)))
+        return found[0](*arguments)
+
+    return call

@@ -1,10 +1,10 @@
 """Sensors: which channels are measured, how well, how often, and within which bounds.
 
 One table of suites serves the env, simulated flight folders and the controllers' estimator. True
-readings come from `dynamics.measure`, eq. (45), sensor effects included; here they get delay, noise,
-bias, a rate, limits and lost samples. Sources: Table V (noise), Table VI (ranges), contract.md (the
-rest). A vehicle file may have its own numbers for a channel (file_numbers.py); they take the place of
-the suites', in all suites but ``state``, which is exact.
+readings come from `dynamics.measure`, eq. (45), sensor effects included; sampling.py gives them delay,
+noise, bias, a rate, limits and lost samples. Sources of the numbers: Table V (noise), Table VI
+(ranges), contract.md (the rest). A vehicle file may have its own numbers for a channel
+(file_numbers.py); they take the place of the suites', in all suites but ``state``, which is exact.
 
 A channel slower than the 100 Hz of the control loop holds its last value, and its instrument has a
 flag in the observation that says whether it is new in this row. Which instruments have a flag is the
@@ -15,10 +15,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from coax_env.errors import InputError
-from coax_env.kernel.compilation import compiled
 from coax_env.model.layout import ACTUATOR_STATES, CHANNEL_UNITS, CHANNELS, N_CHANNELS, STATES
 from coax_env.model.vehicle import Vehicle
 
@@ -154,70 +151,3 @@ def log_suite(name: str, vehicle: Vehicle | None = None) -> tuple[Sensor, ...]:
 def slow_instruments(sensors: tuple[Sensor, ...]) -> tuple[str, ...]:
     """Instruments that their suite has slower than the control loop, in order: those with a flag."""
     return tuple(dict.fromkeys(s.instrument for s in sensors if s.flagged))
-
-
-_ACCELEROMETER = CHANNELS.index("ax")
-
-
-@compiled()
-def shake(readings: np.ndarray, azimuth: float, amplitude: float) -> None:
-    """Add to a row of readings (18,), in place, what the upper rotor at an azimuth [rad] shakes.
-
-    An unbalance turns with the rotor: a line at rotor speed on every axis (effect `vibration`). An
-    amplitude [m/s2] of zero changes nothing.
-    """
-    readings[_ACCELEROMETER] += amplitude * math.sin(azimuth)
-    readings[_ACCELEROMETER + 1] += amplitude * math.cos(azimuth)
-    readings[_ACCELEROMETER + 2] += amplitude * math.sin(azimuth)
-
-
-@compiled()
-def new_samples(row: int, rate: float) -> float:
-    """How many samples a sensor of `rate` [Hz] has taken since the row before, up to this one.
-
-    Rows are those of the 100 Hz loop; samples are rounded up to them: at 40 Hz they come after
-    3, 2, 3, 2 ... rows.
-    """
-    now = math.floor(row * (rate / BASE_RATE) + 1e-9)
-    return now - math.floor((row - 1) * (rate / BASE_RATE) + 1e-9)
-
-
-@compiled()
-def is_new(row: int, rate: float) -> bool:
-    """Whether a sensor of `rate` [Hz] has a new sample in a row of the 100 Hz loop; row 0 always."""
-    return new_samples(row, rate) > 0.0
-
-
-def log_readings(
-    truth: np.ndarray, time: np.ndarray, sensors: tuple[Sensor, ...], rng: np.random.Generator
-) -> dict[str, np.ndarray]:
-    """Noisy log of true readings; NaN where a sensor has no new sample, or has lost it.
-
-    Args:
-        truth: readings of every canonical channel, shape (n, 18).
-        time: since the start of the run [s], shape (n,).
-        sensors: from `log_suite`.
-
-    Returns:
-        channel -> shape (n,), in the channel's unit.
-    """
-    result = {}
-    chances: dict[str, np.ndarray] = {}
-    for sensor in sensors:
-        seen = truth[:, sensor.index]
-        if sensor.delay > 0.0:
-            seen = np.interp(time - sensor.delay, time, seen)
-        values = seen + sensor.noise * rng.standard_normal(len(time)) + sensor.bias
-        if sensor.bias_std > 0.0:
-            values += sensor.bias_std * rng.standard_normal()
-        if sensor.wraps:
-            values = (values + math.pi) % (2.0 * math.pi) - math.pi
-        samples = np.floor(time * sensor.rate + 1e-6)
-        old = np.diff(samples, prepend=samples[:1] - 1.0) <= 0.0
-        if sensor.dropout > 0.0:
-            if sensor.instrument not in chances:
-                chances[sensor.instrument] = rng.random(len(time))
-                chances[sensor.instrument][:1] = 1.0  # a run's first reading is never lost
-            old |= chances[sensor.instrument] < sensor.dropout
-        result[sensor.name] = np.where(old, np.nan, np.clip(values, sensor.low, sensor.high))
-    return result

@@ -19,7 +19,8 @@ from coax_env.report.page import (
     side_by_side,
     table,
 )
-from coax_env.simulation.simulate import REDUCED_K_B, DoubletRow, Remark, Track
+from coax_env.simulation.paper_doublet import REDUCED_K_B, DoubletRow, Remark
+from coax_env.simulation.simulate import Track
 
 Panel = tuple[str, dict[str, np.ndarray]]
 """Axis title and curves by name."""

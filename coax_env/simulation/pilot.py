@@ -9,6 +9,8 @@ import math
 
 import numpy as np
 
+from coax_env.kernel.angles import wrap_angle
+from coax_env.model import state as S
 from coax_env.model.dynamics import full_state, hover_trim
 from coax_env.model.layout import N_COMMANDS, N_STATES, PLACE
 from coax_env.model.linear import N_FLOWN, sampled
@@ -18,7 +20,7 @@ TREMOR_MEMORY = 0.2  # [s]
 TREMOR = np.array([0.6, 0.6, 0.0035, 0.0035])
 """Std of the pilot's hands on the commands [rad/s, rad/s, rad, rad]."""
 
-_HELD = [i for i in range(N_FLOWN) if i not in (13, 14)]  # all but the horizontal position
+_HELD = [i for i in range(N_FLOWN) if i not in (S.X, S.Y)]  # all but the horizontal position
 _TOLERATED = np.array(
     [0.6, 0.6, 0.5, 1.2, 1.2, 0.9, 1.0, 1.0, 1.0, 1.0, 0.2, 0.2, 0.5, np.inf, np.inf, 0.25]
 )
@@ -40,7 +42,12 @@ class Pilot:
     """Feedback gains for one vehicle, and the state of his hands."""
 
     def __init__(self, vehicle: Vehicle, height: float, dt: float, tremor: float = 0.0) -> None:
-        """``dt``: seconds per row. ``tremor`` is the size of the tremor; 1 is usual, 0 none."""
+        """A pilot for one maneuver.
+
+        Args:
+            vehicle: what he flies. height: of its hover [m]. dt: seconds per row.
+            tremor: size of the tremor; 1 is usual, 0 none.
+        """
         state, self.trim = hover_trim(vehicle, height)
         self.trim_state = full_state(state, self.trim, vehicle)[:N_FLOWN]
         self.gain = _gain(vehicle, dt)
@@ -61,14 +68,15 @@ class Pilot:
             state: full state (20,) or more.
             asked: height, forward, right, heading, shape (4,).
             asked_rate: the same, per second.
+            dt: seconds per row. rng: of the tremor.
         """
         error = state[:N_FLOWN] - self.trim_state
-        error[0] -= asked[1]
-        error[1] -= asked[2]
-        error[2] += asked_rate[0]
-        error[5] -= asked_rate[3]
-        error[12] = math.remainder(state[12] - self.trim_state[12] - asked[3], 2.0 * math.pi)
-        error[15] = state[15] + asked[0]
+        error[S.U] -= asked[1]
+        error[S.V] -= asked[2]
+        error[S.W] += asked_rate[0]
+        error[S.R] -= asked_rate[3]
+        error[S.PSI] = wrap_angle(state[S.PSI] - self.trim_state[S.PSI] - asked[3])
+        error[S.Z] = state[S.Z] + asked[0]
         error[PLACE] = 0.0
         error[:N_STATES] = np.clip(error[:N_STATES], -_REACH, _REACH)
         correction = -self.gain @ error

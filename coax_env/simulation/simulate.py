@@ -1,38 +1,35 @@
-"""Simulated flights: a maneuver flown by the one kernel, seen through sensors, as a flight folder.
+"""Simulated flights: a maneuver flown by the env's own control period, logged as a flight folder."""
 
-Also the paper's pre-flight simulation (section III.B) as a table: what its figures print, what its
-equations give, what this run gives.
-"""
-
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from coax_env.env import period
 from coax_env.errors import InputError
 from coax_env.logs.flight import Flight, Run
 from coax_env.logs.repairs import SHORTEST_RUN
-from coax_env.model import dynamics, effects
+from coax_env.model import dynamics
 from coax_env.model import parameters as P
-from coax_env.model.actuators import limit, limits
+from coax_env.model import state as S
+from coax_env.model.actuators import limits
 from coax_env.model.layout import (
     CHANNELS,
     GUSTS,
     N_CHANNELS,
+    N_COMMANDS,
     N_FULL,
-    N_STATES,
-    RPM_PER_RAD_S,
+    N_INPUTS,
     STATES,
 )
-from coax_env.model.sensors import Sensor, log_readings, log_suite, shake
+from coax_env.model.sensors import Sensor, log_suite
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
+from coax_env.simulation.log import log_readings
 from coax_env.simulation.maneuvers import Maneuver, maneuver
 from coax_env.simulation.pilot import CORNER, Pilot, rounded
 
 STEP = 0.01  # [s] the paper's
-DEGREE = math.pi / 180.0
 _TOO_FAR = 1.4  # [rad] of roll or pitch that ends a run
 
 
@@ -87,7 +84,11 @@ def fly(
     """Fly one maneuver from the vehicle's own trim; the truth, without sensors.
 
     Args:
+        vehicle: what `load_vehicle` takes; its effects are flown.
+        plan: name of `maneuvers.MANEUVERS`, or a maneuver.
+        seed: of tremor and gusts.
         closed_loop: whether a pilot flies; None leaves it to the maneuver.
+        gusts: None for none.
         tremor: size of the pilot's tremor, 1 is usual.
         dt: seconds per row.
 
@@ -100,85 +101,91 @@ def fly(
     rng = np.random.default_rng(seed)
     pilot = Pilot(vehicle, plan.height, dt, tremor) if piloted else None
     start, trim = dynamics.hover_trim(vehicle, plan.height)
-
     t = np.arange(round(plan.duration / dt) + 1) * dt
     plan_command = trim + plan.injection(t, trim)
     asked = rounded(plan.asked_for(t), round(CORNER / dt))
     asked_rate = np.gradient(asked, dt, axis=0)
-    values = vehicle.vector.copy()
-    gusting = gusts is not None and bool(np.any(gusts.levels()))
-    level, keep = np.zeros(6), 0.0
-    if gusts is not None:
-        values[P.GUST_MEMORY] = gusts.memory_s
-        level, keep = gusts.levels(), math.exp(-dt / gusts.memory_s)
 
-    x = dynamics.full_state(start, trim, vehicle)
-    if gusting:
-        x[GUSTS] = level * rng.standard_normal(6)
-    delay, within, last = _SwashDelay(values, trim, dt), limits(vehicle), trim.copy()
-    work = np.zeros(dynamics.WORK_SIZE)
-    states, commands = np.empty((len(t), N_FULL)), np.empty((len(t), 4))
+    machine = _Machine(vehicle, start, trim, dt, gusts)
+    states, commands = np.empty((len(t), N_FULL)), np.empty((len(t), N_COMMANDS))
     readings = np.empty((len(t), N_CHANNELS))
-    vibration, azimuth = values[effects.parameter_index("vibration.amplitude")], 0.0
     rows, ended = len(t), ""
-    for k, time in enumerate(t):
-        command = plan_command[k].copy()
+    for row in range(len(t)):
+        machine.disturb(rng)
+        x = machine.x
+        command = plan_command[row].copy()
         if pilot is not None:
-            command += pilot.correction(x, asked[k], asked_rate[k], dt, rng)
+            command += pilot.correction(x, asked[row], asked_rate[row], dt, rng)
             command[:2] = np.maximum(command[:2], 0.0)
-        commands[k] = command
-        possible = command.copy()
-        limit(possible, last, within, dt)
-        pieces = delay.pieces(possible)
-        dynamics.measure(x, dynamics.kernel_input(pieces[0][1], time), values, work, readings[k])
-        shake(readings[k], azimuth, vibration)
-        states[k] = x
+        states[row], commands[row] = x, command
+        machine.give(command, readings[row])
         ended = _why_it_ends(x)
         if ended:
-            rows = k
+            rows = row
             break
-        begin = time
-        for seconds, held in pieces:
-            dynamics.step(x, dynamics.kernel_input(held, begin), seconds, values, work, x)
-            begin += seconds
-        azimuth += dt * x[16]
-        if gusting:
-            x[GUSTS] += level * math.sqrt(1.0 - keep * keep) * rng.standard_normal(6)
+        machine.fly()
     if rows and t[rows - 1] < SHORTEST_RUN:
         raise InputError(f"maneuver {plan.name!r} ends after {t[rows - 1]:.2f} s: {ended}")
     note = f"ended at {t[rows - 1]:.2f} s: {ended}" if ended else ""
     return Track(plan, t[:rows], states[:rows], commands[:rows], readings[:rows], note)
 
 
-class _SwashDelay:
-    """servo_delay in a simulated flight: swash commands come late, rows are split where they do."""
+class _Machine:
+    """One helicopter flown row by row, by the parts of the env's control period (env/period.py).
 
-    def __init__(self, values: np.ndarray, trim: np.ndarray, dt: float) -> None:
-        delay = values[effects.parameter_index("servo_delay.time")]
-        self.whole = int(delay / dt + 1e-9)
-        self.rest = max(delay - self.whole * dt, 0.0)
-        if self.rest < 1e-9:
-            self.rest = 0.0
-        self.dt = dt
-        self.waiting = [trim[2:].copy() for _ in range(self.whole + 1)]
+    A log's reading is taken just after its row's command has been given; the env's just before the
+    next. So `give` measures, with the command that is then in force.
+    """
 
-    def pieces(self, command: np.ndarray) -> list[tuple[float, np.ndarray]]:
-        """(seconds, commands in force) that make up this row."""
-        self.waiting.append(command[2:].copy())
-        older, newer = self.waiting[0], self.waiting[1]
-        self.waiting.pop(0)
-        now = np.concatenate([command[:2], newer])
-        if self.rest == 0.0:
-            return [(self.dt, now)]
-        return [(self.rest, np.concatenate([command[:2], older])), (self.dt - self.rest, now)]
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        start: np.ndarray,
+        trim: np.ndarray,
+        dt: float,
+        gusts: Gusts | None,
+    ) -> None:
+        """From a paper state (16,) at a command (4,); ``dt``: seconds per row."""
+        self.x = dynamics.full_state(start, trim, vehicle)
+        self._p = vehicle.vector.copy()
+        self._u, self._last, self._limits = np.empty(N_INPUTS), trim.copy(), limits(vehicle)
+        slots = period.delay_slots(vehicle.values().get("servo_delay.time", 0.0), dt)
+        self._ring = np.tile(trim[2:], (slots, 1))
+        self._row, self._azimuth, self._dt = 0, 0.0, dt
+        self._work = np.empty(dynamics.WORK_SIZE)
+        self._gust = np.zeros(6) if gusts is None else gusts.levels()
+        if gusts is not None:
+            self._p[P.GUST_MEMORY] = gusts.memory_s
+
+    def disturb(self, rng: np.random.Generator) -> None:
+        """The gusts of the coming row; in the first, those of a wind that has always blown."""
+        if self._gust.any():
+            growth = period.gust_growth(self._dt, self._p[P.GUST_MEMORY]) if self._row else 1.0
+            self.x[GUSTS] += growth * self._gust * rng.standard_normal(6)
+
+    def give(self, command: np.ndarray, readings: np.ndarray) -> None:
+        """Give the row's command (4,); the true readings then, (18,), into `readings`."""
+        u, p, ring, row = self._u, self._p, self._ring, self._row
+        u[:N_COMMANDS] = command
+        period.give_command(u, self._last, self._limits, ring, row, self._dt)
+        period.arrive_at_servos(u, p, ring, row, self._dt)
+        period.true_readings(self.x, u, p, self._azimuth, self._work, readings)
+
+    def fly(self) -> None:
+        """Fly the row under the command that was given."""
+        period.fly_period(
+            self.x, self._u, self._p, self._ring, self._row, self._dt, self._work
+        )  # fmt: skip
+        self._azimuth = period.next_azimuth(self._azimuth, self.x[S.OMEGA_U], self._dt)
+        self._row += 1
 
 
 def _why_it_ends(x: np.ndarray) -> str:
     if not np.all(np.isfinite(x)):
         return "the simulation diverged"
-    if max(abs(x[10]), abs(x[11])) > _TOO_FAR:
+    if max(abs(x[S.PHI]), abs(x[S.THETA])) > _TOO_FAR:
         return "the helicopter tipped over"
-    if x[15] > 0.0:
+    if x[S.Z] > 0.0:
         return "the helicopter hit the ground"
     return ""
 
@@ -204,6 +211,7 @@ def simulate(
         noise: whether chance plays in the readings: noise, drawn bias and lost samples. Rates,
             limits and delays stay.
         seed: of noise, tremor and gusts; the same seed gives the same flight.
+        closed_loop, gusts, tremor, dt: as in `fly`.
 
     Raises:
         InputError: as `fly`.
@@ -226,13 +234,18 @@ def fly_all(
     tremor: float = 1.0,
     dt: float = STEP,
 ) -> tuple[Track, ...]:
-    """The truth behind `simulate`: one track per maneuver, each with its own chance."""
+    """The truth behind `simulate`: one track per maneuver, each with its own random numbers.
+
+    Args:
+        vehicle, maneuvers, seed: as in `simulate`.
+        closed_loop, gusts, tremor, dt: as in `fly`.
+    """
     plans = [maneuvers] if isinstance(maneuvers, str | Maneuver) else list(maneuvers)
     if not plans:
         raise InputError("simulate needs at least one maneuver")
     return tuple(
-        fly(vehicle, plan, seed=air, closed_loop=closed_loop, gusts=gusts, tremor=tremor, dt=dt)
-        for plan, (air, _) in zip(plans, _chances(seed, len(plans)), strict=True)
+        fly(vehicle, plan, seed=flight, closed_loop=closed_loop, gusts=gusts, tremor=tremor, dt=dt)
+        for plan, (flight, _) in zip(plans, _seeds(seed, len(plans)), strict=True)
     )
 
 
@@ -244,12 +257,17 @@ def log_flight(
     noise: bool = True,
     seed: int = 0,
 ) -> Flight:
-    """Tracks as a flight folder holds them, seen through sensors."""
+    """Tracks as a flight folder holds them, seen through sensors.
+
+    Args:
+        vehicle: what flew. tracks: from `fly_all`. suite: from `log_suite`.
+        noise, seed: as in `simulate`.
+    """
     if not noise:
         suite = [replace(sensor, noise=0.0, bias_std=0.0, dropout=0.0) for sensor in suite]
     runs = [
         _log_run(track, suite, np.random.default_rng(readings))
-        for track, (_, readings) in zip(tracks, _chances(seed, len(tracks)), strict=True)
+        for track, (_, readings) in zip(tracks, _seeds(seed, len(tracks)), strict=True)
     ]
     names = [run.name for run in runs]
     for k, name in enumerate(names):
@@ -263,8 +281,8 @@ def log_flight(
     )
 
 
-def _chances(seed: int, runs: int) -> list[list[np.random.SeedSequence]]:
-    """Per run a seed for air and hands, and one for the readings."""
+def _seeds(seed: int, runs: int) -> list[list[np.random.SeedSequence]]:
+    """Per run a seed for gusts and tremor, and one for the readings."""
     if seed < 0:
         raise InputError(f"the seed should not be negative, found {seed}")
     return [source.spawn(2) for source in np.random.SeedSequence(seed).spawn(runs)]
@@ -280,163 +298,3 @@ def _log_run(track: Track, suite: Sequence[Sensor], rng: np.random.Generator) ->
         maneuver=track.maneuver.name,
         note=track.ended,
     )
-
-
-# --- the paper's pre-flight simulation ----------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class DoubletRow:
-    """One quantity of the paper's doublet: printed, from its equations, and as flown here.
-
-    Ranges are (low, high); single values have low == high. ``axis`` is what the figure's axis can
-    show, or 10 % about the number in the text.
-    """
-
-    quantity: str
-    unit: str
-    paper: str
-    axis: tuple[float, float]
-    equations: tuple[float, float]
-    digits: int
-    run: tuple[float, float]
-    reduced: tuple[float, float]
-
-    @property
-    def agrees(self) -> bool:
-        """Within 2 %, or half the last printed digit, of what the paper's equations give."""
-        return all(
-            abs(found - wanted) <= max(0.02 * abs(wanted), 0.5 * 10.0**-self.digits)
-            for found, wanted in zip(self.run, self.equations, strict=True)
-        )
-
-    @property
-    def fits_paper(self) -> bool:
-        """With the printed tables, within what the paper prints."""
-        return _inside(self.run, self.axis)
-
-    @property
-    def reduced_fits_paper(self) -> bool:
-        """With the smaller K_b, within what the paper prints."""
-        return _inside(self.reduced, self.axis)
-
-
-def _inside(found: tuple[float, float], axis: tuple[float, float]) -> bool:
-    return axis[0] <= found[0] and found[1] <= axis[1]
-
-
-REDUCED_K_B = 0.67
-"""Linkage gain that gives the paper's figures; Table III prints 0.91. Inferred, not known."""
-
-_DOUBLET = (
-    # quantity, unit, source, what the paper prints, its limits, equations, digits printed
-    ("u", "m/s", "u", "±2", (-2, 2), (0.0, 2.00), 2),
-    ("v", "m/s", "v", "±1", (-1, 1), (-0.12, 0.00), 2),
-    ("w", "m/s", "w", "±1", (-1, 1), (-0.07, 0.29), 2),
-    ("p", "deg/s", "p", "±30", (-30, 30), (-26.9, 25.1), 1),
-    ("q", "deg/s", "q", "−20 .. 40", (-20, 40), (-19.6, 37.9), 1),
-    ("r", "deg/s", "r", "±5", (-5, 5), (0, 0), 1),
-    ("alpha_l", "deg", "alpha_l", "±5", (-5, 5), (-4.9, 5.3), 1),
-    ("beta_l", "deg", "beta_l", "±2", (-2, 2), (-1.1, 1.2), 1),
-    ("alpha_f", "deg", "alpha_f", "±5", (-5, 5), (-6.4, 5.1), 1),
-    ("beta_f", "deg", "beta_f", "±5", (-5, 5), (-4.3, 2.3), 1),
-    ("phi", "deg", "phi", "±4", (-4, 4), (-2.4, 4.4), 1),
-    ("theta", "deg", "theta", "±5", (-5, 5), (-6.1, 4.6), 1),
-    ("psi", "deg", "psi", "±2", (-2, 2), (0, 0.7), 1),
-    ("y at 10 s", "m", "y", "±1", (-1, 1), (-0.34, -0.34), 2),
-    ("x at 10 s", "m", "x", "around 6", (5.4, 6.6), (8.2, 8.2), 1),
-    ("height lost", "m", "z", "around 0.7", (0.6, 0.8), (1.25, 1.25), 2),
-)  # fmt: skip
-
-
-def _doublet_range(track: Track, source: str, unit: str) -> tuple[float, float]:
-    history = track[source] / (DEGREE if unit.startswith("deg") else 1.0)
-    if source in ("x", "y", "z"):
-        change = float(history[-1] - history[0])
-        return change, change
-    return float(history.min()), float(history.max())
-
-
-def doublet_table(vehicle: Vehicle | str = "lama400d") -> tuple[DoubletRow, ...]:
-    """The paper's doublet (Figs 3-10): printed, by its equations, and flown here with two K_b."""
-    vehicle = load_vehicle(vehicle).without_effects()
-    run = fly(vehicle, "lon_doublet")
-    reduced = fly(vehicle.with_values({"swash_to_flap": REDUCED_K_B}), "lon_doublet")
-    return tuple(
-        DoubletRow(
-            quantity, unit, paper, axis, equations, digits,
-            _doublet_range(run, source, unit), _doublet_range(reduced, source, unit),
-        )
-        for quantity, unit, source, paper, axis, equations, digits in _DOUBLET
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Remark:
-    """A statement of design/paper.md about the doublet, checked by flying it."""
-
-    statement: str
-    expected: tuple[float, ...]
-    found: tuple[float, ...]
-    tolerance: float
-
-    @property
-    def holds(self) -> bool:
-        """Every number within the relative tolerance."""
-        return all(
-            abs(f - e) <= self.tolerance * max(abs(e), 0.1)
-            for f, e in zip(self.found, self.expected, strict=True)
-        )
-
-
-def doublet_remarks(vehicle: Vehicle | str = "lama400d") -> tuple[Remark, ...]:
-    """What else is known about the paper's doublet, each flown here."""
-    vehicle = load_vehicle(vehicle).without_effects()
-    q = _euler_doublet(vehicle)[:, 4] / DEGREE
-    quoted = _doublet_at(vehicle, np.array([2000.0, 2150.0]) / RPM_PER_RAD_S)
-    v = vehicle.values()
-    inverted = vehicle.with_values(
-        {n: 1.0 / v[n] for n in ("flybar_to_rotor_lon", "flybar_to_rotor_lat")}
-    )
-    smaller = fly(vehicle, maneuver("lon_doublet").scaled(3.7 / 5.0))
-    return (
-        Remark(
-            "Euler steps of 10 ms would give q from -27 to 43 deg/s: RK4 is used",
-            (-27.0, 43.0), (float(q.min()), float(q.max())), 0.03,
-        ),
-        Remark(
-            "at exactly 2000/2150 rpm the doublet ends 1 m higher and turning at -103 deg/s",
-            (1.0, -103.0), (float(-quoted[15]), float(quoted[5] / DEGREE)), 0.06,
-        ),
-        Remark(
-            "inverting K_q and K_p, as the wording of the ratio suggests, gives x = 2.9 m",
-            (2.9,), (float(fly(inverted, "lon_doublet")["x"][-1]),), 0.03,
-        ),
-        Remark(
-            "an amplitude of 3.7 deg does what K_b = 0.67 does: x near 6.07 m, height lost 0.68 m",
-            (6.07, 0.68),
-            (float(smaller["x"][-1]), float(smaller["z"][-1] - smaller["z"][0])), 0.03,
-        ),
-    )  # fmt: skip
-
-
-def _euler_doublet(vehicle: Vehicle) -> np.ndarray:
-    """The doublet by Euler's method at 10 ms, shape (n, 16)."""
-    plan = maneuver("lon_doublet")
-    state, trim = dynamics.hover_trim(vehicle, plan.height)
-    t = np.arange(round(plan.duration / STEP)) * STEP
-    states = [state]
-    for command in trim + plan.injection(t, trim):
-        states.append(states[-1] + STEP * dynamics.derivative(states[-1], command, vehicle))
-    return np.array(states)
-
-
-def _doublet_at(vehicle: Vehicle, speeds: np.ndarray) -> np.ndarray:
-    """State (16,) at the end of the doublet flown from rest at z = 0 at given rotor speeds."""
-    plan = maneuver("lon_doublet")
-    base = np.array([*speeds, 0.0, 0.0])
-    t = np.arange(round(plan.duration / STEP)) * STEP
-    x, work = dynamics.full_state(np.zeros(N_STATES), base, vehicle), np.zeros(dynamics.WORK_SIZE)
-    for time, command in zip(t, base + plan.injection(t, base), strict=True):
-        dynamics.step(x, dynamics.kernel_input(command, time), STEP, vehicle.vector, work, x)
-    return x[:N_STATES]

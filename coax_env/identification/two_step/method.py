@@ -4,7 +4,7 @@ Data flow::
 
     flight -> each run on an even grid -> low-pass, spectral filter, check by integration (IV.C)
                                        -> Kalman filter and smoother of (46)-(57)          (V.A)
-           -> runs that stir a mode    -> regressions (64)-(69)                            (V.B)
+           -> runs that excite a mode  -> regressions (64)-(69)                            (V.B)
            -> all runs                 -> pooled physical regressions -> vehicle file
 
 The vehicle takes its numbers from the pooled regressions, not from the table: the table's entries
@@ -20,18 +20,17 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.estimation.helicopter import sensor_std
+from coax_env.identification.two_step.columns import IMU, joined, rows_of
 from coax_env.identification.two_step.modes import (
-    IMU,
+    LEAST_MOVEMENT,
     MODES,
     PHYSICS,
-    STIR,
     ModeFit,
     Physics,
+    excites,
     fit_mode,
     fit_physics,
-    joined,
-    rows_of,
-    stir,
+    movement,
 )
 from coax_env.identification.two_step.processing import (
     CUTOFF,
@@ -106,13 +105,14 @@ def two_step(
     """The paper's identification of a vehicle from a flight.
 
     Args:
-        cutoff: of the low-pass [Hz].
+        flight: whose runs. vehicle: to start from; its numbers are the priors.
+        cutoff: of the low-pass [Hz]. progress: is given a line of text now and then.
 
     Raises:
         InputError: no run has gyros, accelerometers and a height.
     """
 
-    def say(text: str) -> None:
+    def report_progress(text: str) -> None:
         if progress:
             progress(text)
 
@@ -131,7 +131,7 @@ def two_step(
     left_out = [run.name for run in flight.runs if run not in usable]
     if left_out:
         remarks.append(f"without gyros or accelerometers, left out: {', '.join(left_out)}")
-    say("filtering and reconstructing the states")
+    report_progress("filtering and reconstructing the states")
     quiet = _noise_record(usable)
     hover = _still(quiet, cutoff)
     reconstructed = tuple(
@@ -143,22 +143,21 @@ def two_step(
     )
     if not reconstructed:
         remarks.append("no height was logged: the states of step 1 are not reconstructed")
-    say("regressing the coefficients")
-    stirred = [
-        run for run in usable if any(stir(run, axis) > least for axis, least in STIR.items())
-    ]
-    parts = {run.name: rows_of(run, vehicle, noise, cutoff, k) for k, run in enumerate(stirred)}
-    modes = [fit_mode(mode, stirred, parts, vehicle) for mode in MODES]
+    report_progress("regressing the coefficients")
+    moving = [run for run in usable if any(excites(run, axis) for axis in LEAST_MOVEMENT)]
+    parts = {run.name: rows_of(run, vehicle, noise, cutoff, k) for k, run in enumerate(moving)}
+    modes = [fit_mode(mode, moving, parts, vehicle) for mode in MODES]
     idle: dict[str, list[str]] = {}
     for mode, fit in zip(MODES, modes, strict=True):
         if fit is None:
             idle.setdefault(mode.axis, []).append(mode.name)
     for axis, names in idle.items():
         remarks.append(
-            f"no run moves {axis} enough (std {STIR[axis]}): no regression of {', '.join(names)}"
+            f"no run moves {axis} enough (std {LEAST_MOVEMENT[axis]}): "
+            f"no regression of {', '.join(names)}"
         )
-    say("fitting the vehicle's numbers")
-    physical, after = _physical(stirred, vehicle, noise, cutoff, flight)
+    report_progress("fitting the vehicle's numbers")
+    physical, after = _physical(moving, vehicle, noise, cutoff, flight)
     return TwoStep(
         flight,
         vehicle,
@@ -181,7 +180,10 @@ def _noise_of(flight: Flight, channel: str) -> float:
 
 def _noise_record(runs: Sequence[Run]) -> Run:
     """The run in which the commands move least: the paper's hover record."""
-    return min(runs, key=lambda run: sum(stir(run, axis) / STIR[axis] for axis in STIR))
+    return min(
+        runs,
+        key=lambda run: sum(movement(run, axis) / std for axis, std in LEAST_MOVEMENT.items()),
+    )
 
 
 def _still(run: Run, cutoff: float, seconds: float = math.inf) -> dict[str, np.ndarray]:
@@ -209,8 +211,8 @@ def _reconstruct(
     g = vehicle["gravity"].value
     places = np.clip(np.searchsorted(t, run.t), 0, len(t) - 1)
     sonar = np.full(len(t), np.nan)
-    heard = np.isfinite(run.measured["h"])
-    sonar[places[heard]] = run.measured["h"][heard]
+    there = np.isfinite(run.measured["h"])
+    sonar[places[there]] = run.measured["h"][there]
     states = longitudinal(
         raw["q"], raw["ax"], raw["az"], sonar, dt, g, (noise["q"], noise["az"], noise["h"])
     )
@@ -231,7 +233,7 @@ def _physical(
     where = flight.path.name if flight.path else "flight"
     fits, after = [], vehicle
     for physics in PHYSICS:  # thrusts first: the moments are theirs
-        used = [run for run in runs if any(stir(run, axis) > STIR[axis] for axis in physics.axes)]
+        used = [run for run in runs if any(excites(run, axis) for axis in physics.axes)]
         if not used:
             continue
         parts = [rows_of(run, after, noise, cutoff, k) for k, run in enumerate(used)]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coax_env.identification.two_step.modes import download, scales, thrusts
+from coax_env.identification.two_step.loads import loads, scales
 from coax_env.identification.two_step.regression import least_squares
 from coax_env.model.vehicle import Vehicle
 
@@ -44,10 +44,11 @@ def table_viii() -> tuple[Published, ...]:
 def predicted(vehicle: Vehicle) -> dict[str, dict[str, float]]:
     """What the vehicle file's tables give for each entry at the flight's rotor speeds, (61)-(69)."""
     omega_u, omega_l = (np.array(rpm * np.pi / 30.0) for rpm in RPM)
-    T_u, T_l, _, _ = (float(x) for x in thrusts(vehicle, omega_u, omega_l))
+    level = loads(vehicle, omega_u, omega_l)
+    T_u, T_l = float(level.T_u), float(level.T_l)
     force, moment = (float(x) for x in scales(vehicle, omega_u))
     none = dict.fromkeys(("1", "alpha_u", "alpha_l", "q", "delta_lon", "T_l", "T_u"), 0.0)
-    lift = (T_u * (1.0 - download(vehicle)) + T_l) / force
+    lift = -float(level.Z) / force
     by_lower, by_upper = 1.0 / force, -T_l / (T_u * force)
     arm_u, arm_l = vehicle["arm_upper"].value, vehicle["arm_lower"].value
     return {
@@ -81,7 +82,7 @@ def lift_artefact(vehicle: Vehicle) -> dict[str, float]:
     rng = np.random.default_rng(0)
     omega_u = RPM[0] * np.pi / 30.0 * (1.0 + 0.01 * rng.standard_normal(400))
     omega_l = RPM[1] * np.pi / 30.0 * (1.0 + 0.01 * rng.standard_normal(400))
-    T_u, T_l, _, _ = thrusts(vehicle, omega_u, omega_l)
+    T_u, T_l, *_ = loads(vehicle, omega_u, omega_l)
     force, _ = scales(vehicle, omega_u)
     weight = vehicle["mass"].value * vehicle["gravity"].value
     names = ("1", "T_l", "T_u")
