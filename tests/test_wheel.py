@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 import coax_env
 from coax_env.errors import DISTRIBUTION
@@ -62,6 +64,21 @@ def test_every_package_is_declared() -> None:
     ]
     assert not gone, gone
     assert len(declared) == len(set(declared))
+
+
+def test_every_requirement_is_pinned() -> None:
+    """Also of the extras that scripts/set_up.sh leaves out, and each pin is one that is asked for."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"].values()
+    asked = [Requirement(text) for part in (project["dependencies"], *extras) for text in part]
+    pins = {}
+    for line in (ROOT / "scripts" / "constraints.txt").read_text().splitlines():
+        if not line.startswith("#"):
+            name, version = line.split("==")
+            pins[canonicalize_name(name)] = version
+    for requirement in asked:
+        assert pins[canonicalize_name(requirement.name)] in requirement.specifier, requirement
+    assert not [name for name in pins if name.startswith(("nvidia", "cuda", "triton"))]
 
 
 @pytest.mark.slow
