@@ -49,14 +49,15 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_package_is_declared() -> None:
-    """A new folder with an __init__.py would be left out of the wheel, and nobody would notice here."""
+    """A new folder, of code or of data, would be left out of the wheel, and nobody would notice here."""
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
         "packages"
     ]
     there = {
-        ".".join(init.parent.relative_to(ROOT).parts)
+        ".".join(path.parent.relative_to(ROOT).parts)
         for top in ("coax_env", "controllers")
-        for init in (ROOT / top).rglob("__init__.py")
+        for path in (ROOT / top).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
     }
     assert there <= set(declared), there - set(declared)
     gone = [
