@@ -49,10 +49,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_package_is_declared() -> None:
-    """A new folder, of code or of data, would be left out of the wheel, and nobody would notice here."""
-    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
-        "packages"
-    ]
+    """A new folder, of code or data, would be left out of the wheel, and nobody would notice here."""
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
+    declared = tools["setuptools"]["packages"]
     there = {
         ".".join(path.parent.relative_to(ROOT).parts)
         for top in ("coax_env", "controllers")
