@@ -77,7 +77,13 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def with_std(value: float, std: float | None, unit: str) -> str:
-    """``0.50 ± 0.02 m``, both to the place of the std's second digit."""
+    """``0.50 ± 0.02 m``, both to the place of the std's second digit.
+
+    Args:
+        value: the number, in `unit`.
+        std: its standard deviation in the same unit; 0, None or not finite: the number alone.
+        unit: as vehicle files write it, ``"m/s2"``.
+    """
     shown = UNITS.get(unit, unit)
     if not std or not math.isfinite(std):
         return f"{number(value)} {shown}".strip()
@@ -97,9 +103,13 @@ def whole_percent(value: float | None) -> str:
 
 
 def bounds(value: float, half: float, unit: str, signed: bool = False) -> str:
-    """``+9.0 % (8.5 to 9.6)``: a number with its interval, to the place that the interval knows.
+    """``+9.0 % (8.5 to 9.6)``: a number with its interval, to the last place that the interval fixes.
 
-    half: of the interval's width; 0 where the number is exact. signed: with a plus where positive.
+    Args:
+        value: the number, in `unit`.
+        half: half of the interval's width; 0 where the number is exact.
+        unit: as vehicle files write it, ``"m/s2"``.
+        signed: with a plus where positive.
     """
     shown = UNITS.get(unit, unit)
     space = "" if shown.startswith("°") or not shown else " "

@@ -24,6 +24,7 @@ def each(
 
     Args:
         work: a function that other processes can import, or a `partial` of one.
+        pieces: what it is called with, one at a time.
         jobs: so many at once; -1: every core, or the whole cluster. One job works in this process.
         backend: ``"loky"``, joblib's processes, or ``"ray"``: the cluster of RAY_ADDRESS, else a
             local one, also for one job.

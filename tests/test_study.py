@@ -260,7 +260,7 @@ def test_the_unexplained_counts_on_its_axis_and_without_blame() -> None:
     elsewhere["methods"]["coax"]["unexplained"] = [{"channel": "r"}]
     blamed = row_of(flight, [{"effect": "wind"}])
     blamed["methods"]["coax"]["unexplained"] = [{"channel": "q"}]
-    assert [judge.says_unexplained(r, "q") for r in (right, elsewhere, blamed)] == [
+    assert [judge.reports_unexplained(r, "q") for r in (right, elsewhere, blamed)] == [
         True,
         False,
         False,

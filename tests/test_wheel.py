@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from test_readme import folded, ten_lines
 
 import coax_env
@@ -47,14 +49,14 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_package_is_declared() -> None:
-    """A new folder with an __init__.py would be left out of the wheel, and nobody would notice here."""
-    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
-        "packages"
-    ]
+    """A new folder, of code or data, would be left out of the wheel, and nobody would notice here."""
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
+    declared = tools["setuptools"]["packages"]
     there = {
-        ".".join(init.parent.relative_to(ROOT).parts)
+        ".".join(path.parent.relative_to(ROOT).parts)
         for top in ("coax_env", "controllers")
-        for init in (ROOT / top).rglob("__init__.py")
+        for path in (ROOT / top).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
     }
     assert there <= set(declared), there - set(declared)
     gone = [
@@ -62,6 +64,21 @@ def test_every_package_is_declared() -> None:
     ]
     assert not gone, gone
     assert len(declared) == len(set(declared))
+
+
+def test_every_requirement_is_pinned() -> None:
+    """Also of the extras that scripts/set_up.sh leaves out, and each pin is one that is asked for."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"].values()
+    asked = [Requirement(text) for part in (project["dependencies"], *extras) for text in part]
+    pins = {}
+    for line in (ROOT / "scripts" / "constraints.txt").read_text().splitlines():
+        if not line.startswith("#"):
+            name, version = line.split("==")
+            pins[canonicalize_name(name)] = version
+    for requirement in asked:
+        assert pins[canonicalize_name(requirement.name)] in requirement.specifier, requirement
+    assert not [name for name in pins if name.startswith(("nvidia", "cuda", "triton"))]
 
 
 @pytest.mark.slow

@@ -30,7 +30,13 @@ Z = 1.959964
 def fly_and_identify(
     number: int, peer: bool = False, vehicle: str = "lama400d"
 ) -> dict[str, list[dict[str, Any]]]:
-    """method -> intervals of one flight: name, low, high, truth. peer: AeroID too."""
+    """method -> intervals of one flight: name, low, high, truth.
+
+    Args:
+        number: of the flight; the seed of its gusts, noise and drawn vehicle.
+        peer: AeroID too.
+        vehicle: shipped name or file.
+    """
     file = load_vehicle(vehicle)
     flight = simulate(file, "lon_doublet", sensors="paper", seed=number, gusts=GUSTS)
     result: dict[str, list[dict[str, Any]]] = {"tls": [], "ls": []}

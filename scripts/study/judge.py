@@ -71,8 +71,14 @@ def is_shown(row: Row, threshold: float) -> bool:
     return all(e is not None and e >= 2.0 * threshold for e in expected)
 
 
-def says_unexplained(row: Row, channel: str, method: str = OWN) -> bool:
-    """No catalogue effect blamed, and the channel of the hidden one reported as unexplained."""
+def reports_unexplained(row: Row, channel: str, method: str = OWN) -> bool:
+    """Whether no catalogue effect is named and the hidden one's channel is reported as unexplained.
+
+    Args:
+        row: of a flight whose hidden effect is in no catalogue.
+        channel: the one that the effect disturbs.
+        method: whose findings.
+    """
     finding = row["methods"][method]
     return not finding["causes"] and any(
         left["channel"] == channel for left in finding.get("unexplained", ())

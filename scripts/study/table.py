@@ -130,7 +130,7 @@ def _outside(rows: Sequence[Row]) -> Figure:
     unblamed = sum(not judge.named(row) for row in part)
     return _share(
         "outside the list: unexplained, right axis", ">= 80 %", part,
-        lambda row: judge.says_unexplained(row, OUTSIDE_CHANNEL),
+        lambda row: judge.reports_unexplained(row, OUTSIDE_CHANNEL),
         f"no effect blamed in {unblamed} of {len(part)}",
     )  # fmt: skip
 
@@ -235,13 +235,25 @@ def confusion(rows: Iterable[Row]) -> tuple[list[str], list[str], np.ndarray]:
 
 
 def confusion_figure(truths: list[str], names: list[str], shares: np.ndarray) -> figures.Figure:
-    """The matrix as colours."""
+    """The matrix as colours.
+
+    Args:
+        truths: names of its rows.
+        names: of its columns.
+        shares: (truths, names), each row's sum 1.
+    """
     text = [[f"{100.0 * s:.0f}" if s > 0.0 else "" for s in row] for row in shares]
     return figures.heat_map(truths, names, shares, text, "share of flights")
 
 
 def confusion_csv(truths: list[str], names: list[str], shares: np.ndarray) -> str:
-    """The matrix as a table."""
+    """The matrix as a CSV.
+
+    Args:
+        truths: names of its rows.
+        names: of its columns.
+        shares: (truths, names), each row's sum 1.
+    """
     lines = [",".join(["hidden", *names])]
     for truth, row in zip(truths, shares, strict=True):
         lines.append(",".join([truth, *(f"{share:.3f}" for share in row)]))
