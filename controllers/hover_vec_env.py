@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from coax_env.env import hover
-from coax_env.env.fleet import DT
+from coax_env.env.period import DT
 from coax_env.model.vehicle import Vehicle
 from controllers.estimator import EstimatorDesign, Tracker
 from controllers.policy import feature_scales, features, n_features

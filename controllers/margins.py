@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.env.fleet import DT
+from coax_env.env.period import DT
 from coax_env.model.vehicle import Vehicle, load_vehicle
 from controllers.estimator import EstimatorDesign, design_estimator, integrated_readings
 from controllers.lqr import LQG
