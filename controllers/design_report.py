@@ -41,7 +41,7 @@ def _decibels(gain: float) -> str:
     """A factor of the loop's gain in dB; any where there is no limit."""
     if not 0.0 < gain < np.inf:
         return "any"
-    return f"{20.0 * np.log10(gain):+.1f} dB".replace("-", "−")
+    return f"{20.0 * np.log10(gain):+.1f} dB"
 
 
 def design_page(
@@ -71,7 +71,7 @@ def design_page(
         f"Flown on {vehicle.name} with its own noisy {controller.sensors} sensors, "
         f"{score['episodes']} flights of {score['seconds']:.0f} s: "
         f"**{100 * score['success_rate']:.0f} % succeed**.",
-        f"All four inputs at once may be off by {gain} in gain or {phase} in phase.",
+        f"All four inputs at once may be off by {gain} in gain or by {phase} in phase.",
         spread_in_words(worst, spread),
     ]
     response = figures.histories(*step_response(controller, vehicle))
@@ -115,13 +115,13 @@ def _estimator_blocks(controller: LQG) -> list[str]:
 
 
 def spread_in_words(worst: dict[str, Any], spread: np.ndarray) -> str:
-    """What is left on the worst of the vehicles drawn from the file's spread."""
+    """Score and disk margin of the worst of the vehicles drawn from the file's spread."""
     gain, phase = disk_in_words(float(spread.min()))
     return (
         f"Worst of {len(worst['vehicles'])} vehicles drawn from the file's spread: "
         f"{100 * worst['success_rate']:.0f} % of the flights succeed, cost {worst['mean_cost']:.2g} "
         f"(median {np.median([v['mean_cost'] for v in worst['vehicles']]):.2g}); "
-        f"of {len(spread)} more: {gain} in gain or {phase} in phase."
+        f"the loops of {len(spread)} more tolerate at least {gain} in gain or {phase} in phase."
     )
 
 

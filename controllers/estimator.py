@@ -261,7 +261,7 @@ class Tracker:
         design = self.design
         which = self._every if which is None else which
         observations = np.asarray(observations)
-        if self._view.aims(observations):
+        if self._view.has_target(observations):
             observations = self._aimed(observations, which)
         _correct(
             which, observations, self._rows,
@@ -273,7 +273,7 @@ class Tracker:
 
     def _aimed(self, observations: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Observations from the point asked for; where that has moved, the estimate moves too."""
-        seen, asked, there = self._view.seen(observations)
+        seen, asked, there = self._view.relative_to_target(observations)
         moved = np.where((self._rows > 0)[:, None], asked - self._asked, 0.0)[which]
         heading = asked[which, 3] + seen[which, self._view.names.index("psi")]
         forward, right = turned(moved[:, :2], -heading).T
@@ -319,13 +319,13 @@ class Estimating(Feedback):
         """New flights of `count` helicopters."""
         self.tracker = Tracker(self.estimator, self.count)
 
-    def answer(self, observations: np.ndarray) -> np.ndarray:
+    def compute_actions(self, observations: np.ndarray) -> np.ndarray:
         """Actions (count, 4), not yet clipped, to observations (count, n_obs)."""
         self.known = self.tracker.see(observations)
-        return self.answer_knowing(self.known)
+        return self.actions_from_estimate(self.known)
 
     @abstractmethod
-    def answer_knowing(self, known: np.ndarray) -> np.ndarray:
+    def actions_from_estimate(self, known: np.ndarray) -> np.ndarray:
         """Actions (count, 4), not yet clipped, to estimates and integrals (count, n + i)."""
 
     def act(self, observation: np.ndarray) -> np.ndarray:

@@ -157,7 +157,7 @@ FIGURES = (
 
 
 class _Totals:
-    """Sums over every flight, kept while they are flown."""
+    """Sums over every flight, updated every period."""
 
     def __init__(self, count: int, task: str, course: Any) -> None:
         self.count, self.task = count, task
@@ -208,7 +208,7 @@ class _Totals:
         self.drift = np.maximum(self.drift, np.where(finite, away, 0.0))
 
     def score(self, steps: int) -> dict[str, Any]:
-        """The figures, of flights that should have had so many steps."""
+        """The figures of score.json; `steps` is the length of a whole flight."""
         judged = np.maximum(self.judged, 1.0)
         errors = {name: np.sqrt(total / judged) for name, total in self.squares.items()}
         errors["drift"] = self.drift

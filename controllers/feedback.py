@@ -1,4 +1,4 @@
-"""What the controllers of this project share: one helicopter or a batch, and controller.json."""
+"""Common to this project's controllers: one helicopter or a batch, and controller.json."""
 
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -14,7 +14,7 @@ VERSION = 1
 
 
 class Feedback(ABC):
-    """A controller: a subclass defines how a flight begins and the action to an observation.
+    """A controller; a subclass defines how a flight begins and what action follows an observation.
 
     Its actions are about `action_trim`, in units of `action_scale`, both (4,) per command.
     """
@@ -40,7 +40,7 @@ class Feedback(ABC):
         batch = np.atleast_2d(observation)
         if self.count != len(batch):
             self.reset(len(batch))
-        actions = np.clip(self.answer(batch), -1.0, 1.0).astype(np.float32)
+        actions = np.clip(self.compute_actions(batch), -1.0, 1.0).astype(np.float32)
         return actions if np.ndim(observation) == 2 else actions[0]
 
     @abstractmethod
@@ -48,7 +48,7 @@ class Feedback(ABC):
         """New flights of `count` helicopters."""
 
     @abstractmethod
-    def answer(self, observations: np.ndarray) -> np.ndarray:
+    def compute_actions(self, observations: np.ndarray) -> np.ndarray:
         """Actions (count, 4), not yet clipped, to observations (count, n_obs)."""
 
 

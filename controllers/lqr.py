@@ -43,7 +43,7 @@ class LQG(Estimating, Designed):
 
     kind = "lqg"
 
-    def answer_knowing(self, known: np.ndarray) -> np.ndarray:
+    def actions_from_estimate(self, known: np.ndarray) -> np.ndarray:
         """Actions (count, 4), not yet clipped, to estimates and integrals (count, n + i)."""
         return -self.tracker.offset / self.estimator.action_scale - known @ self.gain.T
 

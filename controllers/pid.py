@@ -74,7 +74,7 @@ class PID(Feedback, Designed):
         self._smooth = np.zeros((self.count, 3))  # forward, right, down [m/s]
         self._sums = np.zeros((self.count, 4))  # forward, right [m], height [m s], heading [rad s]
 
-    def answer(self, observations: np.ndarray) -> np.ndarray:
+    def compute_actions(self, observations: np.ndarray) -> np.ndarray:
         """Actions (count, 4), not yet clipped, to observations (count, n_obs)."""
         batch, there = self._view.as_hover(observations)
         g, y = self.gains, {name: batch[:, at] for name, at in self._at.items()}

@@ -74,12 +74,12 @@ class Policy(Estimating):
 
     network: Network
     estimator: EstimatorDesign
-    scales: np.ndarray  # (n + i,), of what is known
+    scales: np.ndarray  # (n + i,), of estimates and integrals
     content: dict[str, Any]  # of policy.json
 
     kind = "ppo"
 
-    def answer_knowing(self, known: np.ndarray) -> np.ndarray:
+    def actions_from_estimate(self, known: np.ndarray) -> np.ndarray:
         """Actions (count, 4), not yet clipped, to estimates and integrals (count, n + i)."""
         return self.network(features(known, self.scales))
 
@@ -91,7 +91,7 @@ def features(known: np.ndarray, scales: np.ndarray) -> np.ndarray:
 
 
 def feature_scales(design: EstimatorDesign) -> np.ndarray:
-    """What becomes 1 in each feature, shape (n + i,)."""
+    """Size of an estimate or integral that becomes 1 in its feature, (n + i,)."""
     sizes = []
     for name, spread in zip(design.states, design.spread, strict=True):
         if name.startswith("omega_"):
@@ -138,13 +138,13 @@ def save_policy(
         "estimator": design.to_dict(),
     }  # fmt: skip
     with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(_dated(DESCRIPTION), json.dumps(content, allow_nan=False))
-        archive.writestr(_dated(WEIGHTS), weights.getvalue())
+        archive.writestr(_undated(DESCRIPTION), json.dumps(content, allow_nan=False))
+        archive.writestr(_undated(WEIGHTS), weights.getvalue())
     return write_bytes(path, buffer.getvalue())
 
 
-def _dated(name: str) -> zipfile.ZipInfo:
-    """A member without the time of day: the same policy makes the same file."""
+def _undated(name: str) -> zipfile.ZipInfo:
+    """A member without a date: the same policy makes the same file."""
     member = zipfile.ZipInfo(name)
     member.compress_type = zipfile.ZIP_DEFLATED
     return member

@@ -52,7 +52,7 @@ class StateFeedback(Feedback, Designed):
         self._view = TargetView(self.sensors)
         self.integrals = np.zeros((self.count, len(self.integrated)))
 
-    def answer(self, observations: np.ndarray) -> np.ndarray:
+    def compute_actions(self, observations: np.ndarray) -> np.ndarray:
         """Actions (count, 4), not yet clipped, to observations (count, n_obs)."""
         batch, there = self._view.as_hover(observations)
         state = batch - self.state_trim

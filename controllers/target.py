@@ -30,7 +30,7 @@ class TargetView:
         self._up = -tasks.height_sign("position", own) if aims else 1.0
         self._speed = [self.names.index(n) for n in ("vn", "ve") if n in self.names]
 
-    def aims(self, observations: np.ndarray) -> bool:
+    def has_target(self, observations: np.ndarray) -> bool:
         """Whether observations (count, n) have a target in them."""
         return observations.shape[1] == self.width + tasks.N_WAY
 
@@ -41,12 +41,14 @@ class TargetView:
             observations (count, width), float; whether the setpoint is the target itself, or there is
             no target but to hover, (count,) bool.
         """
-        if self.aims(observations):
-            seen, _, there = self.seen(observations)
+        if self.has_target(observations):
+            seen, _, there = self.relative_to_target(observations)
             return seen, there
         return observations.astype(float), np.ones(len(observations), dtype=bool)
 
-    def seen(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def relative_to_target(
+        self, observations: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Observations (count, width + 4) as those of a hover at the target, or on the way to it.
 
         Returns:

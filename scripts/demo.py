@@ -84,7 +84,7 @@ def save(result: Diagnosis, out: Path, scores: ControllerScores | None = None) -
 
 
 def print_errors(result: Diagnosis) -> None:
-    """The channels in which the bare model errs most, in one line."""
+    """Errors of both models in the channels in which the bare one errs most, in one line."""
     gain = result.findings["gain"]
     worst = sorted(
         gain["channels"].items(),

@@ -417,19 +417,19 @@ def test_a_target_seen_from_itself_is_a_hover():
         base[0, [names.index("pn"), names.index("pe")]] = goal
         base[0, names.index("h")] = 2.2
         base[0, [names.index("vn"), names.index("ve")]] = np.cos(psi), np.sin(psi)
-        seen, asked, there = view.seen(np.hstack([base, np.zeros((1, 4))]))
+        seen, asked, there = view.relative_to_target(np.hstack([base, np.zeros((1, 4))]))
         assert asked[0] == pytest.approx([*goal, -2.2, psi]) and there[0]
         assert seen[0, [names.index(n) for n in ("pn", "pe", "psi")]] == pytest.approx(np.zeros(3))
         assert seen[0, names.index("h")] == pytest.approx(hover.HEIGHT)
         assert seen[0, [names.index("vn"), names.index("ve")]] == pytest.approx([1.0, 0.0])
         away = np.array([[0.2, -0.1, 0.05, 0.1]])
-        seen, asked, there = view.seen(np.hstack([base, away]))
+        seen, asked, there = view.relative_to_target(np.hstack([base, away]))
         cosine, sine = np.cos(psi), np.sin(psi)
         north, east = 0.2 * cosine + 0.1 * sine, 0.2 * sine - 0.1 * cosine
         assert asked[0] == pytest.approx([goal[0] + north, goal[1] + east, -2.25, psi + 0.1])
         there_again = np.hypot(*seen[0, [names.index("pn"), names.index("pe")]])
         assert there_again == pytest.approx(np.hypot(0.2, 0.1)) and there[0]
-        assert not view.seen(np.hstack([base, 10.0 * away]))[2][0]
+        assert not view.relative_to_target(np.hstack([base, 10.0 * away]))[2][0]
 
 
 def test_drawn_vehicles_are_judged_by_the_worst(onboard):

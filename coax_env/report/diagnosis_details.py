@@ -20,7 +20,7 @@ MOST_INNOVATION_FIGURES = 60
 
 
 def detail_blocks(result: "Diagnosis", command_line: str) -> list[str]:
-    """What stands behind the findings, folded away."""
+    """The search, the innovations, the method and the changed parameters, folded away."""
     shares = _predictable_shares(result)
     search = _search_figures(result, shares)
     innovations = _innovation_figures(result, shares)

@@ -131,7 +131,7 @@ def evidence_steps(steps: Sequence[tuple[str, float]]) -> Figure:
 
 
 def parameter_moves(moves: Mapping[str, tuple[float, float]]) -> Figure:
-    """Fitted parameters: how far each moved, and its std now, both in stds of its prior."""
+    """Fitted parameters: how far each moved, and its std after the fit, both in its prior's std."""
     names = list(moves)[::-1]
     dots = {
         "type": "scatter", "mode": "markers", "marker": {"color": AFTER, "size": 9},
@@ -149,7 +149,7 @@ def parameter_moves(moves: Mapping[str, tuple[float, float]]) -> Figure:
         hovermode="closest",
         showlegend=False,
         margin={"t": 10},
-        xaxis={"title": {"text": "move from the prior, in its std (bar: std after the fit)"}},
+        xaxis={"title": {"text": "move / prior std"}},
         yaxis={"ticklabelstandoff": 6},
         shapes=[band],
     )

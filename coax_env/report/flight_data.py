@@ -19,7 +19,7 @@ _PILOTS_ORDER = ("h", "phi", "theta", "psi", "pn", "pe", "vn", "ve", "vd", "v", 
 
 
 def ordered(channels: Iterable[str]) -> list[str]:
-    """Channels from what a pilot sees first; the rest in the contract's order."""
+    """Channels in a pilot's order: height, attitude, position first; the rest as in the log."""
     have = set(channels)
     return [
         c for c in (*_PILOTS_ORDER, *(c for c in CHANNELS if c not in _PILOTS_ORDER)) if c in have
@@ -76,7 +76,7 @@ def _rows_near(t: np.ndarray, predicted: np.ndarray) -> np.ndarray:
 
 
 def points_each(count: int) -> int:
-    """Points per curve where a page has so many figures and is to stay under 6 MB."""
+    """Points per curve where a page has so many figures and must stay under 5 MB."""
     return max(120, min(MOST_POINTS, POINTS_PER_PAGE // max(count, 1)))
 
 

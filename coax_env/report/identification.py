@@ -135,7 +135,7 @@ def _parameters(
                 "–" if left is None else f"{100 * left:.0f} %",
             ]
         )
-    caption = "Green: within one std of the prior."
+    caption = "Bar: std after the fit. Green: within one std of the prior."
     blocks: list[str] = [figure(fit_figures.parameter_moves(moves), caption)] if moves else []
     blocks.append(table(["parameter", "before", "after", "move / prior std", "std left"], rows))
     if directions:

@@ -63,11 +63,12 @@ def page(
 
 
 def inline(text: str) -> Markup:
-    """Plain text as HTML; ``**words**`` become bold and ```words``` code. Markup stays as it is."""
+    """Plain text as HTML; ``**words**`` become bold, ```words``` code. Markup stays as it is."""
     if isinstance(text, Markup):
         return text
     safe = _NUMBER_AND_UNIT.sub("\\1\u00a0\\2", escape(text))
     safe = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)
+    safe = re.sub(r"·10\^(−?\d+)", r"·10<sup>\1</sup>", safe)
     return Markup(re.sub(r"`(.+?)`", r"<code>\1</code>", safe))
 
 

@@ -63,13 +63,13 @@ def figure_of(data: list[dict[str, Any]], height: int, **layout: Any) -> Figure:
 
 
 def packed(values: Any) -> Any:
-    """Numbers as plotly's typed arrays in single precision: small, and more than a screen shows."""
+    """Numbers as plotly's typed arrays in single precision, base64: small, and exact enough."""
     array = np.ascontiguousarray(values, "<f4")
     return {"dtype": "f4", "bdata": base64.b64encode(array.tobytes()).decode()}
 
 
 def thinned(count: int, points: int = MOST_POINTS) -> slice:
-    """Every how many of `count` samples are drawn where at most `points` shall be."""
+    """Slice that keeps at most `points` of `count` samples, evenly."""
     return slice(None, None, max(1, math.ceil(count / points)))
 
 

@@ -46,8 +46,8 @@ def _summary(result: Replay, run: str, channel: str) -> tuple[str, list[str]]:
     diverged = [replay.name for replay in result.runs if replay.diverged]
     sentences = [
         f"The filtered state is simulated open loop for {horizon} with the recorded commands, from a "
-        "start every quarter of a second, and compared with the measurement. In units of the "
-        "sensor's noise a perfect model would come out near 1."
+        "start every quarter of a second, and compared with the measurement. A perfect "
+        "model's error would be about the sensor's noise."
     ]
     if diverged:
         sentences.append(f"**The simulation diverges in {and_list(diverged)}.**")
@@ -57,8 +57,7 @@ def _summary(result: Replay, run: str, channel: str) -> tuple[str, list[str]]:
     if math.isfinite(ratio):
         title += f": by {number(entry['rms'], 2)} {unit_name(entry['unit'])} in {run}"
         sentences.append(
-            f"In units of the sensor's noise that is {number(ratio, 2)}, the largest of all runs and "
-            "channels."
+            f"That is {number(ratio, 2)} times the sensor's noise, the most of all runs and channels."
         )
     return capital(title), sentences
 

@@ -26,7 +26,7 @@ Panel = tuple[str, dict[str, np.ndarray]]
 """Axis title and curves by name."""
 
 POINTS = 3600
-"""Per curve, all maneuvers of a page together: it is to stay under 6 MB."""
+"""Per curve, all maneuvers of a page together: it is to stay under 5 MB."""
 
 DOUBLET_HEADER = (
     "quantity", "unit", "paper prints", "its equations", "this run, K_b 0.91", "agrees",
