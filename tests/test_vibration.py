@@ -1,4 +1,4 @@
-"""A line at rotor speed, planted by hand: amplitude, evidence and channels are known without the code."""
+"""A line at rotor speed, planted by hand: what it is worth is known without the code."""
 
 import math
 
