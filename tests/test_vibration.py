@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from coax_env import load_vehicle
 from coax_env.diagnosis import vibration
 from coax_env.logs.flight import Flight, Run
 
@@ -97,6 +98,23 @@ def test_the_std_is_the_scatter():
 @pytest.mark.parametrize("off", [1.0, -2.5, 4.0])
 def test_what_shakes_beside_the_rotor_is_no_line_of_it(off):
     assert vibration.find(shaken(ALL, off=off)) is None
+
+
+def test_the_other_rotors_line_is_no_neighbour():
+    """Both rotors shake, 2.4 Hz apart: the other's line costs only what leaks of it into one second."""
+    both = shaken(ALL)
+    for i, channel in enumerate(ALL):
+        lower = 0.25 * np.sin(SPEEDS["lower"] * both.runs[0].t + 0.4 * i)
+        both.runs[0].measured[channel] += lower
+    clean = vibration._line(shaken(ALL), "upper").evidence
+    assert vibration._line(both, "upper").evidence > 0.3 * clean
+
+
+def test_a_vehicle_without_its_vibration_keeps_all_else():
+    vehicle = load_vehicle("lama400d").with_effect("gyro_bias", x=0.01)
+    shaking = vehicle.with_effect("vibration", amplitude=0.3)
+    assert vibration.without(shaking).effects == vehicle.effects
+    assert vibration.without(shaking).parameters == vehicle.parameters
 
 
 def test_noise_is_no_line_and_a_small_line_is_not_named():
