@@ -223,6 +223,13 @@ def test_white_scores_are_not_inflated_and_one_bad_block_is_no_correlation():
     assert variance_inflation(q, ["a"], ["a"]) == pytest.approx(before, rel=0.15)
 
 
+def test_scores_that_are_no_numbers_inflate_nothing():
+    q = scored(0.5, blocks=20)
+    list(vars(q).values())[8][:] = np.inf
+    with np.errstate(invalid="ignore"):
+        assert variance_inflation(q, ["a"], ["a"]) == 1.0
+
+
 def test_the_inflation_does_not_depend_on_how_a_group_is_written():
     q = scored(0.7, blocks=400)
     T = np.array([[1.0, 0.4], [-2.0, 3.0]])

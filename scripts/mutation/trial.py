@@ -53,6 +53,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/identification/two_step/*": ("tests/test_two_step.py",),
     "coax_env/identification/*": ("tests/test_identification.py", "tests/test_two_step.py"),
     "coax_env/diagnosis/gain.py": ("tests/test_gain.py", "tests/test_diagnosis.py"),
+    "coax_env/diagnosis/vibration.py": ("tests/test_vibration.py", "tests/test_unlisted.py"),
     "coax_env/diagnosis/calibration.py": ("tests/test_study.py",),
     "coax_env/diagnosis/*": (
         "tests/test_diagnosis.py", "tests/test_unlisted.py", "tests/test_input_innovations.py",

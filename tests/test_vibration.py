@@ -1,0 +1,147 @@
+"""A line at rotor speed, planted by hand: what it is worth is known without the code."""
+
+import math
+
+import numpy as np
+import pytest
+
+from coax_env import load_vehicle
+from coax_env.diagnosis import vibration
+from coax_env.logs.flight import Flight, Run
+
+SPEEDS = {"upper": 209.0, "lower": 224.0}  # rad/s: 33.3 and 35.7 Hz
+SIGMA = 0.1  # m/s2
+
+
+def shaken(
+    amplitudes: dict[str, float],
+    rotor: str = "upper",
+    seed: int = 0,
+    seconds: int = 40,
+    rate: float = 100.0,
+    drift: float = 0.0,
+    measured_speed: bool = True,
+    off: float = 0.0,
+) -> Flight:
+    """White accelerometers on a slow motion, a sine of the rotor's azimuth in some of them.
+
+    Args:
+        amplitudes: of the sine by channel [m/s2]; every channel has a phase of its own.
+        drift: of the rotor speeds [rad/s2], seen by the encoders only.
+        off: by which the sine misses the rotor's frequency [Hz].
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(seconds * rate)) / rate
+    azimuth = (SPEEDS[rotor] + 2.0 * np.pi * off) * t + 0.5 * drift * t**2
+    measured = {}
+    for i, channel in enumerate(("ax", "ay", "az")):
+        motion = 0.5 * np.sin(0.7 * t + i) - 9.8 * (channel == "az")
+        line = amplitudes.get(channel, 0.0) * np.sin(azimuth + 1.3 * i)
+        measured[channel] = motion + line + SIGMA * rng.standard_normal(t.size)
+    if measured_speed:
+        for name, speed in SPEEDS.items():
+            measured[f"rpm_{name}"] = (speed + drift * t) * 30.0 / math.pi
+    command = np.tile([*SPEEDS.values(), 0.0, 0.0], (t.size, 1))
+    return Flight("lama400d", (Run("made up", t, command, measured),))
+
+
+ALL = dict.fromkeys(("ax", "ay", "az"), 0.25)
+
+
+@pytest.mark.parametrize("rotor", ["upper", "lower"])
+@pytest.mark.parametrize("rate", [100.0, 80.0, 27.0])
+def test_the_planted_line_is_found_at_its_rotor(rotor, rate):
+    """At 80 Hz nearly at half the rate, at 27 Hz as an alias."""
+    line = vibration.find(shaken(ALL, rotor, rate=rate))
+    assert line is not None and line.rotor == rotor
+    assert abs(line.amplitude - 0.25) < 3.0 * line.std < 0.05
+    assert set(line.channels) == {"ax", "ay", "az"}
+
+
+def test_the_amplitude_is_the_root_mean_square_over_the_axes_and_the_strongest_comes_first():
+    line = vibration.find(shaken({"ax": 0.2, "ay": 0.5}))
+    assert line.amplitude == pytest.approx(math.sqrt((0.2**2 + 0.5**2) / 3.0), rel=0.05)
+    assert line.channels == ("ay", "ax")
+
+
+def test_it_is_followed_where_the_rotor_speeds_up():
+    """A rotor that gains a revolution a second in forty seconds; the commands alone do not know."""
+    found = vibration.find(shaken(ALL, drift=0.15))
+    assert found is not None and found.amplitude == pytest.approx(0.25, rel=0.05)
+    steady = vibration.find(shaken(ALL, measured_speed=False))
+    assert steady is not None and steady.amplitude == pytest.approx(0.25, rel=0.05)
+
+
+def test_the_evidence_is_that_of_the_power_over_its_neighbours():
+    """A sine of amplitude A in n readings of noise s: power A^2 n/2 + 2 s^2, neighbours 2 s^2.
+
+    Log-likelihood of exponential powers whose mean is F and not 1: F - 1 - log F each.
+    """
+    amplitude, n = 0.06, 100
+    F = 1.0 + amplitude**2 * n / (4.0 * SIGMA**2)
+    expected = 3 * 40 * (F - 1.0 - math.log(F))
+    evidence = [
+        vibration._line(shaken(dict.fromkeys(ALL, amplitude), seed=seed), "upper").evidence
+        for seed in range(6)
+    ]
+    assert np.mean(evidence) == pytest.approx(expected, rel=0.12)
+
+
+def test_the_std_is_the_scatter():
+    """Over flights, without what is allowed for the smearing of the phase."""
+    lines = [vibration._line(shaken(ALL, seed=seed, seconds=10), "upper") for seed in range(40)]
+    own = [math.sqrt(line.std**2 - (vibration.SMEAR * line.amplitude) ** 2) for line in lines]
+    assert np.std([line.amplitude for line in lines]) == pytest.approx(np.mean(own), rel=0.3)
+    assert np.mean([line.amplitude for line in lines]) == pytest.approx(0.25, rel=0.01)
+
+
+@pytest.mark.parametrize("off", [1.0, -2.5, 4.0])
+def test_what_shakes_beside_the_rotor_is_no_line_of_it(off):
+    assert vibration.find(shaken(ALL, off=off)) is None
+
+
+def test_the_other_rotors_line_is_no_neighbour():
+    """Both rotors shake, 2.4 Hz apart: the other's line costs only what leaks of it into one second."""
+    both = shaken(ALL)
+    for i, channel in enumerate(ALL):
+        lower = 0.25 * np.sin(SPEEDS["lower"] * both.runs[0].t + 0.4 * i)
+        both.runs[0].measured[channel] += lower
+    clean = vibration._line(shaken(ALL), "upper").evidence
+    assert vibration._line(both, "upper").evidence > 0.3 * clean
+
+
+def test_a_vehicle_without_its_vibration_keeps_all_else():
+    vehicle = load_vehicle("lama400d").with_effect("gyro_bias", x=0.01)
+    shaking = vehicle.with_effect("vibration", amplitude=0.3)
+    assert vibration.without(shaking).effects == vehicle.effects
+    assert vibration.without(shaking).parameters == vehicle.parameters
+
+
+def test_noise_is_no_line_and_a_small_line_is_not_named():
+    for seed in range(10):
+        assert vibration.find(shaken({}, seed=seed)) is None
+    weak = shaken(dict.fromkeys(ALL, 0.5 * smallest()), seconds=120)
+    assert vibration._line(weak, "upper").evidence > 14.0 and vibration.find(weak) is None
+
+
+def smallest() -> float:
+    return vibration.CATALOGUE["vibration"].parameters[0].smallest
+
+
+def test_taking_it_out_leaves_the_motion_and_the_noise():
+    """Sine and cosine take two readings' worth of noise from every second, and nothing else."""
+    flight, quiet = shaken(ALL), shaken({})
+    line = vibration.find(flight)
+    left = vibration.taken_out(flight, line).runs[0].measured
+    for channel in ALL:
+        rest = left[channel] - quiet.runs[0].measured[channel]
+        assert rest.std() < 0.25 * SIGMA
+        assert rest.std() == pytest.approx(SIGMA * math.sqrt(2.0 / 100.0), rel=0.2)
+    assert np.array_equal(left["rpm_upper"], flight.runs[0].measured["rpm_upper"])
+
+
+def test_no_line_without_accelerometers():
+    flight = shaken(ALL)
+    bare = {c: z for c, z in flight.runs[0].measured.items() if c.startswith("rpm")}
+    run = Run("made up", flight.runs[0].t, flight.runs[0].command, bare)
+    assert vibration.find(Flight("lama400d", (run,))) is None
