@@ -18,9 +18,20 @@ from scipy.spatial.transform import Rotation
 
 from coax_env import derivative, hover_trim, load_vehicle
 from coax_env.kernel import compilation
+from coax_env.model import channels as Z
 from coax_env.model import dynamics, effects
+from coax_env.model import inputs as U
 from coax_env.model import parameters as P
-from coax_env.model.layout import CHANNELS, N_CHANNELS, N_FULL, N_STATES, STATES
+from coax_env.model import state as S
+from coax_env.model.layout import (
+    CHANNELS,
+    COMMANDS,
+    FULL_STATES,
+    N_CHANNELS,
+    N_FULL,
+    N_STATES,
+    STATES,
+)
 
 LAMA = load_vehicle("lama400d")
 COUPLED = LAMA.with_values({"flap_coupling_lon": 0.2, "flap_coupling_lat": -0.3})
@@ -939,3 +950,12 @@ def test_no_index_leaves_its_array(lag, tmp_path):
 
 def test_paper_states_are_the_first_sixteen():
     assert N_STATES == 16 and NAMES[:3] == ["u", "v", "w"] and NAMES[-1] == "z"
+
+
+def test_places_have_the_names_of_the_layout():
+    for places, names in (
+        (S, [name for name, _ in FULL_STATES]),
+        (U, [name for name, _ in COMMANDS] + ["time"]),
+        (Z, CHANNELS),
+    ):
+        assert [getattr(places, name.upper()) for name in names] == list(range(len(names)))

@@ -27,6 +27,7 @@ from coax_env.estimation.fit import (
 )
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.estimation.whiteness import whiteness
+from coax_env.kernel.angles import wrap_angle, wrap_angles
 from coax_env.kernel.compilation import pointer
 
 # --- a pendulum with a motor: state angle, rate; input a torque; read by an encoder and two gyros --
@@ -343,7 +344,8 @@ def test_angles_wrap():
 
 @pytest.mark.parametrize("angle", [-9.0, -math.pi, -0.1, 0.0, 3.0, math.pi, 100.0])
 def test_wrap_angle(angle):
-    wrapped = kalman.wrap_angle(angle)
+    wrapped = wrap_angle(angle)
+    assert wrapped == wrap_angles(np.array([angle]))[0]
     assert -math.pi <= wrapped < math.pi
     assert math.cos(wrapped - angle) == pytest.approx(1.0)
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numba import boolean, float32, float64, int64, types
 
+from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled
 
 _A = float64[::1]
@@ -38,12 +39,6 @@ SAME_STEP = 1e-6
 BLOCK = 16
 """Rows of matrices are as long as a multiple of this, zeros at the end: no loop has a scalar rest."""
 _LOG_2PI = math.log(2.0 * math.pi)
-
-
-@compiled(types.float64(float64))
-def wrap_angle(angle):
-    """Angle in [-pi, pi)."""
-    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @compiled(int64(int64))
