@@ -17,7 +17,10 @@ from typing import Any
 import numba
 
 PACKAGE = Path(__file__).parents[1]
-TABLES = ("model/layout.py", "model/parameters.py", "model/workspace.py")
+TABLES = tuple(
+    f"model/{name}.py"
+    for name in ("channels", "inputs", "layout", "parameters", "state", "workspace")
+)
 """Places and sizes that compiled code has as constants; these files compile nothing themselves."""
 
 

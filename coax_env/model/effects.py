@@ -37,16 +37,17 @@ from numba import njit
 
 from coax_env.errors import InputError
 from coax_env.kernel.compilation import BORROWING, name_apart
+from coax_env.model import channels as Z
 from coax_env.model import generic_terms
 from coax_env.model import parameters as P
+from coax_env.model import state as S
 from coax_env.model import workspace as F
 from coax_env.model.layout import CHANNELS
 
 STAGES = ("PROPERTY", "AIR", "SWASH", "ROTOR", "LOAD", "UNLISTED", "SENSOR")
 PROPERTY, AIR, SWASH, ROTOR, LOAD, UNLISTED, SENSOR = (P.N_FIXED + i for i in range(len(STAGES)))
 SWITCHES = slice(P.N_FIXED, P.N_FIXED + len(STAGES))
-"""Where a parameter vector says of each stage whether it has an effect: 0 or 1."""
-"""Where each stage's switch stands in the parameter vector."""
+"""Places in a parameter vector of the stages' switches: 1 where the stage has an effect, else 0."""
 
 INFINITY = math.inf
 DEGREE = math.pi / 180.0
@@ -496,7 +497,7 @@ def flap_blowback(x, f, p, e):
 )
 def yaw_damping(x, f, p, e):
     """Yaw moment -k r."""
-    f[F.MOMENT_Z] -= p[e] * x[5]
+    f[F.MOMENT_Z] -= p[e] * x[S.R]
 
 
 @effect(
@@ -508,8 +509,8 @@ def yaw_damping(x, f, p, e):
 )
 def rate_damping(x, f, p, e):
     """Roll and pitch moments -k p and -k q."""
-    f[F.MOMENT_X] -= p[e] * x[3]
-    f[F.MOMENT_Y] -= p[e] * x[4]
+    f[F.MOMENT_X] -= p[e] * x[S.P]
+    f[F.MOMENT_Y] -= p[e] * x[S.Q]
 
 
 @effect(
@@ -555,9 +556,8 @@ def spin_up_reaction(x, f, p, e):
 
 # --- sensors --------------------------------------------------------------------------------------
 # Places of the readings in the workspace.
-_GYRO, _ACCEL = F.READING + CHANNELS.index("p"), F.READING + CHANNELS.index("ax")
-_ATTITUDE, _HEIGHT = F.READING + CHANNELS.index("phi"), F.READING + CHANNELS.index("h")
-_SINK = F.READING + CHANNELS.index("vd")
+_GYRO, _ACCEL, _ATTITUDE = F.READING + Z.P, F.READING + Z.AX, F.READING + Z.PHI
+_HEIGHT, _SINK = F.READING + Z.H, F.READING + Z.VD
 
 
 @effect(
@@ -571,7 +571,7 @@ _SINK = F.READING + CHANNELS.index("vd")
 def imu_lever_arm(x, f, p, e):
     """Accelerometers off the centre of gravity: f + omega' x r + omega x (omega x r)."""
     rx, ry, rz = p[e], p[e + 1], p[e + 2]
-    wx, wy, wz = x[3], x[4], x[5]
+    wx, wy, wz = x[S.P], x[S.Q], x[S.R]
     along = wx * rx + wy * ry + wz * rz
     square = wx * wx + wy * wy + wz * wz
     f[_ACCEL] += f[F.Q_DOT] * rz - f[F.R_DOT] * ry + wx * along - square * rx
