@@ -16,7 +16,7 @@ from coax_env.kernel.random_streams import (
     skip,
     two_normals,
 )
-from coax_env.kernel.simd import anywhere, select
+from coax_env.kernel.simd import any_lane, select
 from coax_env.model import parameters as P
 from coax_env.model.layout import N_CHANNELS
 from coax_env.model.sensors import new_samples
@@ -99,7 +99,7 @@ def read(values, row, sensors, bias, stream, flags, held):
         if sensors[k, RATE] != rate:
             rate = sensors[k, RATE]
             new = new_samples(row, rate)
-        if not anywhere(new > 0.0):
+        if not any_lane(new > 0.0):
             continue
         value = values[k] + bias[k]
         if noise > 0.0:

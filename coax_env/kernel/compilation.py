@@ -25,11 +25,11 @@ TABLES = tuple(
 
 
 def kernel_sources() -> list[Path]:
-    """The package's files that take part in compiled code: those that import this room, and TABLES."""
+    """The files that take part in compiled code: this room, those that import it, and TABLES."""
     compiling = [
         path
         for path in sorted(PACKAGE.rglob("*.py"))
-        if "coax_env.kernel" in path.read_text(encoding="utf-8")
+        if path.parent.name == "kernel" or "coax_env.kernel" in path.read_text(encoding="utf-8")
     ]
     return [*compiling, *(PACKAGE / name for name in TABLES)]
 

@@ -278,7 +278,7 @@ def _rates_where_on(x, p, f, dx):
         _rates_bare(x, p, f, dx)
 
 
-_rates = Variants(_rates_bare, _rates_where_on)
+_rates: Any = Variants(_rates_bare, _rates_where_on)
 
 
 @compiled(forceinline=True)
