@@ -9,8 +9,9 @@ e = v / s, and so the likelihood is
 
     -2 log L = sum over readings of  e^2 + log s^2 + log 2 pi.
 
-F and H are mostly zero, and only what is not is multiplied (sparse.py); tests/test_estimation.py holds
-the pass against the same filter with dense matrices. What it stores, its gains K, 1 / s and Jacobians,
+F and H are mostly zero, and only what is not is multiplied (sparse.py); tests/test_kalman.py holds the
+pass against the same filter with dense matrices. One departure from the book: both Jacobians are those
+at the predicted state, from one look at the rates, and serve some rows (`refresh`). What it stores, its gains K, 1 / s and Jacobians,
 is what the passes of frozen_gains.py and noise_score.py work with.
 
 Bar-Shalom, Li and Kirubarajan 2001, ch. 5 and 10; Durbin and Koopman 2012, sec. 6.4 (one reading at a
@@ -22,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import boolean, float32, float64, int64, types
+from numba.extending import typeof_impl
 
 from coax_env.estimation.sparse import (
     REORDER,
@@ -64,9 +66,14 @@ class CompiledModel(NamedTuple):
     def of(cls, model: Any) -> "CompiledModel":
         """That of a state_space.Model."""
         return cls(
-            model.step, model.measure, model.drift_and_readings, model.exact, model.wraps,
-            model.state_scale, model.work_size,
-        )  # fmt: skip
+            model.step,
+            model.measure,
+            model.drift_and_readings,
+            np.ascontiguousarray(model.exact, bool),
+            np.ascontiguousarray(model.wraps, bool),
+            np.ascontiguousarray(model.state_scale, float),
+            int(model.work_size),
+        )
 
 
 class RunData(NamedTuple):
@@ -165,6 +172,12 @@ GAINS = types.NamedTuple([float32[:, ::1], _A, float32[:, :, ::1]], Gains)
 PATH = types.NamedTuple([float32[:, :, ::1], _N, _M], Path)
 TRACE = types.NamedTuple([_M, _M, GAINS, PATH], Trace)
 COVARIANCES = types.NamedTuple([float64[:, :, ::1], _N], Covariances)
+
+
+@typeof_impl.register(CompiledModel)
+def _type_of_model(model: CompiledModel, context: Any) -> types.Type:
+    """MODEL, whatever numba would find out: to look at the functions costs 50 us a call."""
+    return MODEL
 
 
 # --- linearise --------------------------------------------------------------------------------------
@@ -317,7 +330,7 @@ def _gate(z, R, gate, log_likelihood, w):
     return log_likelihood, beyond
 
 
-@compiled(**REORDER)
+@compiled(forceinline=True, **REORDER)
 def _correct(i, w):
     """Take in reading `i` of a row: x = x + K v, P = P - K H P; returns v and s^2."""
     nx, width = w.x.size, w.HP.size
@@ -389,7 +402,7 @@ def _store_matrix(A, out):
             out[i, j] = A[i, j]
 
 
-@compiled(**REORDER)
+@compiled(forceinline=True, **REORDER)
 def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
     """`filter_pass` in arrays that are there."""
     n, m = run.z.shape
