@@ -61,7 +61,11 @@ def find_non_zeros(A):
 
 @compiled(types.void(SPARSE, float64[:, ::1], float64[:, ::1]), **REORDER)
 def multiply(A, B, out):
-    """A B into `out`, with what is not zero in A alone."""
+    """A B, with what is not zero in A alone.
+
+    Args:
+        A: Sparse, its non-zeros found. B: (columns of A, width). out: (rows of A, width).
+    """
     width = out.shape[1]
     for i in range(A.counts.size):
         for j in range(width):
@@ -75,7 +79,11 @@ def multiply(A, B, out):
 
 @compiled(types.void(float32[:, :, ::1], int64, SPARSE))
 def unpack(stored, slot, A):
-    """One of the stored matrices (slots, rows, columns) into A, with its non-zeros."""
+    """One of the stored matrices back into a Sparse one, with its non-zeros.
+
+    Args:
+        stored: (slots, rows, columns). slot: which. A: Sparse, out.
+    """
     for i in range(stored.shape[1]):
         for j in range(stored.shape[2]):
             A.values[i, j] = stored[slot, i, j]

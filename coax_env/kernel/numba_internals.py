@@ -53,22 +53,39 @@ def define_call(
 
 
 def external_function(builder: Any, name: str, result: ir.Type, kinds: list[ir.Type]) -> Any:
-    """A function of LLVM or of the process, by its symbol."""
+    """A function of LLVM or of the process.
+
+    Args:
+        builder: numba's. name: the function's symbol.
+        result: type of what it returns. kinds: types of its arguments.
+    """
     return cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, kinds), name)
 
 
 def pointer_at(context: Any, builder: Any, symbol: str) -> Any:
-    """The address that a symbol of the process has."""
+    """The address that a symbol of the process has, as a pointer to an INTP.
+
+    Args:
+        context, builder: numba's. symbol: its name, once given to llvmlite.binding.add_symbol.
+    """
     return context.get_c_value(builder, INTP, symbol)
 
 
 def raise_error(context: Any, builder: Any, error: type, *message: str) -> None:
-    """Leave the compiled function with a Python exception."""
+    """Leave the compiled function with a Python exception.
+
+    Args:
+        context, builder: numba's. error: the exception's class. message: what it is called with.
+    """
     context.call_conv.return_user_exc(builder, error, message)
 
 
 def array_data(context: Any, builder: Any, kind: types.Array, array: Any) -> Any:
-    """Pointer to an array's first element."""
+    """Pointer to an array's first element.
+
+    Args:
+        context, builder: numba's. kind, array: the array's type and value.
+    """
     return make_array(kind)(context, builder, array).data
 
 
@@ -77,7 +94,7 @@ def view_rows(context: Any, builder: Any, source: types.Array, array: Any, row: 
     """The memory of a two-dimensional contiguous array as a one-dimensional array, row by row.
 
     Args:
-        source, array: the array's type and value.
+        context, builder: numba's. source, array: the array's type and value.
         row: type of the array that is returned. element: of one of its elements, of `size` bytes.
     """
     of = make_array(source)(context, builder, array)
@@ -89,7 +106,12 @@ def view_rows(context: Any, builder: Any, source: types.Array, array: Any, row: 
 
 def stack_array(context: Any, builder: Any, row: types.Array, element: ir.Type, count: int,
                 size: int) -> Any:  # fmt: skip
-    """A one-dimensional array of so many elements of `size` bytes on the stack, not set."""
+    """A one-dimensional array on the stack, not set.
+
+    Args:
+        context, builder: numba's. row: type of the array. element: type of one of its elements.
+        count: how many. size: bytes of one.
+    """
     with builder.goto_entry_block():
         place = builder.alloca(ir.ArrayType(element, count))
     data = builder.bitcast(place, element.as_pointer())

@@ -139,7 +139,11 @@ def by_type(key: Any) -> Callable[[Callable], Callable]:
 
 
 def select(flag: Any, yes: Any, no: Any) -> Any:
-    """`yes` where the flag is true, else `no`: of one number or of each lane."""
+    """What stands for a branch: of one number, or of each lane by itself.
+
+    Args:
+        flag: truth, or register of truths. yes, no: what is chosen where it is true, and where not.
+    """
     return yes if flag else no
 
 

@@ -447,7 +447,11 @@ def _full_derivative(x, u, p, work, dx):
 
 
 def full_state(state: np.ndarray, command: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """The full state (26,): the paper's sixteen, actuators settled on the command, no gust."""
+    """The full state (26,): the paper's sixteen, actuators settled on the command, no gust.
+
+    Args:
+        state: the paper's states (16,). command: commands (4,). vehicle: whose state it is.
+    """
     x = np.zeros(N_FULL)
     x[:N_STATES] = state
     x[S.OMEGA_U : S.GUST_X] = command
@@ -463,7 +467,11 @@ def kernel_input(command: np.ndarray, time: float = 0.0) -> np.ndarray:
 
 
 def full_derivative(x: np.ndarray, u: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """Rates of the full state (26,) for an input (5,); actuators as first-order states."""
+    """Rates of the full state (26,); actuators as first-order states.
+
+    Args:
+        x: full state (26,). u: commands and time (5,). vehicle: its numbers and effects.
+    """
     dx = np.zeros(N_FULL)
     _full_derivative(
         np.ascontiguousarray(x, float), np.ascontiguousarray(u, float), vehicle.vector,
@@ -502,7 +510,12 @@ def derivative(state: Any, command: Any, vehicle: Vehicle | str) -> np.ndarray:
 
 
 def readings(state: Any, command: Any, vehicle: Vehicle) -> dict[str, float]:
-    """Noise-free readings of every canonical channel at a full or a paper state."""
+    """Noise-free readings of every canonical channel, in its unit (layout.CHANNEL_UNITS).
+
+    Args:
+        state: full state (26,), or the paper's (16,) with actuators settled on the command.
+        command: commands (4,). vehicle: its numbers and effects.
+    """
     state = np.asarray(state, float)
     command = np.asarray(command, float)
     x = full_state(state, command, vehicle) if state.size == N_STATES else state.copy()

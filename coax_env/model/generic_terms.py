@@ -116,7 +116,11 @@ def hover_speeds(p: np.ndarray) -> tuple[float, float]:
 
 @compiled()
 def term_value(i: int, x: np.ndarray, f: np.ndarray, p: np.ndarray) -> float:
-    """Value of the term TERMS[i] at a full state and the kernel's workspace."""
+    """Value of the term TERMS[i], in its unit.
+
+    Args:
+        i: which. x: full state (26,). f: workspace (N_FLOW,). p: parameter vector.
+    """
     if i < _SQUARES:
         return x[i]
     if i < _PRODUCTS:
