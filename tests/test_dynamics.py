@@ -18,9 +18,20 @@ from scipy.spatial.transform import Rotation
 
 from coax_env import derivative, hover_trim, load_vehicle
 from coax_env.kernel import compilation
+from coax_env.model import channels as Z
 from coax_env.model import dynamics, effects
+from coax_env.model import inputs as U
 from coax_env.model import parameters as P
-from coax_env.model.layout import CHANNELS, N_CHANNELS, N_FULL, N_STATES, STATES
+from coax_env.model import state as S
+from coax_env.model.layout import (
+    CHANNELS,
+    COMMANDS,
+    FULL_STATES,
+    N_CHANNELS,
+    N_FULL,
+    N_STATES,
+    STATES,
+)
 
 LAMA = load_vehicle("lama400d")
 COUPLED = LAMA.with_values({"flap_coupling_lon": 0.2, "flap_coupling_lat": -0.3})
@@ -835,7 +846,7 @@ def test_no_two_compiled_functions_share_a_name():
     assert len(names) > 50
 
 
-LATE_PROGRAM = """
+LAZY_PROGRAM = """
 import sys
 import numpy as np
 import coax_env
@@ -871,9 +882,9 @@ print(*compiled)
 def test_effects_are_compiled_when_first_flown():
     """None for a bare vehicle; an interrupt reaches the caller, and the next call compiles."""
     done = subprocess.run(
-        [sys.executable, "-c", LATE_PROGRAM], capture_output=True, text=True, check=True
+        [sys.executable, "-c", LAZY_PROGRAM], capture_output=True, text=True, check=True
     )
-    assert done.stdout.strip() == ";interrupted;step _property_effects"
+    assert done.stdout.strip() == ";interrupted;_step _property_effects"
 
 
 @pytest.mark.slow
@@ -900,11 +911,11 @@ def test_an_edited_callee_is_compiled_anew(tmp_path):
     first = run()
     assert first[1] == pytest.approx(-1.0)
     assert run() == first
-    callee = tmp_path / "coax_env" / "effects.py"
+    callee = tmp_path / "coax_env" / "model" / "effects.py"
     text = callee.read_text()
-    line = "f[F.MOMENT_Z] -= p[e] * x[5]"
+    line = "f[F.MOMENT_Z] -= p[e] * x[S.R]"
     assert line in text
-    callee.write_text(text.replace(line, "f[F.MOMENT_Z] -= 3.0 * p[e] * x[5]"))
+    callee.write_text(text.replace(line, "f[F.MOMENT_Z] -= 3.0 * p[e] * x[S.R]"))
     second = run()
     assert second[0] != first[0]
     assert second[1] == pytest.approx(-3.0)
@@ -939,3 +950,12 @@ def test_no_index_leaves_its_array(lag, tmp_path):
 
 def test_paper_states_are_the_first_sixteen():
     assert N_STATES == 16 and NAMES[:3] == ["u", "v", "w"] and NAMES[-1] == "z"
+
+
+def test_places_have_the_names_of_the_layout():
+    for places, names in (
+        (S, [name for name, _ in FULL_STATES]),
+        (U, [name for name, _ in COMMANDS] + ["time"]),
+        (Z, CHANNELS),
+    ):
+        assert [getattr(places, name.upper()) for name in names] == list(range(len(names)))

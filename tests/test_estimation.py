@@ -21,11 +21,14 @@ from coax_env.estimation.engine import (
     Engine,
     Estimate,
     RunPass,
+    _Buffers,
 )
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.quadratic import Linearised, Quadratic, bounded_solve
+from coax_env.estimation.sparse import padded, with_places
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.estimation.whiteness import whiteness
+from coax_env.kernel.angles import wrap_angle, wrap_angles
 from coax_env.kernel.compilation import pointer
 
 # --- a pendulum with a motor: state angle, rate; input a torque; read by an encoder and two gyros --
@@ -67,12 +70,6 @@ def _drift_and_readings(x, u, dt, p, work, out):
     out[2] = x[ANGLE]
     out[3] = x[RATE] + p[BIAS]
     out[4] = x[RATE]
-
-
-@pointer(types.void(_A, _A, types.float64, _A, _A, _A))
-def _quadruple(x, u, dt, p, work, out):
-    for i in range(x.size):
-        out[i] = 4.0 * x[i]
 
 
 class Pendulum:
@@ -342,7 +339,8 @@ def test_angles_wrap():
 
 @pytest.mark.parametrize("angle", [-9.0, -math.pi, -0.1, 0.0, 3.0, math.pi, 100.0])
 def test_wrap_angle(angle):
-    wrapped = kalman.wrap_angle(angle)
+    wrapped = wrap_angle(angle)
+    assert wrapped == wrap_angles(np.array([angle]))[0]
     assert -math.pi <= wrapped < math.pi
     assert math.cos(wrapped - angle) == pytest.approx(1.0)
 
@@ -365,26 +363,44 @@ def test_uneven_rows_are_followed():
 
 @pytest.mark.parametrize("rate", [0.1, 3.0])
 def test_jacobian_of_a_step_is_the_exponential_of_that_of_the_drift(rate):
-    """To third order; rows that the drift takes exactly are I + A; a stiff row has the step's own."""
+    """To third order; rows that the drift takes exactly are I + A; none of a row that is too stiff."""
     nx = 3
     exact = np.array([False, True, False])
-    A = np.zeros((nx, kalman.BLOCK))
-    A[:, :nx] = [[-rate, 0.4, 0.0], [0.0, 0.1, 0.2], [0.3, 0.0, -0.2]]
-    AA, F = np.zeros_like(A), np.zeros_like(A)
-    places, counts = np.zeros((nx, nx), int), np.zeros(nx, int)
-    x = np.array([0.3, -0.2, 0.5])
-    kalman._transition(
-        _quadruple, exact, x, np.zeros(1), 0.1, np.zeros(1), np.zeros(1), np.full(nx, 1e-3), 4.0 * x,
-        np.zeros(nx), A, AA, places, counts, F,
-    )  # fmt: skip
-    a = A[:, :nx]
+    A = with_places(np.zeros((nx, padded(nx))), nx)
+    A.values[:, :nx] = [[-rate, 0.4, 0.0], [0.0, 0.1, 0.2], [0.3, 0.0, -0.2]]
+    F = with_places(np.zeros_like(A.values), nx)
+    done = kalman.exponential(exact, A, np.zeros_like(A.values), F)
+    assert done == (rate <= kalman.MOST_DECAY)
+    if not done:
+        assert not F.values.any()
+        return
+    a = A.values[:, :nx]
     expected = np.eye(nx) + a + a @ a / 2.0 + a @ a @ a / 6.0
     expected[exact] = (np.eye(nx) + a)[exact]
-    if rate > kalman.MOST_DECAY:
-        expected = 4.0 * np.eye(nx)
-    np.testing.assert_allclose(F[:, :nx], expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(F.values[:, :nx], expected, rtol=1e-9, atol=1e-12)
     for i in range(nx):
-        assert set(places[i, : counts[i]]) == set(np.flatnonzero(F[i]))
+        assert set(F.places[i, : F.counts[i]]) == set(np.flatnonzero(F.values[i]))
+
+
+def test_a_stiff_row_has_the_jacobian_of_the_step():
+    """Where the drift's series is no longer good, the step itself is differenced, in the pass too."""
+    stiff = Pendulum()
+    stiff.exact = np.array([False, False])
+    values = {**TRUTH, "damping": 40.0}
+    record = swing(1, n=40, values=values)
+    assert values["damping"] * DT > kalman.MOST_DECAY
+    _, along = Engine(stiff, [record])._filter_run(
+        0,
+        stiff.vector(values),
+        stiff.process_noise(NOISE),
+        np.full(3, 0.01),
+        NOISE,
+        _Buffers(),
+        _Buffers(),
+    )
+    k, d = values["stiffness"], values["damping"]
+    F = [[1.0 - DT * DT * k, DT - DT * DT * d], [-DT * k, 1.0 - DT * d]]
+    np.testing.assert_allclose(along.F[0], F, atol=1e-6)
 
 
 # --- signatures ----------------------------------------------------------------------------------

@@ -98,9 +98,15 @@ def test_a_replay_has_no_innovations_in_its_open_loop(tmp_path):
     t_end = moved.channels["phi"].t[-1]
     targets[phi] = int(np.argmin(np.abs(engine.records[0].t - t_end)))
     kalman.fly_open_loop(
-        engine.model.step, engine.model.measure, engine.intervals[0], inputs, x,
-        engine.model.vector(gains), engine.model.work_size, first, targets, out,
-    )  # fmt: skip
+        engine.compiled,
+        engine.intervals[0],
+        inputs,
+        x,
+        engine.model.vector(gains),
+        first,
+        targets,
+        out,
+    )
     assert out[phi] == pytest.approx(moved.channels["phi"].predicted[-1], abs=1e-12)
 
 

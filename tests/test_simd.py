@@ -1,6 +1,8 @@
-"""Lanes: several helicopters in one register fly, sense and end as each would alone."""
+"""SIMD batches: several helicopters in one register fly, sense and end as each would alone."""
 
+import ast
 import math
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -12,6 +14,8 @@ from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.kernel import simd
 from coax_env.kernel.random_streams import normals_of
 from coax_env.kernel.simd import SIMD_WIDTH, simd_view, simd_view_uint64
+from coax_env.model import inputs as U
+from coax_env.model import state as S
 from coax_env.model.dynamics import WORK_SIZE, full_state, hover_trim, measure, step
 from coax_env.model.dynamics import measure_bare as measure_any
 from coax_env.model.dynamics import step_bare as step_any
@@ -21,12 +25,12 @@ LAMA = coax_env.load_vehicle("lama400d")
 
 
 @numba.njit
-def _step_lanes(x, u, p, work, out):
+def _step_registers(x, u, p, work, out):
     step_any(simd_view(x), simd_view(u), 0.01, simd_view(p), simd_view(work), simd_view(out))
 
 
 @numba.njit
-def _measure_lanes(x, u, p, work, out):
+def _measure_registers(x, u, p, work, out):
     measure_any(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
 
 
@@ -61,7 +65,7 @@ def _normals(bits, first, second):
 
 
 def applied(function, x: np.ndarray, results: int = 1) -> list[np.ndarray]:
-    """A function of lanes at numbers, whose count is a multiple of SIMD_WIDTH."""
+    """A function of registers at numbers, whose count is a multiple of SIMD_WIDTH."""
     outs = [np.empty((len(x) // SIMD_WIDTH, SIMD_WIDTH)) for _ in range(results)]
     function(np.ascontiguousarray(x.reshape(-1, SIMD_WIDTH)), *outs)
     return [out.ravel() for out in outs]
@@ -141,14 +145,14 @@ def test_normal_numbers_are_those_of_box_and_muller():
 
 
 def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """SIMD_WIDTH states anywhere in flight, commands, and vehicles: (26, SIMD_WIDTH), (5, SIMD_WIDTH), (n, SIMD_WIDTH)."""
+    """States anywhere in flight (26, SIMD_WIDTH), inputs (5, SIMD_WIDTH), vehicles (n, SIMD_WIDTH)."""
     rng = np.random.default_rng(seed)
     state, command = hover_trim(LAMA)
     x = full_state(state, command, LAMA)[:, None] + rng.normal(0.0, 0.3, (26, SIMD_WIDTH))
-    x[12] += rng.uniform(-30.0, 30.0, SIMD_WIDTH)
+    x[S.PSI] += rng.uniform(-30.0, 30.0, SIMD_WIDTH)
     u = np.zeros((5, SIMD_WIDTH))
-    u[:4] = command[:, None] * (1.0 + rng.normal(0.0, 0.1, (4, SIMD_WIDTH)))
-    u[2:4] += rng.normal(0.0, 0.1, (2, SIMD_WIDTH))
+    u[: U.TIME] = command[:, None] * (1.0 + rng.normal(0.0, 0.1, (4, SIMD_WIDTH)))
+    u[U.DELTA_LON : U.TIME] += rng.normal(0.0, 0.1, (2, SIMD_WIDTH))
     p = np.array([LAMA.draw(rng).vector for _ in range(SIMD_WIDTH)]).T
     return x, u, np.ascontiguousarray(p)
 
@@ -158,8 +162,8 @@ def test_each_lane_flies_and_measures_as_one_helicopter(seed):
     x, u, p = drawn(seed)
     work = np.zeros((WORK_SIZE, SIMD_WIDTH))
     flown, readings = np.empty_like(x), np.empty((N_CHANNELS, SIMD_WIDTH))
-    _step_lanes(x, u, p, work, flown)
-    _measure_lanes(x, u, p, work, readings)
+    _step_registers(x, u, p, work, flown)
+    _measure_registers(x, u, p, work, readings)
     for j in range(SIMD_WIDTH):
         one = [np.ascontiguousarray(a[:, j]) for a in (x, u, p)]
         expected, measured = np.empty(26), np.empty(N_CHANNELS)
@@ -172,10 +176,10 @@ def test_each_lane_flies_and_measures_as_one_helicopter(seed):
 def test_what_is_not_a_number_stays_in_its_lane():
     x, u, p = drawn(0)
     work, clean, spoilt = np.zeros((WORK_SIZE, SIMD_WIDTH)), np.empty_like(x), np.empty_like(x)
-    _step_lanes(x, u, p, work, clean)
-    x[3, 2] = math.nan
-    u[0, 5 % SIMD_WIDTH] = math.inf
-    _step_lanes(x, u, p, work, spoilt)
+    _step_registers(x, u, p, work, clean)
+    x[S.P, 2] = math.nan
+    u[U.OMEGA_U, 5 % SIMD_WIDTH] = math.inf
+    _step_registers(x, u, p, work, spoilt)
     hit = [2, 5 % SIMD_WIDTH]
     assert not np.isfinite(spoilt[:, hit]).all(axis=0).any()
     others = np.setdiff1d(np.arange(SIMD_WIDTH), hit)
@@ -187,7 +191,7 @@ def test_what_is_not_a_number_stays_in_its_lane():
 
 @pytest.mark.parametrize("columns", [1, 2, 4, 5, 18, 26])
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_rows_go_into_lanes_and_back_to_where_they_were(columns, kind):
+def test_rows_go_into_registers_and_back_to_where_they_were(columns, kind):
     rng = np.random.default_rng(columns)
     rows = rng.normal(size=(40, columns))
     which = rng.permutation(40)[:SIMD_WIDTH]
@@ -236,7 +240,7 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
     ],
     ids=["one group", "and three more", "fewer than a group", "own vehicles", "waypoints"],
 )
-def test_rows_in_lanes_fly_as_rows_one_by_one(monkeypatch, count, arguments):
+def test_rows_in_a_simd_batch_fly_as_rows_one_by_one(monkeypatch, count, arguments):
     side_by_side = flown(monkeypatch, True, count, **arguments)
     one_by_one = flown(monkeypatch, False, count, **arguments)
     assert np.array_equal(side_by_side["ends"], one_by_one["ends"])
@@ -246,3 +250,16 @@ def test_rows_in_lanes_fly_as_rows_one_by_one(monkeypatch, count, arguments):
         ours, theirs = side_by_side[what], one_by_one[what]
         assert np.array_equal(np.isnan(ours), np.isnan(theirs))
         assert np.nanmax(np.abs(ours - theirs) / (1.0 + np.abs(theirs))) < error
+
+
+# --- numba ----------------------------------------------------------------------------------------
+
+
+def test_only_one_module_uses_what_numba_does_not_document():
+    """Its documented interface is numba itself, numba.types and numba.extending."""
+    for path in sorted(Path(coax_env.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            private = {n for n in names if n.startswith("numba.") and n != "numba.extending"}
+            assert not private or path.name == "numba_internals.py", (path, private)

@@ -22,7 +22,7 @@ from coax_env.kernel.random_streams import (
     skip,
     two_normals,
 )
-from coax_env.kernel.simd import anywhere, select
+from coax_env.kernel.simd import any_lane, select
 from coax_env.model import effects
 from coax_env.model import parameters as P
 from coax_env.model import state as S
@@ -210,7 +210,7 @@ def take_samples(values, row, sensors, bias, stream, flags, held):
         if sensors[k, RATE] != rate:
             rate = sensors[k, RATE]
             new = new_samples(row, rate)
-        if not anywhere(new > 0.0):
+        if not any_lane(new > 0.0):
             continue
         value = values[k] + bias[k]
         if noise > 0.0:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.estimation import kalman
+from coax_env.estimation import frozen_gains, kalman, noise_score
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
 
@@ -59,6 +59,12 @@ class PassJacobians:
     F: np.ndarray
     F_of: np.ndarray
     predicted: np.ndarray
+
+
+def _trace(run: RunPass, at: PassJacobians) -> kalman.Trace:
+    gains = kalman.Gains(run.gains, run.per_sigma, run.H)
+    path = kalman.Path(at.F, at.F_of, at.predicted)
+    return kalman.Trace(run.states, run.innovations, gains, path)
 
 
 @dataclass(frozen=True)
@@ -117,6 +123,7 @@ class Engine:
 
     def __init__(self, model: Model, records: Sequence[Record], threads: int | None = None) -> None:
         self.model = model
+        self.compiled = kalman.CompiledModel.of(model)
         self.records = tuple(records)
         self.threads = threads or int(os.environ.get("COAX_THREADS", "2"))
         self.starts = [model.start(r) for r in self.records]
@@ -213,11 +220,11 @@ class Engine:
         slots = np.full(n, -1, np.int64)
         slots[starts] = np.arange(starts.size)
         P = np.zeros((starts.size, nx, nx))
+        gains, path = kalman.Gains(K, per_sigma, H), kalman.Path(F, F_of, predicted)
         log_likelihood, deweighted = kalman.filter_pass(
-            self.model.step, self.model.measure, self.model.drift_and_readings, self.model.exact,
-            self.intervals[i], u, record.z, self.model.wraps, x0, P0, R, q, p,
-            self.model.state_scale, self.model.work_size, GATE, REFRESH,
-            keep is not None, states, e, K, per_sigma, H, slots, P, F, F_of, predicted,
+            self.compiled, kalman.RunData(self.intervals[i], u, record.z),
+            kalman.Variances(x0, P0, R, q), p, GATE, REFRESH,
+            kalman.Trace(states, e, gains, path), kalman.Covariances(P, slots),
         )  # fmt: skip
         if not np.isfinite(log_likelihood):
             K[:], per_sigma[:], H[:] = 0.0, 0.0, 0.0
@@ -314,12 +321,13 @@ class Engine:
             if not np.array_equal(inputs, run.inputs):
                 which[k] = len(sets)
                 sets.append(inputs)
-        kalman.signature_pass(
-            self.model.drift_and_readings, self.model.measure, self.intervals[i], np.array(sets), which,
-            at.predicted, run.states, run.innovations, p, np.array(vectors), moves.steps[columns],
-            moves.reading_only[columns], self.model.exact, self.model.work_size, run.gains,
-            run.per_sigma, run.H, at.F, at.F_of, REFRESH, columns, J, by_channel,
+        moved = frozen_gains.Moves(
+            np.array(vectors), moves.steps[columns], moves.reading_only[columns],
+            np.array(sets), which, columns,
         )  # fmt: skip
+        frozen_gains.signature_pass(
+            self.compiled, self.intervals[i], _trace(run, at), p, moved, REFRESH, J, by_channel
+        )
 
     def _probed_signatures(
         self, i: int, run: RunPass, moves: _Moves, J: np.ndarray, by_channel: np.ndarray
@@ -392,10 +400,10 @@ class Engine:
         return sum(self._each(one)) + penalty(free, values)
 
     def _frozen(self, i: int, run: RunPass, p: np.ndarray, out: np.ndarray) -> bool:
-        return kalman.mean_pass(
-            self.model.step, self.model.measure, self.intervals[i],
-            self.model.inputs(run.record, p), run.record.z, self.model.wraps,
-            self.starts[i][0], p, self.model.work_size, run.gains, run.per_sigma, run.H, REFRESH, out,
+        u, gains = self.model.inputs(run.record, p), kalman.Gains(run.gains, run.per_sigma, run.H)
+        return frozen_gains.mean_pass(
+            self.compiled, kalman.RunData(self.intervals[i], u, run.record.z), self.starts[i][0], p,
+            gains, REFRESH, out,
         )  # fmt: skip
 
     def fit(
@@ -471,10 +479,9 @@ class Engine:
             with self._borrowed_buffers() as buffers:
                 run, at = self._filter_run(i, p, q, R, noise, buffers, buffers)
                 if np.isfinite(run.log_likelihood):
-                    kalman.score_pass(
-                        self.intervals[i], run.innovations, run.gains, run.per_sigma, run.H,
-                        at.F, at.F_of, REFRESH, block, by_noise, by_start,
-                    )  # fmt: skip
+                    noise_score.score_pass(
+                        self.intervals[i], _trace(run, at), REFRESH, block, by_noise, by_start
+                    )
             return run.log_likelihood, by_noise, by_start
 
         log_likelihood, by_noise, by_start = zip(*self._each(one), strict=True)

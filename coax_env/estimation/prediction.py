@@ -103,10 +103,7 @@ def fly_again(
             for gust, out in ((0.0, predicted), (1.0, decaying)):
                 x = run.states[first].copy()
                 x[GUSTS] *= gust
-                ok = kalman.fly_open_loop(
-                    engine.model.step, engine.model.measure, dt, inputs, x, p,
-                    engine.model.work_size, first, targets, out[s],
-                )  # fmt: skip
+                ok = kalman.fly_open_loop(engine.compiled, dt, inputs, x, p, first, targets, out[s])
                 diverged |= not ok
             for i in used:
                 if targets[i] >= 0:
@@ -194,10 +191,7 @@ def _spread(
     x0[GUSTS] = 0.0
 
     def fly(x: np.ndarray, out: np.ndarray) -> None:
-        kalman.fly_open_loop(
-            engine.model.step, engine.model.measure, dt, inputs, x, p,
-            engine.model.work_size, first, targets, out,
-        )  # fmt: skip
+        kalman.fly_open_loop(engine.compiled, dt, inputs, x, p, first, targets, out)
 
     fly(x0.copy(), base)
     for j in range(20):

@@ -105,6 +105,7 @@ def _flown(
     readings = np.empty(len(CHANNELS))
     target = np.full(len(CHANNELS), -1, np.int64)
     x = np.full(run.states.shape[1], np.nan)
+    compiled = kalman.CompiledModel.of(model)
     for k, row in enumerate(rows):
         if begins[k]:
             x = run.states[row].copy()
@@ -113,8 +114,7 @@ def _flown(
         elif np.isfinite(x).all():
             target[0] = row
             if not kalman.fly_open_loop(
-                model.step, model.measure, dt, inputs, x, p, model.work_size,
-                rows[k - 1], target, readings,
+                compiled, dt, inputs, x, p, rows[k - 1], target, readings
             ):  # fmt: skip
                 x = np.full_like(x, np.nan)
         states[k] = x

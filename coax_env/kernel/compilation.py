@@ -25,11 +25,11 @@ TABLES = tuple(
 
 
 def kernel_sources() -> list[Path]:
-    """The package's files that take part in compiled code: those that import this room, and TABLES."""
+    """The files that take part in compiled code: this room, those that import it, and TABLES."""
     compiling = [
         path
         for path in sorted(PACKAGE.rglob("*.py"))
-        if "coax_env.kernel" in path.read_text(encoding="utf-8")
+        if path.parent.name == "kernel" or "coax_env.kernel" in path.read_text(encoding="utf-8")
     ]
     return [*compiling, *(PACKAGE / name for name in TABLES)]
 
@@ -76,9 +76,10 @@ def _own_cache() -> Iterator[None]:
 def name_apart(function: Callable, *values: Any) -> Callable:
     """Give a closure a name with its values in it, or with those given.
 
-    numba tells functions apart by name and by a count of what this process has compiled so far, in the
-    cache's index as in the machine code's symbols. Closures of one name can therefore be mixed up where
-    one process loads what two have compiled, or one that was stopped half way and began again.
+    numba distinguishes functions by name and by a count of what this process has compiled so far,
+    in the cache's index as in the machine code's symbols. Closures of one name can therefore be mixed
+    up where one process loads what two have compiled, or one that was stopped half way and began
+    again.
     """
     if not values:
         cells = [cell.cell_contents for cell in function.__closure__ or ()]

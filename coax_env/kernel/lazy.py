@@ -1,9 +1,10 @@
 """Compiled functions that are compiled when they are first called.
 
 numba compiles every function that a compiled function might call, so that whoever flies a vehicle
-without effects would wait for the code of them all. A lazily compiled function is called through its address
-instead, which stands in a cell of memory; while the cell is empty, the call goes to Python first and
-has the function compiled. What compiled code remembers is the cell's name, so it can be cached.
+without effects would wait for the code of them all. A lazily compiled function is called through its
+address instead, which stands in a cell of memory; while the cell is empty, the call goes to Python
+first and has the function compiled. What compiled code remembers is the cell's name, so it can be
+cached.
 """
 
 import ctypes
@@ -15,10 +16,17 @@ from typing import Any
 import llvmlite.binding
 from llvmlite import ir
 from numba import float64, types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 from coax_env.kernel.compilation import name_apart, pointer
+from coax_env.kernel.numba_internals import (
+    INT32,
+    INTP,
+    external_function,
+    if_unlikely,
+    pointer_at,
+    raise_error,
+)
 
 DONE, FAILED, INTERRUPTED = range(3)
 _MAKER = ctypes.CFUNCTYPE(ctypes.c_int)
@@ -60,18 +68,16 @@ def lazily_compiled(function: Callable) -> Any:
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kinds = [context.get_value_type(kind) for kind in signature.args]
         function = ir.FunctionType(ir.VoidType(), kinds).as_pointer()
-        place = context.get_c_value(builder, cgutils.intp_t, cell_symbol)
-        empty = builder.icmp_unsigned("==", builder.load(place), cgutils.intp_t(0))
-        with cgutils.if_unlikely(builder, empty):
-            kind = ir.FunctionType(cgutils.int32_t, [])
-            call = cgutils.get_or_insert_function(builder.module, kind, maker_symbol)
-            outcome = builder.call(call, [])
-            for code, error in ((INTERRUPTED, KeyboardInterrupt), (FAILED, RuntimeError)):
-                with cgutils.if_unlikely(
-                    builder, builder.icmp_unsigned("==", outcome, cgutils.int32_t(code))
-                ):
-                    message = () if code == INTERRUPTED else (f"{name} did not compile",)
-                    context.call_conv.return_user_exc(builder, error, message)
+        place = pointer_at(context, builder, cell_symbol)
+        empty = builder.icmp_unsigned("==", builder.load(place), INTP(0))
+        with if_unlikely(builder, empty):
+            outcome = builder.call(external_function(builder, maker_symbol, INT32, []), [])
+            for code, error, message in (
+                (INTERRUPTED, KeyboardInterrupt, ()),
+                (FAILED, RuntimeError, (f"{name} did not compile",)),
+            ):
+                with if_unlikely(builder, builder.icmp_unsigned("==", outcome, INT32(code))):
+                    raise_error(context, builder, error, *message)
         builder.call(builder.inttoptr(builder.load(place), function), args)
         return context.get_dummy_value()
 

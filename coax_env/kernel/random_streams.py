@@ -46,7 +46,11 @@ def next_bits(stream):
 
 @compiled()
 def uniform(stream, low, high):
-    """Uniform in [low, high)."""
+    """Uniform in [low, high), the next number of a stream.
+
+    Args:
+        stream: key and counter (2,), which moves on by one. low, high: bounds.
+    """
     return low + (high - low) * (next_bits(stream) >> _S11) * 2.0**-53
 
 
@@ -74,7 +78,7 @@ def normals_of(bits):
 
     The radius is sqrt(-2 ln((n + 1/2) / 2^32)), n the upper half of the bits, and the angle the
     lower half's share of a turn; both to 1e-11, by polynomials of least largest error (Remez), which
-    are the same for one stream and for lanes of them.
+    are the same for one stream and for a SIMD batch of them.
     """
     number = bits_of(float(bits >> _S32) + 0.5)  # m 2^e with m in [1/2, 1)
     e = float(number >> _S52) - (1022.0 + 32.0)

@@ -19,6 +19,7 @@ import numpy as np
 
 from coax_env.kernel.compilation import compiled
 from coax_env.model import parameters as P
+from coax_env.model import state as S
 from coax_env.model import workspace as F
 
 HARMONICS = 4
@@ -115,7 +116,11 @@ def hover_speeds(p: np.ndarray) -> tuple[float, float]:
 
 @compiled()
 def term_value(i: int, x: np.ndarray, f: np.ndarray, p: np.ndarray) -> float:
-    """Value of the term TERMS[i] at a full state and the kernel's workspace."""
+    """Value of the term TERMS[i], in its unit.
+
+    Args:
+        i: which. x: full state (26,). f: workspace (N_FLOW,). p: parameter vector.
+    """
     if i < _SQUARES:
         return x[i]
     if i < _PRODUCTS:
@@ -125,18 +130,18 @@ def term_value(i: int, x: np.ndarray, f: np.ndarray, p: np.ndarray) -> float:
         return x[a] * x[b]
     if i < _HEADING:
         which = i - _TILT
-        angle = x[10 + which % 2]
+        angle = x[S.PHI + which % 2]
         return math.sin(angle) if which < 2 else 1.0 - math.cos(angle)
     if i < _COMMAND:
         which = i - _HEADING
-        angle = (which // 2 + 1) * x[12]
+        angle = (which // 2 + 1) * x[S.PSI]
         return math.sin(angle) if which % 2 == 0 else math.cos(angle)
     which = i - _COMMAND
     if which < 2:
         upper, lower = hover_speeds(p)
         return f[F.OMEGA_U] - upper if which == 0 else f[F.OMEGA_L] - lower
     if which < 4:
-        return x[16 + which]
+        return x[S.SWASH_LON + which - 2]
     return f[F.OMEGA_U_DOT] if which == 4 else f[F.OMEGA_L_DOT]
 
 

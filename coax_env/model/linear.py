@@ -102,7 +102,12 @@ def sampled(
 def slopes(
     function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
-    """Jacobian (n_out, len(scale)) of a function by central differences in its first inputs."""
+    """Jacobian (n_out, len(scale)) of a function by central differences.
+
+    Args:
+        function: of a vector, gives a vector (n_out,). at: where (n,).
+        scale: size of a usual change of each of the first inputs; the others are not moved.
+    """
     columns = []
     for i, size in enumerate(scale):
         ahead, behind = at.copy(), at.copy()

@@ -2,6 +2,7 @@
 
 The file imports from `coax_env.model.effects` and decorates a function, as the catalogue itself does::
 
+    from coax_env.model import state as S
     from coax_env.model import workspace as F
     from coax_env.model.effects import LOAD, EffectParameter, effect
 
@@ -9,7 +10,7 @@ The file imports from `coax_env.model.effects` and decorates a function, as the 
             channels="q theta", source="seen on the bench")
     def heading_moment(x, f, p, e):
         "A pitching moment that follows the heading, k sin(3 psi)."
-        f[F.MOMENT_Y] += p[e] * math.sin(3.0 * x[12])
+        f[F.MOMENT_Y] += p[e] * math.sin(3.0 * x[S.PSI])
 """
 
 import importlib.util

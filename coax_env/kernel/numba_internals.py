@@ -1,0 +1,129 @@
+"""All that this project uses of numba beyond its documented interface, behind a few functions.
+
+numba lets users add types and functions, but not everything that a SIMD register needs: its private
+names stand here and nowhere else (tests/test_simd.py), and pyproject.toml bounds numba to the versions
+that the tests have run with. `context` and `builder` are those that numba hands to an intrinsic.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.imputils import impl_ret_borrowed
+from numba.core.typeconv import Conversion
+from numba.core.typing.templates import AbstractTemplate, Signature, infer_global, signature
+from numba.extending import lower_builtin
+from numba.np.arrayobj import make_array, populate_array
+
+SAFE = Conversion.safe
+"""A conversion of an argument that loses nothing."""
+INTP = cgutils.intp_t
+"""An integer as wide as a pointer."""
+INT32 = cgutils.int32_t
+unpack_tuple = cgutils.unpack_tuple
+"""``unpack_tuple(builder, value, count)``: a tuple's elements."""
+if_unlikely = cgutils.if_unlikely
+"""``with if_unlikely(builder, condition):`` code for what hardly ever happens."""
+
+
+def define_call(
+    key: Any, result: types.Type, kinds: tuple[types.Type, ...],
+    fits: Callable[[types.Type, types.Type], bool], emit: Callable,
+) -> None:  # fmt: skip
+    """Let compiled code call `key`, an operator or function, with arguments of new types.
+
+    Args:
+        key: what is called. result: type of what it returns. kinds: types of its arguments.
+        fits: whether an argument of one type may stand for a kind; at least one must be its kind.
+        emit: ``emit(context, builder, signature, values)`` writes the code.
+    """
+
+    class Typing(AbstractTemplate):
+        def generic(self, args: tuple, kws: dict) -> Signature | None:
+            meant = len(args) == len(kinds) and any(map(operator.eq, args, kinds))
+            if meant and not kws and all(map(fits, args, kinds)):
+                return signature(result, *kinds)
+            return None
+
+    infer_global(key)(Typing)
+    lower_builtin(key, *kinds)(emit)
+
+
+def external_function(builder: Any, name: str, result: ir.Type, kinds: list[ir.Type]) -> Any:
+    """A function of LLVM or of the process.
+
+    Args:
+        builder: numba's. name: the function's symbol.
+        result: type of what it returns. kinds: types of its arguments.
+    """
+    return cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, kinds), name)
+
+
+def pointer_at(context: Any, builder: Any, symbol: str) -> Any:
+    """The address that a symbol of the process has, as a pointer to an INTP.
+
+    Args:
+        context, builder: numba's. symbol: its name, once given to llvmlite.binding.add_symbol.
+    """
+    return context.get_c_value(builder, INTP, symbol)
+
+
+def raise_error(context: Any, builder: Any, error: type, *message: str) -> None:
+    """Leave the compiled function with a Python exception.
+
+    Args:
+        context, builder: numba's. error: the exception's class. message: what it is called with.
+    """
+    context.call_conv.return_user_exc(builder, error, message)
+
+
+def array_data(context: Any, builder: Any, kind: types.Array, array: Any) -> Any:
+    """Pointer to an array's first element.
+
+    Args:
+        context, builder: numba's. kind, array: the array's type and value.
+    """
+    return make_array(kind)(context, builder, array).data
+
+
+def view_rows(context: Any, builder: Any, source: types.Array, array: Any, row: types.Array,
+              element: ir.Type, size: int) -> Any:  # fmt: skip
+    """The memory of a two-dimensional contiguous array as a one-dimensional array, row by row.
+
+    Args:
+        context, builder: numba's. source, array: the array's type and value.
+        row: type of the array that is returned. element: of one of its elements, of `size` bytes.
+    """
+    of = make_array(source)(context, builder, array)
+    count, _ = unpack_tuple(builder, of.shape, 2)
+    data = builder.bitcast(of.data, element.as_pointer())
+    rows = _one_dimensional(context, builder, row, data, count, size, of.meminfo)
+    return impl_ret_borrowed(context, builder, row, rows)
+
+
+def stack_array(context: Any, builder: Any, row: types.Array, element: ir.Type, count: int,
+                size: int) -> Any:  # fmt: skip
+    """A one-dimensional array on the stack, not set.
+
+    Args:
+        context, builder: numba's. row: type of the array. element: type of one of its elements.
+        count: how many. size: bytes of one.
+    """
+    with builder.goto_entry_block():
+        place = builder.alloca(ir.ArrayType(element, count))
+    data = builder.bitcast(place, element.as_pointer())
+    length = context.get_constant(types.intp, count)
+    return _one_dimensional(context, builder, row, data, length, size, None)
+
+
+def _one_dimensional(context: Any, builder: Any, row: types.Array, data: Any, count: Any, size: int,
+                     owner: Any) -> Any:  # fmt: skip
+    rows = make_array(row)(context, builder)
+    stride = context.get_constant(types.intp, size)
+    populate_array(
+        rows, data, shape=[count], strides=[stride], itemsize=stride, meminfo=owner
+    )  # fmt: skip
+    return rows._getvalue()

@@ -1,0 +1,243 @@
+"""What an effect is, how it enters the catalogue, and its places in the parameter vector.
+
+The effects themselves are in effects.py.
+"""
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from coax_env.errors import InputError
+from coax_env.kernel.compilation import BORROWING, name_apart
+from coax_env.model import parameters as P
+from coax_env.model.layout import CHANNELS
+
+STAGES = ("PROPERTY", "AIR", "SWASH", "ROTOR", "LOAD", "UNLISTED", "SENSOR")
+PROPERTY, AIR, SWASH, ROTOR, LOAD, UNLISTED, SENSOR = (P.N_FIXED + i for i in range(len(STAGES)))
+SWITCHES = slice(P.N_FIXED, P.N_FIXED + len(STAGES))
+"""Places in a parameter vector of the stages' switches: 1 where the stage has an effect, else 0."""
+
+INFINITY = math.inf
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """One parameter of an effect.
+
+    ``usual`` is the usual size and the std of the prior about ``off``; ``smallest`` the size under
+    which it does not matter in prediction and is never named; a ``shape`` parameter (a decay, say)
+    acts only once the effect itself does; ``timing``: a lag or delay of the command; ``probe``: finite
+    step for the signature where the effect has no slope at its off-value.
+    """
+
+    name: str
+    unit: str
+    usual: float
+    smallest: float
+    off: float = 0.0
+    lower: float = -INFINITY
+    upper: float = INFINITY
+    shape: bool = False
+    timing: bool = False
+    probe: float = 0.0
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One group of parameters with the function that acts on them.
+
+    ``replaces`` names base parameters that are the same column. ``input_shift``: acts on the input,
+    not in the kernel. ``line``: found by its line in the spectrum (vibration.py), not by a signature.
+    ``generic``: unlisted terms, of which a vehicle file holds those that are not zero. ``damps``: its
+    one parameter damps the motion, and so changes what a filter makes of gusts.
+    """
+
+    name: str
+    stage: int
+    parameters: tuple[EffectParameter, ...]
+    channels: tuple[str, ...]
+    source: str
+    summary: str
+    function: Any  # compiled
+    replaces: tuple[str, ...] = ()
+    input_shift: bool = False
+    line: bool = False
+    generic: bool = False
+    damps: bool = False
+    index: int = -1
+
+    def names(self) -> tuple[str, ...]:
+        """Full names of the parameters, ``effect.parameter``."""
+        return tuple(f"{self.name}.{p.name}" for p in self.parameters)
+
+
+CATALOGUE: dict[str, Effect] = {}
+"""The effects that have a name: what can be found, excluded and listed as a cause."""
+GROUPS: dict[str, Effect] = {}
+"""Those and the generic groups: everything that a vehicle file and the kernel know."""
+_FIRST = P.N_FIXED + len(STAGES)
+
+
+def effect(
+    stage: int,
+    *parameters: EffectParameter,
+    channels: str,
+    source: str,
+    replaces: tuple[str, ...] = (),
+    input_shift: bool = False,
+    line: bool = False,
+    generic: bool = False,
+    damps: bool = False,
+    name: str = "",
+) -> Callable[[Callable], Callable]:
+    """Enter a function into the catalogue; its docstring is the effect's summary.
+
+    Args:
+        stage: where in the kernel it runs. parameters: in the order of the parameter vector.
+        channels: names, with spaces, of those that show it most. source: book or paper, and equation.
+        replaces, input_shift, line, generic, damps: see Effect.
+        name: in the catalogue; that of the function where empty.
+
+    Raises:
+        InputError: the name is taken, a channel does not exist, or the stage or parameters are none.
+    """
+
+    def enter(function: Callable) -> Callable:
+        own = name or function.__name__
+        if not isinstance(stage, int) or not parameters:
+            raise InputError(f"effect {own!r}: @effect(stage, EffectParameter(...), ...) is wanted")
+        if own in GROUPS:
+            raise InputError(f"the catalogue of effects has {own!r} already")
+        if damps and sum(not p.shape for p in parameters) != 1:
+            raise InputError(f"effect {own!r}: damps=True is for an effect of one parameter")
+        for channel in channels.split():
+            if channel not in CHANNELS:
+                raise InputError(f"effect {own!r}: no channel {channel!r}")
+        users = not function.__module__.startswith("coax_env.")  # which may make arrays
+        function_compiled = njit(**{**BORROWING, "_nrt": users})(name_apart(function))
+        entry = Effect(
+            name=own,
+            stage=stage,
+            parameters=parameters,
+            channels=tuple(channels.split()),
+            source=source,
+            summary=(function.__doc__ or "").strip(),
+            function=function_compiled,
+            replaces=replaces,
+            input_shift=input_shift,
+            line=line,
+            generic=generic,
+            damps=damps,
+            index=n_parameters(),
+        )
+        GROUPS[own] = entry
+        if not generic:
+            CATALOGUE[own] = entry
+        _offs.cache_clear()
+        return function_compiled
+
+    return enter
+
+
+def forget(names: Collection[str]) -> None:
+    """Take the latest entries out again (a user's file that turned out faulty)."""
+    for name in names:
+        GROUPS.pop(name)
+        CATALOGUE.pop(name, None)
+    _offs.cache_clear()
+
+
+def n_parameters() -> int:
+    """Length of the parameter vector."""
+    return _FIRST + sum(len(e.parameters) for e in GROUPS.values())
+
+
+@cache
+def _offs() -> tuple[np.ndarray, np.ndarray]:
+    """Off-values of all effects' parameters, (k,), and which switch each one throws, (k, stages)."""
+    every = [(p, e.stage) for e in GROUPS.values() for p in e.parameters]
+    throws = [
+        [not p.shape and stage == switch for switch in range(P.N_FIXED, _FIRST)]
+        for p, stage in every
+    ]
+    return np.array([p.off for p, _ in every]), np.array(throws, dtype=float)
+
+
+# --- what the kernel and the vehicle files read -----------------------------------------------------
+
+
+def parameter_index(name: str) -> int:
+    """Place of ``"mass"`` or ``"ground_effect.gain"`` in the parameter vector."""
+    group, _, own = name.rpartition(".")
+    if not group:
+        return P.GUST_MEMORY if name == "gust_memory" else list(P.BASE).index(name)
+    if name in P.COMMAND_GAINS:
+        return P.COMMAND_GAIN + list(P.COMMAND_GAINS).index(name)
+    entry = GROUPS[group]
+    return entry.index + [p.name for p in entry.parameters].index(own)
+
+
+def off_vector() -> np.ndarray:
+    """Parameter vector with every effect off and the base parameters NaN."""
+    vector = np.full(n_parameters(), np.nan)
+    vector[P.GUST_MEMORY] = 0.5
+    vector[P.AIR_DOWN : P.N_FIXED] = 0.0
+    vector[_FIRST:] = _offs()[0]
+    set_switches(vector)
+    return vector
+
+
+def pack(values: Mapping[str, float]) -> np.ndarray:
+    """The kernel's parameter vector from full names and values; effects not named are off."""
+    vector = off_vector()
+    for name, value in values.items():
+        vector[parameter_index(name)] = value
+    for reference, own in P.GUST_REFERENCE.items():
+        vector[reference] = vector[own]
+    set_switches(vector)
+    return vector
+
+
+def set_switches(vector: np.ndarray) -> None:
+    """Switch on, in place, the stages that have an effect away from its off-value.
+
+    Of one parameter vector, or of many at once, shape (..., n_parameters()).
+    """
+    off, throws = _offs()
+    vector[..., P.N_FIXED : _FIRST] = (vector[..., _FIRST:] != off) @ throws > 0.0
+
+
+def completed(effect_name: str, table: Mapping[str, Any], make: Callable) -> dict[str, Any]:
+    """An effect's parameters in catalogue order, absent ones at their off-value.
+
+    Of a generic group only what is not zero.
+
+    Args:
+        effect_name: in the catalogue. table: name -> parameter, of those that are given.
+        make: ``make(value, std, unit, source)``, a parameter that is not.
+    """
+    entry = GROUPS[effect_name]
+    if entry.generic:
+        names = [p.name for p in entry.parameters if p.name in table and table[p.name].value != 0.0]
+        return {name: table[name] for name in names}
+    return {
+        p.name: table.get(p.name) or make(p.off, 0.0, p.unit, "off-value") for p in entry.parameters
+    }
+
+
+def stage_function(stage: int) -> Callable:
+    """One function that runs all effects of a stage in the catalogue's order, for compiled code.
+
+    Written out as source, one call a line: a chain of closures takes numba three times as long.
+    """
+    entries = [e for e in GROUPS.values() if e.stage == stage]
+    calls = [f"    {e.name}(x, f, p, {e.index})" for e in entries]
+    names = {"__name__": __name__, **{e.name: e.function for e in entries}}
+    exec("\n".join(["def run(x, f, p):", *calls, "    pass"]), names)
+    names["run"].__qualname__ = f"stage_{stage}"
+    return njit(**BORROWING)(names["run"])

@@ -1,0 +1,180 @@
+"""The filter pass against the textbook's, with dense matrices: predict, correct, nothing left out."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+from test_estimation import (
+    ANGLE,
+    CHANNELS,
+    DAMPING,
+    DT,
+    NOISE,
+    RATE,
+    SINE,
+    STIFFNESS,
+    TRUTH,
+    Pendulum,
+    swing,
+    with_holes,
+)
+
+from coax_env.estimation import kalman
+from coax_env.estimation.sparse import ROW_MULTIPLE, find_non_zeros, multiply, padded, with_places
+from coax_env.estimation.state_space import Record
+from coax_env.kernel.angles import wrap_angles
+
+GATE = 8.0
+H = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+"""The pendulum's readings: its angle, and its rate twice."""
+
+
+def step_of(x: np.ndarray, u: float, h: float, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pendulum a row later, and the Jacobian F of that, by hand."""
+    pull = (1.0 - p[SINE]) * x[ANGLE] + p[SINE] * math.sin(x[ANGLE])
+    stiffness = p[STIFFNESS] * (1.0 - p[SINE] + p[SINE] * math.cos(x[ANGLE]))
+    rate = x[RATE] + h * (u - p[STIFFNESS] * pull - p[DAMPING] * x[RATE])
+    F = np.array(
+        [
+            [1.0 - h * h * stiffness, h * (1.0 - h * p[DAMPING])],
+            [-h * stiffness, 1.0 - h * p[DAMPING]],
+        ]
+    )
+    return np.array([x[ANGLE] + h * rate, rate]), F
+
+
+def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) -> dict[str, Any]:
+    """Bar-Shalom, Li and Kirubarajan 2001, table 10.3.3-1; readings one after the other.
+
+    And beside it all readings of a row at once, which must give the same.
+    """
+    x, P = Pendulum.start_at.copy(), np.diag(Pendulum.start_std**2)
+    dt = np.append(np.diff(record.t), 0.0)
+    found: dict[str, Any] = {
+        name: [] for name in ("x", "P", "predicted", "F", "e", "K", "per_sigma")
+    }
+    log_likelihood = 0.0
+    beyond = 0
+    for k in range(record.t.size):
+        found["predicted"].append(x)
+        # innovation, and what the gate makes of R
+        v = record.z[k] - H @ x
+        v[0] = wrap_angles(v[:1])[0]
+        there = np.flatnonzero(np.isfinite(v))
+        R_k = R.copy()
+        for i in there:
+            s2 = H[i] @ P @ H[i] + R[i]
+            if v[i] ** 2 > GATE**2 * s2:
+                R_k[i] += v[i] ** 2 / GATE**2 - s2
+                log_likelihood -= 0.5 * (GATE**2 - 1.0) * math.log(v[i] ** 2 / GATE**2 / s2)
+                beyond += 1
+        # correct, all at once
+        S = H[there] @ P @ H[there].T + np.diag(R_k[there])
+        gain = P @ H[there].T @ np.linalg.inv(S)
+        x_joint, P_joint = x + gain @ v[there], P - gain @ H[there] @ P
+        if there.size:
+            log_likelihood += multivariate_normal.logpdf(v[there], cov=S)
+        # correct, one after the other
+        e, x_before = np.full(3, np.nan), x
+        for i in there:
+            residual = v[i] - H[i] @ (x - x_before)
+            s2 = H[i] @ P @ H[i] + R_k[i]
+            K = P @ H[i] / s2
+            x, P = x + K * residual, (np.eye(2) - np.outer(K, H[i])) @ P
+            e[i] = residual / math.sqrt(s2)
+            found["K"].append(K)
+            found["per_sigma"].append(1.0 / math.sqrt(s2))
+        np.testing.assert_allclose(x, x_joint, atol=1e-10)
+        np.testing.assert_allclose(P, P_joint, atol=1e-12)
+        found["e"].append(e)
+        found["x"].append(x)
+        found["P"].append(P)
+        # predict; F, as H, is that of the predicted state
+        F = step_of(x_before, record.command[k, 0], dt[k], p)[1]
+        x = step_of(x, record.command[k, 0], dt[k], p)[0]
+        P = F @ P @ F.T + np.diag(q) * dt[k]
+        found["F"].append(F)
+    return {
+        **{name: np.array(rows) for name, rows in found.items()},
+        "log_likelihood": log_likelihood, "beyond": beyond,
+    }  # fmt: skip
+
+
+def fast_filter(
+    record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray
+) -> tuple[float, int, kalman.Trace, kalman.Covariances]:
+    """`filter_pass` with new Jacobians at every row, and all that it stores."""
+    model = Pendulum()
+    model.state_scale = np.full(2, 1e-7)  # so that differences are as good as derivatives
+    (n, m), readings = record.z.shape, int(np.isfinite(record.z).sum())
+    trace = kalman.Trace(
+        np.zeros((n, 2)), np.zeros((n, m)),
+        kalman.Gains(
+            np.zeros((readings, 2), np.float32), np.zeros(readings), np.zeros((n, m, 2), np.float32)
+        ),
+        kalman.Path(np.zeros((n, 2, 2), np.float32), np.zeros(n, np.int64), np.zeros((n, 2))),
+    )  # fmt: skip
+    kept = kalman.Covariances(np.zeros((n, 2, 2)), np.arange(n))
+    run = kalman.RunData(np.append(np.diff(record.t), 0.0), record.command, record.z)
+    start = kalman.Variances(Pendulum.start_at, np.diag(Pendulum.start_std**2), R, q)
+    log_likelihood, beyond = kalman.filter_pass(
+        kalman.CompiledModel.of(model), run, start, p, GATE, 1, trace, kept
+    )
+    return log_likelihood, beyond, trace, kept
+
+
+@pytest.mark.parametrize("sine", [0.0, 1.0], ids=["linear", "nonlinear"])
+@pytest.mark.parametrize("clock", ["even", "jitters"])
+def test_the_pass_is_the_textbooks_filter(sine, clock):
+    """States, covariances, innovations, gains, Jacobians and likelihood; with holes and outliers."""
+    values = {**TRUTH, "sine": sine}
+    record = with_holes(swing(11, n=200, values=values), 0.3, seed=2)
+    z = record.z.copy()
+    z[50] += [2.0, 4.0, 4.0]
+    z[120] -= [0.0, 5.0, 5.0]
+    t = record.t
+    if clock == "jitters":
+        t = DT * np.cumsum(np.random.default_rng(3).uniform(0.3, 2.0, 200))
+    record = replace(record, z=z, t=t)
+    model = Pendulum()
+    p, q = model.vector(values), model.process_noise(NOISE)
+    R = np.array([NOISE.reading[c] for c in CHANNELS]) ** 2
+    dense = dense_filter(record, p, R, q)
+    log_likelihood, beyond, trace, kept = fast_filter(record, p, R, q)
+    assert beyond == dense["beyond"] >= 2
+    assert log_likelihood == pytest.approx(dense["log_likelihood"], abs=1e-6)
+    for ours, theirs in (
+        (trace.states, dense["x"]), (kept.P, dense["P"]), (trace.e, dense["e"]),
+        (trace.path.predicted, dense["predicted"]), (trace.gains.K, dense["K"]),
+        (trace.gains.per_sigma, dense["per_sigma"]),
+        (trace.path.F[trace.path.F_of[:-1]], dense["F"][:-1]),
+        (trace.gains.H, np.broadcast_to(H, trace.gains.H.shape)),
+    ):  # fmt: skip
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-7)
+
+
+# --- sparse matrices --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+def test_a_sparse_product_is_the_dense_one(share):
+    rng = np.random.default_rng(5)
+    values = rng.normal(size=(7, padded(5)))
+    values[:, 5:] = 0.0
+    values[rng.random(values.shape) >= share] = 0.0
+    A = with_places(values, 5)
+    find_non_zeros(A)
+    for i in range(7):
+        assert list(A.places[i, : A.counts[i]]) == list(np.flatnonzero(values[i]))
+    B = rng.normal(size=(5, padded(9)))
+    out = np.full((7, padded(9)), np.nan)
+    multiply(A, B, out)
+    np.testing.assert_allclose(out, values[:, :5] @ B, atol=1e-14)
+
+
+@pytest.mark.parametrize("count", [1, ROW_MULTIPLE - 1, ROW_MULTIPLE, ROW_MULTIPLE + 1])
+def test_rows_are_padded_to_whole_multiples(count):
+    assert padded(count) % ROW_MULTIPLE == 0 and 0 <= padded(count) - count < ROW_MULTIPLE
