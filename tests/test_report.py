@@ -22,7 +22,7 @@ from coax_env.model.layout import STATES
 from coax_env.model.vehicle import Parameter
 from coax_env.report import consequences, figures, fit_figures, plot_style
 from coax_env.report.flight_view import flight_view
-from coax_env.report.page import figure, inline, table
+from coax_env.report.page import card, figure, inline, table
 from coax_env.simulation import simulate as sim
 from coax_env.simulation.paper_doublet import doublet_remarks, doublet_table
 
@@ -687,6 +687,8 @@ def test_numbers_as_people_write_them():
 
 def test_text_is_escaped():
     assert inline("<b> **x** `y`") == "&lt;b&gt; <strong>x</strong> <code>y</code>"
+    assert inline("(7.0 ± 0.1)·10^−3") == "(7.0 ± 0.1)·10<sup>−3</sup>"
+    assert card("<b>", "<i>", ["<u>"], "<s>").count("&lt;") == 4
     assert "<script>" not in table(["<script>"] * 2, [["<script>", "1"]])
     closing = figures.heat_map(["</script>"], ["a"], np.eye(1), [["1"]], "x")
     assert figure(closing).count("</script>") == 1

@@ -284,7 +284,7 @@ def test_diagnose_writes_what_the_contract_says(tmp_path):
     assert "gyro_bias" in load_vehicle(out / "vehicle.toml").effects
     page = (out / "report.html").read_text()
     assert "gyro bias" in page.lower() and 'src="http' not in page
-    assert "Controllers before and after" in page
+    assert "Controllers of both models" in page
 
 
 @pytest.mark.slow
