@@ -89,7 +89,7 @@ def test_a_run_that_diverged_and_channels_that_are_not_compared_do_not_count():
 
 
 def test_intervals_without_scatter_are_points():
-    found = gain(run({"h": 0.5}), run({"h": 0.5}), run({"h": math.hypot(0.3, 0.1)}))
+    found = gain(run({"h": 0.5}), run({"h": 0.4}), run({"h": math.hypot(0.3, 0.1)}))
     assert found["ci95"] == pytest.approx([75.0, 75.0])
     assert found["channels"]["h"]["ci95"] == pytest.approx([math.sqrt(0.1)] * 2)
 
@@ -123,9 +123,10 @@ def test_the_floor_is_what_the_uncertainty_of_the_start_leaves():
     """Two runs' floors 0.1 and 0.3 over the noise: sqrt(0.05) of 0.4 cannot be removed."""
     before = run({"h": 0.5})
     after = [run({"h": 0.45}, floor={"h": 0.1}), run({"h": 0.45}, floor={"h": 0.3})]
-    found = gain([before, before], [before, before], after)
+    refitted = run({"h": 0.4})
+    found = gain([before, before], [refitted, refitted], after)
     assert found["noise_floor_percent"] == pytest.approx(100.0 * (1 - math.sqrt(0.05) / 0.4))
-    lucky = gain(before, before, run({"h": 0.3}, floor={"h": 0.2}))
+    lucky = gain(before, refitted, run({"h": 0.3}, floor={"h": 0.2}))
     assert lucky["noise_floor_percent"] == lucky["error_removed_percent"] == pytest.approx(100.0)
 
 
