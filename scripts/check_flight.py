@@ -61,7 +61,7 @@ def show(found: "FlightCheck") -> None:
         rows.append([c.channel, f"{c.rate:.3g}", f"{c.std:.2g}", c.unit, gap, str(c.runs)])
     command_line.print_columns(rows)
     print("not measured:", " ".join(found.missing) or "nothing")
-    for note in found.mended:
+    for note in found.repaired:
         print("repaired:", note)
     if found.unread:
         print("columns not read:", ", ".join(found.unread))

@@ -76,7 +76,7 @@ def test_the_expected_std_is_what_identification_then_reports(tmp_path):
 
 @pytest.mark.slow
 def test_the_envelope_is_kept_by_every_vehicle_of_the_spread():
-    tight = Envelope(tilt=np.radians(6.0), distance=3.0)
+    tight = Envelope(tilt=np.radians(6.0), room=3.0)
     plan = plan_flight(LAMA, runs=2, envelope=tight)
     assert len(plan.refused) > 5
     for run in plan.runs:

@@ -188,7 +188,7 @@ def test_every_candidate_but_few_is_safe_with_the_bare_vehicle():
         (Envelope(ceiling=1.6), HEAVE),
         (Envelope(lowest=1.45), HEAVE),
         (Envelope(speed=1.0), maneuver("forward_run")),
-        (Envelope(distance=3.0), maneuver("forward_run")),
+        (Envelope(room=3.0), maneuver("forward_run")),
         (Envelope(tilt=math.radians(3.0)), maneuver("lon_3211")),
         (Envelope(turning=math.radians(5.0)), maneuver("yaw_3211")),
     ],

@@ -27,7 +27,7 @@ class Envelope:
         tilt: of roll and pitch [rad].
         turning: yaw rate [rad/s].
         speed: [m/s].
-        distance: horizontal, from the start [m].
+        room: horizontal distance from the start [m].
     """
 
     lowest: float = 0.15
@@ -35,7 +35,7 @@ class Envelope:
     tilt: float = 35.0 * DEGREE
     turning: float = 200.0 * DEGREE
     speed: float = 4.0
-    distance: float = 15.0
+    room: float = 15.0
 
     def breach(self, flown: Track) -> str:
         """What a simulated run leaves the envelope by, in words; empty where it stays inside."""
@@ -56,7 +56,7 @@ class Envelope:
             return f"turns at {turning / DEGREE:.0f} deg/s"
         if speed > self.speed:
             return f"reaches {speed:.1f} m/s"
-        if away > self.distance:
+        if away > self.room:
             return f"goes {away:.0f} m away"
         return ""
 

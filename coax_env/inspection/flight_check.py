@@ -37,7 +37,7 @@ Progress = Callable[[str], None]
 class FlightCheck:
     """Result of `check_flight`.
 
-    missing: channels that no run has. mended: what was done to the data while reading. suspicions: of
+    missing: channels that no run has. repaired: what was done to the data while reading. suspicions: of
     units, signs and sensors, in words. effects: of the catalogue, best shown first. undetermined:
     base parameters that these flights leave open, `directions` along what. not_believed: share of
     readings that the filter left out. next_step: in words, with a command.
@@ -48,7 +48,7 @@ class FlightCheck:
     runs: tuple[RunCheck, ...]
     channels: tuple[ChannelCheck, ...]
     missing: tuple[str, ...]
-    mended: tuple[str, ...]
+    repaired: tuple[str, ...]
     unread: tuple[str, ...]
     suspicions: tuple[str, ...]
     effects: tuple[EffectCheck, ...]
@@ -107,7 +107,7 @@ def check_flight(
         runs=tuple(run_check(run) for run in flight.runs),
         channels=channels,
         missing=tuple(c for c in CHANNELS if c not in flight.channels),
-        mended=flight.notes,
+        repaired=flight.notes,
         unread=flight.unread,
         suspicions=tuple(suspicions),
         effects=found.effects,
