@@ -17,21 +17,20 @@ from typing import Any
 import numba
 
 PACKAGE = Path(__file__).parents[1]
-TABLES = tuple(
-    f"model/{name}.py"
-    for name in ("channels", "inputs", "layout", "parameters", "state", "workspace")
-)
-"""Places and sizes that compiled code has as constants; these files compile nothing themselves."""
+COMPILED_ROOMS = ("kernel", "model")
 
 
 def kernel_sources() -> list[Path]:
-    """The files that take part in compiled code: this room, those that import it, and TABLES."""
-    compiling = [
+    """The files that take part in compiled code: two whole rooms, and what imports this one.
+
+    Whole rooms, since compiled code takes constants and functions from files that compile nothing.
+    """
+    return [
         path
         for path in sorted(PACKAGE.rglob("*.py"))
-        if path.parent.name == "kernel" or "coax_env.kernel" in path.read_text(encoding="utf-8")
+        if path.parent.name in COMPILED_ROOMS
+        or "coax_env.kernel" in path.read_text(encoding="utf-8")
     ]
-    return [*compiling, *(PACKAGE / name for name in TABLES)]
 
 
 def source_hash(extra: tuple[Path, ...] = ()) -> str:
