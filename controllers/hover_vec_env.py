@@ -84,7 +84,7 @@ class HoverVecEnv(FleetVecEnv):
             last = self.view(info["final_obs"])
             self.begin(done)
             known = self.tracker.see(observations, done)
-            self.tell_the_end(infos, done & ~over, truncated & ~terminated, last)
+            self.report_ends(infos, done & ~over, truncated & ~terminated, last)
             over |= done
             actions = np.where(over[:, None], 0.0, actions)  # until the next decision
         self._return[over], self._length[over] = 0.0, 0

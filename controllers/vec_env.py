@@ -97,13 +97,13 @@ class FleetVecEnv(_base.VecEnv):  # type: ignore[name-defined]
             last = self.view(info["final_obs"])
             self.begin(done)
             seen = np.where(done[:, None], self.view(observations, done), last)
-            self.tell_the_end(infos, done, truncated & ~terminated, last)
+            self.report_ends(infos, done, truncated & ~terminated, last)
             for i in np.flatnonzero(done).tolist():
                 infos[i] |= _of_row(info["final_info"], i)
             self._return[done], self._length[done] = 0.0, 0
         return seen, (self._reward_scale * rewards).astype(np.float32), done, infos
 
-    def tell_the_end(
+    def report_ends(
         self, infos: list[dict[str, Any]], which: np.ndarray, by_time: np.ndarray, last: np.ndarray
     ) -> None:
         """What Stable-Baselines3 wants to know of the flights that have ended, into their `infos`."""

@@ -95,7 +95,7 @@ def _split(delay, slots, dt):
 
 
 @compiled()
-def arrive_at_servos(u, p, ring, row, dt):
+def apply_servo_delay(u, p, ring, row, dt):
     """Put into `u` the swash command that is in force as a row begins; arguments as `give_command`."""
     slots = len(ring)
     if p[_DELAY] <= 0.0 or slots == 1:

@@ -32,7 +32,7 @@ from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model.layout import ATTITUDE, PLACE, POSITION, RPM_PER_RAD_S, VELOCITY
 
-SIMD_WIDTH, HEIGHT = PICTURE
+WIDTH, HEIGHT = PICTURE
 HUMAN_EVERY = 4  # control periods per picture on a screen: 25 a second
 _SMOOTH = 2  # drawn so much larger, then scaled down
 _MAP, _DISCS = (640, 20, 300, 250), (640, 280, 300, 110)  # x, y, width, height [px]
@@ -59,16 +59,16 @@ class Renderer:
         self._fonts = {
             size: self._pygame.font.Font(None, size * _SMOOTH) for size in (15, 18, 21, 26)
         }
-        size = (SIMD_WIDTH * _SMOOTH, HEIGHT * _SMOOTH)
+        size = (WIDTH * _SMOOTH, HEIGHT * _SMOOTH)
         self._sheet = self._pygame.Surface(size, depth=32)
         self._glass = self._pygame.Surface(size, self._pygame.SRCALPHA, 32)
         self._window: Any = None
         self._clock: Any = None
 
     def picture(self, view: View) -> np.ndarray:
-        """One picture, uint8 of shape (HEIGHT, SIMD_WIDTH, 3)."""
+        """One picture, uint8 of shape (HEIGHT, WIDTH, 3)."""
         pixels = self._pygame.image.tobytes(self._draw(view), "RGB")
-        return np.frombuffer(pixels, dtype=np.uint8).reshape(HEIGHT, SIMD_WIDTH, 3).copy()
+        return np.frombuffer(pixels, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3).copy()
 
     def show(self, view: View) -> None:
         """Put a picture on the screen, at the speed at which it was flown.
@@ -80,7 +80,7 @@ class Renderer:
         if self._window is None:
             try:
                 pygame.display.init()
-                self._window = pygame.display.set_mode((SIMD_WIDTH, HEIGHT))
+                self._window = pygame.display.set_mode((WIDTH, HEIGHT))
             except pygame.error as error:
                 raise InputError(
                     f"render_mode 'human' needs a screen ({error}); 'rgb_array' needs none"
@@ -108,14 +108,14 @@ class Renderer:
         self._paths(camera, view)
         self._helicopter(camera, view)
         self._sheet.blit(self._glass, (0, 0))
-        edge = (STAGE, 0, SIMD_WIDTH - STAGE, HEIGHT)
+        edge = (STAGE, 0, WIDTH - STAGE, HEIGHT)
         self._pygame.draw.rect(self._sheet, _PAPER, [v * _SMOOTH for v in edge])
         self._wind(camera, view)
         self._scale_bar(camera)
         self._map(view)
         self._discs(view)
         self._numbers(view)
-        return self._pygame.transform.smoothscale(self._sheet, (SIMD_WIDTH, HEIGHT))
+        return self._pygame.transform.smoothscale(self._sheet, (WIDTH, HEIGHT))
 
     def _scenery(self, camera: "Camera") -> None:
         horizon = camera.horizon()

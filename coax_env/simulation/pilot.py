@@ -30,10 +30,10 @@ _EFFORT = np.array([0.04, 0.04, 0.08, 0.08])  # rotor speeds as a fraction of tr
 CORNER = 1.0  # [s] over which the pilot rounds the corners of what he is asked for
 
 
-def rounded(asked: np.ndarray, rows: int) -> np.ndarray:
+def rounded(reference: np.ndarray, rows: int) -> np.ndarray:
     """What is asked for (n, k) with corners rounded over some rows: a centred running mean."""
     half = rows // 2
-    padded = np.pad(asked, ((half, half), (0, 0)), mode="edge")
+    padded = np.pad(reference, ((half, half), (0, 0)), mode="edge")
     window = np.ones(2 * half + 1) / (2 * half + 1)
     return np.column_stack([np.convolve(column, window, mode="valid") for column in padded.T])
 
@@ -57,8 +57,8 @@ class Pilot:
     def correction(
         self,
         state: np.ndarray,
-        asked: np.ndarray,
-        asked_rate: np.ndarray,
+        reference: np.ndarray,
+        reference_rate: np.ndarray,
         dt: float,
         rng: np.random.Generator,
     ) -> np.ndarray:
@@ -66,17 +66,17 @@ class Pilot:
 
         Args:
             state: full state (20,) or more.
-            asked: height, forward, right, heading, shape (4,).
-            asked_rate: the same, per second.
+            reference: height, forward, right, heading asked for, shape (4,).
+            reference_rate: the same, per second.
             dt: seconds per row. rng: of the tremor.
         """
         error = state[:N_FLOWN] - self.trim_state
-        error[S.U] -= asked[1]
-        error[S.V] -= asked[2]
-        error[S.W] += asked_rate[0]
-        error[S.R] -= asked_rate[3]
-        error[S.PSI] = wrap_angle(state[S.PSI] - self.trim_state[S.PSI] - asked[3])
-        error[S.Z] = state[S.Z] + asked[0]
+        error[S.U] -= reference[1]
+        error[S.V] -= reference[2]
+        error[S.W] += reference_rate[0]
+        error[S.R] -= reference_rate[3]
+        error[S.PSI] = wrap_angle(state[S.PSI] - self.trim_state[S.PSI] - reference[3])
+        error[S.Z] = state[S.Z] + reference[0]
         error[PLACE] = 0.0
         error[:N_STATES] = np.clip(error[:N_STATES], -_REACH, _REACH)
         correction = -self.gain @ error

@@ -103,8 +103,8 @@ def fly(
     start, trim = dynamics.hover_trim(vehicle, plan.height)
     t = np.arange(round(plan.duration / dt) + 1) * dt
     plan_command = trim + plan.injection(t, trim)
-    asked = rounded(plan.asked_for(t), round(CORNER / dt))
-    asked_rate = np.gradient(asked, dt, axis=0)
+    reference = rounded(plan.asked_for(t), round(CORNER / dt))
+    reference_rate = np.gradient(reference, dt, axis=0)
 
     machine = _Machine(vehicle, start, trim, dt, gusts)
     states, commands = np.empty((len(t), N_FULL)), np.empty((len(t), N_COMMANDS))
@@ -115,7 +115,7 @@ def fly(
         x = machine.x
         command = plan_command[row].copy()
         if pilot is not None:
-            command += pilot.correction(x, asked[row], asked_rate[row], dt, rng)
+            command += pilot.correction(x, reference[row], reference_rate[row], dt, rng)
             command[:2] = np.maximum(command[:2], 0.0)
         states[row], commands[row] = x, command
         machine.give(command, readings[row])
@@ -168,7 +168,7 @@ class _Machine:
         u, p, ring, row = self._u, self._p, self._ring, self._row
         u[:N_COMMANDS] = command
         period.give_command(u, self._last, self._limits, ring, row, self._dt)
-        period.arrive_at_servos(u, p, ring, row, self._dt)
+        period.apply_servo_delay(u, p, ring, row, self._dt)
         period.true_readings(self.x, u, p, self._azimuth, self._work, readings)
 
     def fly(self) -> None:

@@ -51,14 +51,15 @@ def longitudinal(
         noise: std of the gyro [rad/s], the accelerometers [m/s2] and the sonar [m]. The paper gives no
             Q, R or P0: Q is the IMU's noise through the model, R the sonar's, both of Table V.
     """
-    gyro, accelerometer, echo = noise
-    heard = sonar[np.isfinite(sonar)]
-    start = np.array([0.0, 0.0, 0.0, float(np.median(heard[:20])) if heard.size else 0.0, 0.0])
-    shake = np.array([gyro, accelerometer, accelerometer]) ** 2
+    gyro, accelerometer, sonar_std = noise
+    heights = sonar[np.isfinite(sonar)]
+    start = np.array([0.0, 0.0, 0.0, float(np.median(heights[:20])) if heights.size else 0.0, 0.0])
+    process_noise = np.array([gyro, accelerometer, accelerometer]) ** 2
     columns = [np.ascontiguousarray(column, float) for column in (q, ax, az, sonar)]
     predicted, P_predicted, filtered, P_filtered, transition = _filter(
-        *columns, float(dt), float(gravity), shake, float(echo) ** 2, start, START_STD**2
-    )
+        *columns, float(dt), float(gravity), process_noise, float(sonar_std) ** 2,
+        start, START_STD**2,
+    )  # fmt: skip
     smooth, P_smooth = _smooth(predicted, P_predicted, filtered, P_filtered, transition)
     return Longitudinal(
         filtered, _std(P_filtered), smooth, _std(P_smooth), columns[3] - filtered[:, H]
@@ -68,7 +69,7 @@ def longitudinal(
 @compiled(makes_arrays=True)
 def _filter(
     q: np.ndarray, ax: np.ndarray, az: np.ndarray, sonar: np.ndarray, dt: float, g: float,
-    shake: np.ndarray, echo: float, start: np.ndarray, spread: np.ndarray,
+    process_noise: np.ndarray, sonar_variance: float, start: np.ndarray, spread: np.ndarray,
 ) -> tuple[np.ndarray, ...]:  # fmt: skip
     """Forward pass: predicted and filtered states (n, 5), covariances (n, 5, 5), transitions."""
     n = q.size
@@ -81,7 +82,7 @@ def _filter(
     for k in range(n):
         predicted[k], P_predicted[k] = x, P
         if np.isfinite(sonar[k]):
-            gain = P[:, H].copy() / (P[H, H] + echo)
+            gain = P[:, H].copy() / (P[H, H] + sonar_variance)
             x = x + gain * (sonar[k] - x[H])
             P = P - np.outer(gain, P[H].copy())
             P = 0.5 * (P + P.T)
@@ -103,7 +104,7 @@ def _filter(
         G[THETA, 0], G[U, 0], G[W, 0] = 1.0, -middle[W], middle[U]
         G[U, 1] = G[W, 2] = 1.0
         transition[k] = F
-        P = F @ P @ F.T + dt * dt * ((G * shake) @ G.T)
+        P = F @ P @ F.T + dt * dt * ((G * process_noise) @ G.T)
     return predicted, P_predicted, filtered, P_filtered, transition
 
 

@@ -150,15 +150,15 @@ def _from_draws(
 ) -> np.ndarray:
     """Covariance of the scores that the errors make, from draws of them.
 
-    The instruments at hand hold errors of their own already, which meet those drawn as a stranger's:
+    The instruments at hand hold errors of their own already, which are independent of those drawn:
     what one draw's instruments make of another's errors is taken off again.
     """
     own = np.zeros((len(draws), *instruments.shape))
     own[:, :, noisy] = draws[:, :, :-1] + off[:, :, None] * share[:-1]
     whole = np.cov(np.einsum("dnk,dn->dk", instruments + own, off).T)
-    strange = np.cov(np.einsum("dnk,dn->dk", np.roll(own, 1, axis=0), off).T)
-    whole, strange = np.atleast_2d(whole), np.atleast_2d(strange)
-    kept, axes = eigh(whole - strange, whole)
+    foreign = np.cov(np.einsum("dnk,dn->dk", np.roll(own, 1, axis=0), off).T)
+    whole, foreign = np.atleast_2d(whole), np.atleast_2d(foreign)
+    kept, axes = eigh(whole - foreign, whole)
     back = whole @ axes  # axes' whole axes = 1
     return np.asarray(back @ np.diag(np.maximum(kept, 0.1)) @ back.T)
 
@@ -175,7 +175,7 @@ def _gusts(
     shape = _autocovariance(off, lengths, step * most)[::step]
     size = float(residual.var())
     levels = size * GUST_SIZES
-    # beyond a quarter of a run, what is remembered cannot be told from the offset
+    # beyond a quarter of a run, what is remembered is confounded with the offset
     memories = np.geomspace(step, max(min(lengths) / 4.0, 2.0 * step), GUST_MEMORIES)
     best, level, memory = -math.inf, 0.0, 1.0
     for tau in memories:
@@ -186,18 +186,18 @@ def _gusts(
             w, turn = eigh(toeplitz(np.exp(-step * lag / tau)), D)
             parts.append((w, turn.T @ residual[block], turn.T @ instruments[block]))
         for s in (0.0, *levels):
-            told = 0.0
+            log_likelihood = 0.0
             A = np.zeros((instruments.shape[1],) * 2)
             c = np.zeros(instruments.shape[1])
             for w, y, X in parts:
                 v = 1.0 + s * w
-                told -= 0.5 * float(np.sum(np.log(v)) + np.sum(y**2 / v))
+                log_likelihood -= 0.5 * float(np.sum(np.log(v)) + np.sum(y**2 / v))
                 A += X.T @ (X / v[:, None])
                 c += X.T @ (y / v)
-            told += 0.5 * float(c @ np.linalg.lstsq(A, c, rcond=None)[0])
-            told -= 0.5 * float(np.linalg.slogdet(A)[1])
-            if told > best:
-                best, level, memory = told, s, float(tau)
+            log_likelihood += 0.5 * float(c @ np.linalg.lstsq(A, c, rcond=None)[0])
+            log_likelihood -= 0.5 * float(np.linalg.slogdet(A)[1])
+            if log_likelihood > best:
+                best, level, memory = log_likelihood, s, float(tau)
     keep = math.exp(-1.0 / memory)
     total = np.zeros((instruments.shape[1],) * 2)
     for start, stop in pairwise(edges):
@@ -279,7 +279,7 @@ def _parzen(lags: int) -> np.ndarray:
     return np.where(x < 0.5, 1.0 - 6.0 * x**2 + 6.0 * x**3, 2.0 * (1.0 - x) ** 3)
 
 
-# --- what cannot be told apart ------------------------------------------------------------------------
+# --- collinearity -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
