@@ -106,7 +106,9 @@ def test_flights_are_read_without_a_model():
                 )
 
 
-ENGINE = "engine kalman noise_levels quadratic state_space whiteness"
+ENGINE = (
+    "engine frozen_gains kalman noise_levels noise_score quadratic sparse state_space whiteness"
+)
 
 
 @pytest.mark.parametrize("name", ENGINE.split())

@@ -52,7 +52,7 @@ def test_gymnasium_checks_the_pictures_without_a_warning(mode):
 
 def test_a_picture_has_its_shape_and_is_reproducible():
     one, other = picture(), picture()
-    assert one.shape == (rendering.HEIGHT, rendering.SIMD_WIDTH, 3) and one.dtype == np.uint8
+    assert one.shape == (rendering.HEIGHT, rendering.WIDTH, 3) and one.dtype == np.uint8
     assert np.array_equal(one, other)
     assert len(np.unique(one.reshape(-1, 3), axis=0)) > 100
 
@@ -108,7 +108,7 @@ def test_a_state_that_is_not_a_number_can_be_drawn():
     env = CoaxEnv(render_mode="rgb_array")
     env.reset(seed=0)
     env.step(np.full(4, np.nan))
-    assert env.render().shape == (rendering.HEIGHT, rendering.SIMD_WIDTH, 3)
+    assert env.render().shape == (rendering.HEIGHT, rendering.WIDTH, 3)
 
 
 def test_without_a_mode_nothing_is_drawn_and_without_a_screen_it_is_said(monkeypatch):
