@@ -273,7 +273,7 @@ def _transition(model, u, dt, p, w):
         find_non_zeros(w.F)
 
 
-@compiled(**REORDER)
+@compiled(inline="always", **REORDER)  # a call of its own rounds the last bit otherwise
 def _rescaled(F, ratio):
     """The same Jacobian for another step: rows of slow states follow the step to first order."""
     nx = F.counts.size
