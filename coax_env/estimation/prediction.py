@@ -26,6 +26,7 @@ from coax_env.estimation.helicopter import (
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import Noise
 from coax_env.logs.flight import Flight, read_flight
+from coax_env.model import state as S
 from coax_env.model.layout import CHANNEL_UNITS, CHANNELS, GUSTS, N_FULL
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
@@ -112,7 +113,7 @@ def fly_again(
             turn = (
                 2.0
                 * np.pi
-                * np.round((run.states[first, 12] - turns[first, HEADING]) / (2.0 * np.pi))
+                * np.round((run.states[first, S.PSI] - turns[first, HEADING]) / (2.0 * np.pi))
             )
             if np.isfinite(turn):
                 measured[s, HEADING] += turn
@@ -186,7 +187,7 @@ def _spread(
     """Variance by channel of a perfect model's prediction: the start's covariance flown forward."""
     base = np.full(len(CHANNELS), np.nan)
     moved = np.full(len(CHANNELS), np.nan)
-    S = np.zeros((len(CHANNELS), N_FULL))
+    sensitivity = np.zeros((len(CHANNELS), N_FULL))
     x0 = run.states[first].copy()
     x0[GUSTS] = 0.0
 
@@ -194,13 +195,13 @@ def _spread(
         kalman.fly_open_loop(engine.compiled, dt, inputs, x, p, first, targets, out)
 
     fly(x0.copy(), base)
-    for j in range(20):
+    for j in range(GUSTS.start):
         x = x0.copy()
         x[j] += engine.model.state_scale[j]
         fly(x, moved)
-        S[:, j] = (moved - base) / engine.model.state_scale[j]
-    S[~np.isfinite(S)] = 0.0
-    return np.einsum("ij,jk,ik->i", S, run.start_covariances[slot], S)
+        sensitivity[:, j] = (moved - base) / engine.model.state_scale[j]
+    sensitivity[~np.isfinite(sensitivity)] = 0.0
+    return np.einsum("ij,jk,ik->i", sensitivity, run.start_covariances[slot], sensitivity)
 
 
 # --- what the scripts call -------------------------------------------------------------------------

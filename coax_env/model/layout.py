@@ -39,6 +39,7 @@ POSITION = slice(13, 16)
 PLACE = slice(13, 15)  # north and east of it
 ROTOR_SPEED = slice(16, 18)
 SWASH = slice(18, 20)
+ACTUATORS = slice(16, 20)
 GUST_FORCE = slice(20, 23)
 GUST_MOMENT = slice(23, 26)
 GUSTS = slice(20, 26)
