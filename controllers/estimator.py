@@ -154,7 +154,12 @@ class EstimatorDesign:
 def design_estimator(
     vehicle: Vehicle, nominal: Nominal = None, sensors: str = "onboard"
 ) -> EstimatorDesign:
-    """The filter for a vehicle and a sensor suite. A pure servo delay is taken as a lag."""
+    """The filter for a vehicle and a sensor suite. A pure servo delay is taken as a lag.
+
+    Args:
+        vehicle: the filter is designed on. sensors: name of the suite.
+        nominal: whose trim and scale the actions have, see `action_map`.
+    """
     used = [s for s in suite(sensors, vehicle) if s.index != _SPEED]  # |V| has no slope at hover
     A_flown, B_flown, C_channels, D_channels, x_trim, u_trim = sampled(delay_as_lag(vehicle), DT)
     A, B = np.eye(len(_NAMES)), np.zeros((len(_NAMES), N_COMMANDS))

@@ -69,7 +69,12 @@ def _move_air(x, p, stream, filters, steady, turbulence, air):
 
 @compiled(makes_arrays=True)
 def disturb_rows(first, last, active, x, heli, world):
-    """Gusts and turbulence of the coming period for the active rows first..last-1."""
+    """Gusts and turbulence of the coming period for the active rows first..last-1.
+
+    Args:
+        first, last: the share of the rows. active: which of them fly, (n,) bool.
+        x: full states, (n, 26), whose gusts change. heli, world: the batch's arrays, arrays.py.
+    """
     air = np.empty(3)
     many = len(heli.params) > 1
     gust = world.gust
@@ -123,7 +128,12 @@ def fly_rows(first, last, active, actions, x, heli, world, mission, outcome):
 
 @compiled()
 def pay_waypoints(first, last, active, x, heli, mission, outcome):
-    """Pay the active rows first..last-1 that have reached their targets, and give them others."""
+    """Pay the active rows first..last-1 that have reached their targets, and give them others.
+
+    Args:
+        first, last: the share of the rows. active: which of them fly, (n,) bool.
+        x: full states, (n, 26). heli, mission, outcome: the batch's arrays, arrays.py.
+    """
     bonus = mission.weights[hover.N_TERMS]
     for i in range(first, last):
         target, progress = heli.targets[i], heli.progress[i]
@@ -137,7 +147,12 @@ def pay_waypoints(first, last, active, x, heli, mission, outcome):
 
 @compiled()
 def observe_targets(first, last, which, heli, mission, observations):
-    """The way to the target by the readings held, observed, for the rows first..last-1 of a mask."""
+    """The way to the target by the readings held, observed, for the rows first..last-1 of a mask.
+
+    Args:
+        first, last: the share of the rows. which: those of them to observe, (n,) bool.
+        heli, mission: the batch's arrays, arrays.py. observations: (n, n_observed), in place.
+    """
     begin = heli.held.shape[1] - tasks.N_WAY
     for i in range(first, last):
         if which[i]:

@@ -90,7 +90,12 @@ _START_RATE, _START_VELOCITY, _START_RISE = START["rate"], START["velocity"], ST
 
 @compiled()
 def random_start(stream, command, x):
-    """A random start into the full state `x` (26,): rotors and swash settled on `command` (4,)."""
+    """A random start into the full state `x` (26,): rotors and swash settled on `command` (4,).
+
+    Args:
+        stream: key and counter, (2,) uint64. command: [rad/s, rad/s, rad, rad], (4,).
+        x: full state, (26,), is put here.
+    """
     for i in range(N_FULL):
         x[i] = 0.0
     for i in range(3):

@@ -59,7 +59,12 @@ FORCE, MOMENT = range(2)
 
 @compiled()
 def command(action, trim, scale, u):
-    """An action (4,), clipped in place to [-1, 1], as commands into `u`."""
+    """An action (4,), clipped in place to [-1, 1], as commands into `u`.
+
+    Args:
+        action: (4,). trim, scale: command = trim + scale action, (4,) each [rad/s, rad/s, rad, rad].
+        u: commands and time, (5,); its commands are put here.
+    """
     for k in range(4):
         a = action[k]
         a = select(a < -1.0, -1.0, a)
@@ -99,7 +104,11 @@ def _split(delay, slots, dt):
 
 @compiled()
 def apply_servo_delay(u, p, ring, row, dt):
-    """Put into `u` the swash command that is in force as a row begins; arguments as `give_command`."""
+    """Put into `u` the swash command that is in force as a row begins; arguments as `give_command`.
+
+    Args:
+        u, ring, row, dt: as in `give_command`. p: parameter vector.
+    """
     slots = len(ring)
     if p[_DELAY] <= 0.0 or slots == 1:
         return
@@ -144,7 +153,11 @@ def fly_period(x, u, p, ring, row, dt, work):
 
 @compiled()
 def next_azimuth(azimuth, speed, dt):
-    """Azimuth [rad] of a rotor of this speed [rad/s] after `dt` seconds, within a turn."""
+    """Azimuth [rad] of a rotor of this speed [rad/s] after `dt` seconds, within a turn.
+
+    Args:
+        azimuth: [rad] now. speed: of the rotor [rad/s]. dt: [s].
+    """
     azimuth = azimuth + dt * speed
     return azimuth - TURN * math.floor(azimuth / TURN)
 
@@ -157,7 +170,12 @@ def gust_growth(dt, memory):
 
 @compiled()
 def add_gusts(x, p, gust, stream):
-    """Move the gust states on by one period: exponential memory, stationary std `gust` (2,)."""
+    """Move the gust states on by one period: exponential memory, stationary std `gust` (2,).
+
+    Args:
+        x: full state, (26,), in place. p: parameter vector.
+        gust: std of force [N] and moment [N m], (2,). stream: key and counter, (2,) uint64.
+    """
     share = gust_growth(DT, p[P.GUST_MEMORY])
     for half, first in ((FORCE, S.GUST_X), (MOMENT, S.GUST_L)):
         if gust[half] > 0.0:

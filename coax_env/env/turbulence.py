@@ -123,7 +123,12 @@ def turbulence_step(stream, filters, height, wind, dt, air):
 
 
 def spectrum(frequency: np.ndarray, sigma: float, tau: float, along: bool) -> np.ndarray:
-    """One-sided Dryden spectrum at frequencies [Hz], (m/s)^2/Hz; `along` the wind, or across it."""
+    """One-sided Dryden spectrum at frequencies [Hz], (m/s)^2/Hz; `along` the wind, or across it.
+
+    Args:
+        frequency: [Hz], any shape. sigma: std [m/s]. tau: memory [s], see `dryden`.
+        along: the wind, or across it and downwards.
+    """
     square = (2.0 * math.pi * np.asarray(frequency, dtype=float) * tau) ** 2
     if along:
         return 4.0 * sigma**2 * tau / (1.0 + square)

@@ -211,7 +211,12 @@ def _worth(
 def gain_of_the_truth(
     result: Diagnosis, hidden: list[str], values: Mapping[str, float], held: Collection[str]
 ) -> dict[str, Any]:
-    """What the true structure removes on the same held-out runs, refitted on the same others."""
+    """What the true structure removes on the same held-out runs, refitted on the same others.
+
+    Args:
+        result: of the diagnosis. hidden: the flight's true effects.
+        values: of the generator, by its own names. held: names of the runs held out.
+    """
     fit, engine_held = forced(result.flight, hidden, values, held)
     horizon = SETTINGS.horizon
     replayed = fly_again(engine_held, fit.values, fit.noise, horizon)
@@ -222,7 +227,12 @@ def gain_of_the_truth(
 def forced(
     flight: Flight, hidden: list[str], values: Mapping[str, float], held: Collection[str]
 ) -> tuple[Fit, Engine]:
-    """These effects fitted, from their true sizes on; and the engine of the held-out runs."""
+    """These effects fitted, from their true sizes on; and the engine of the held-out runs.
+
+    Args:
+        flight: its runs. hidden: names of the effects.
+        values: of the generator, by its own names. held: names of the runs held out.
+    """
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     model = HeliModel(vehicle)
     problem = Problem.of(model, _records(flight, held, within=False), hidden)

@@ -146,6 +146,10 @@ def flapping(
 
     a' = (gain tilt - a) / time_constant - rate: the tilt held from row to row, exactly; the rate by the
     trapezoidal rule. Columns of an (n, k) `rate` are followed each on its own.
+
+    Args:
+        rate: of the body, (n,) or (n, k) [rad/s]. tilt: of the swash plate, (n,) or one [rad].
+        dt: seconds between rows. time_constant: [s]. gain: flap per swash tilt [1].
     """
     half = 0.5 * dt / time_constant
     turning = lfilter([0.5 * dt, 0.5 * dt], [1.0 + half, half - 1.0], rate, axis=0)
