@@ -23,7 +23,7 @@ from coax_env.estimation.fitted_vehicle import (
 )
 from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel, record_of, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
-from coax_env.estimation.prediction import RunReplay, fly_again
+from coax_env.estimation.prediction import RunReplay, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 from coax_env.identification.maximum_likelihood import (
@@ -183,7 +183,7 @@ def _by_maximum_likelihood(
         f"identified from {where} (maximum likelihood)",
         flight,
     )
-    report("flying again")
+    report("flying the runs open loop")
     again = Engine(model, [record_of(run) for run in held.runs])
     return Identification(
         held,
@@ -192,8 +192,8 @@ def _by_maximum_likelihood(
         tuple(names),
         found.estimate,
         found.noise,
-        fly_again(again, model.bare_values, first),
-        fly_again(again, values, found.noise),
+        replay_runs(again, model.bare_values, first),
+        replay_runs(again, values, found.noise),
         (*known, *([found.remark] if found.remark else [])),
         *left_open(found.free, found.estimate.covariance),
         each_run(engine, found.free, lin, values, inflation),

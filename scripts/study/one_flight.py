@@ -21,7 +21,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
-from coax_env.estimation.prediction import fly_again
+from coax_env.estimation.prediction import replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
 from coax_env.logs.flight import Flight, read_flight
@@ -219,7 +219,7 @@ def gain_of_the_truth(
     """
     fit, engine_held = forced(result.flight, hidden, values, held)
     horizon = SETTINGS.horizon
-    replayed = fly_again(engine_held, fit.values, fit.noise, horizon)
+    replayed = replay_runs(engine_held, fit.values, fit.noise, horizon)
     gain = gain_of(result.replay_before, result.replay_refitted, replayed, result.noise, horizon)
     return {key: gain[key] for key in ("error_removed_percent", "ci95")}
 
