@@ -51,7 +51,7 @@ from coax_env.model.vehicle import Vehicle
 from controllers.feedback import Feedback
 from controllers.target import TargetView, turned
 
-DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; not the fly-bar's, from which it must be told
+DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; unlike the fly-bar's, to be distinguished
 FORCE_SHARE = 0.05  # std of the disturbing force, of the weight
 MOMENT_ARM = 0.002  # [m] std of the disturbing roll and pitch moment, of the weight
 TORQUE_SHARE = 0.07  # std of the disturbing yaw moment, of one rotor's torque
@@ -229,7 +229,7 @@ def integrated_readings(design: EstimatorDesign) -> dict[str, float]:
 class Tracker:
     """The running filter, for one helicopter or many, and the integrals of some readings.
 
-    In every control period: `see` the observation, then tell what was done with `acted`. Where the
+    In every control period: `see` the observation, then report what was done with `acted`. Where the
     observation has a target, all is relative to it (controllers/target.py).
     """
 
@@ -276,7 +276,7 @@ class Tracker:
     def see(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
         """Take in observations (count, n_obs), only in the rows of a mask where one is given.
 
-        A reading that is no finite number tells nothing, and changes nothing.
+        A reading that is no finite number carries no information, and changes nothing.
 
         Returns:
             what is known, (count, n + i): the estimate and the integrals.
@@ -399,7 +399,7 @@ def _correct(
         gain = first_gain[0] if rows[i] == 0 else gains[rows[i] % len(gains)]
         for k in range(m):
             y[k] -= trim[k]
-            if not math.isfinite(y[k]):  # a reading that is no number tells nothing
+            if not math.isfinite(y[k]):  # no number, no information
                 y[k] = expected[k]
                 continue
             if k == heading:
@@ -418,7 +418,7 @@ def _predict(command, A_by_state, B_by_command, turn, state):
     """Move states (count, n) on by one control period, in place: x = A x + B du.
 
     The heading, state number `turn` (-1: none), stays within -pi .. pi: whatever a compass has made
-    of it, nobody shall fly a whole turn back.
+    of it, no controller is to fly a whole turn back.
     """
     before = np.empty(state.shape[1])
     for i in range(len(state)):
@@ -472,7 +472,7 @@ def _spreads(vehicle: Vehicle, command: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _unobserved(
     A: np.ndarray, C: np.ndarray, first: np.ndarray, noise: np.ndarray
 ) -> tuple[str, ...]:
-    """States whose error the readings never show and time does not heal.
+    """States whose error the readings never show and that does not decay.
 
     From the information matrix sum (A^k)' C' R^-1 C A^k of five seconds, with states in units of
     their first std: its directions with next to no information that do not decay by themselves,

@@ -4,7 +4,7 @@ The purpose of the paper's section III, taken further. Data flow::
 
     candidates (next_maneuver.py) and multisines -> flown with the vehicle and with draws of it
         -> outside the envelope: left out, and why -> expected information of each
-        -> picked one by one, each the one that tells most beside those picked -> flight card
+        -> picked one by one, each the most informative beside those picked -> flight card
 
 What is gained is the sum of the logarithms of the wanted numbers' std (all of them alike, whatever
 their units: the log determinant of what is left beside the others, D_s-optimality, Atkinson and
@@ -111,7 +111,7 @@ def plan_flight(
     known = np.diag([f.std**-2 for f in free])
     safe: list[tuple[Maneuver, Track, np.ndarray]] = []
     refused = []
-    options = (*candidates(), *stirring())
+    options = (*candidates(), *multisine_maneuvers())
     for k, option in enumerate(options):
         report(f"flying {option.name} ({k + 1} of {len(options)})")
         flown, why = _safe(vehicle, spread, option, envelope)
@@ -142,7 +142,7 @@ def plan_flight(
     )
 
 
-def stirring() -> tuple[Maneuver, ...]:
+def multisine_maneuvers() -> tuple[Maneuver, ...]:
     """Multisines on all four inputs at once, at half and at full size, with a pilot."""
     waves = multisines(len(AXES), LENGTH)
     return tuple(

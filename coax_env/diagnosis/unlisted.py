@@ -1,6 +1,6 @@
 """What no effect of the catalogue explains: generic terms on the six axes, found by their signatures.
 
-The filter's gust states soak up a force or moment that the model lacks. Terms of generic_terms.py are
+The filter's gust states absorb a force or moment that the model lacks. Terms of generic_terms.py are
 screened by how much of those estimates they follow; the best are weighed as effects are, by their
 signatures with the base parameters and the causes in place projected out; what passes the threshold,
 and is large enough to matter in prediction, becomes part of the model and is refitted with it. Then

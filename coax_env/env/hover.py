@@ -3,7 +3,7 @@
 Reward and cost can be taken about another target: the other tasks (tasks.py) do.
 
 Controllers are compared by a quadratic cost: squared errors in units of LIMITS, the success
-conditions of contract.md. The reward has a term 1/(1 + |error|/scale) per error, in (0, 1]: sharp
+conditions (tasks.py). The reward has a term 1/(1 + |error|/scale) per error, in (0, 1]: sharp
 at the goal, and with a slope far from it, so that a policy can be learnt from nothing.
 """
 

@@ -5,7 +5,7 @@ it moves on from one target to the next. All tasks start, end and are rewarded b
 target in force; ``hover`` has its target fixed over the start. A target is (north, east, height,
 heading) [m, rad] for the user, and x y z psi of the state in the kernel.
 
-Success is contract.md's, about the target: see `judge`, and `succeeded` for one recorded flight.
+Success is SUCCESS's, about the target: see `judge`, and `succeeded` for one recorded flight.
 """
 
 import math
@@ -40,7 +40,7 @@ SUCCESS = {
     "heading": hover.LIMITS["heading"],
     "drift": hover.LIMITS["position"],
 }
-"""Contract.md: rms of the errors of height [m], speed [m/s] and heading [rad]; farthest drift [m]."""
+"""Ours: rms of the errors of height [m], speed [m/s] and heading [rad]; farthest drift [m]."""
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ LEAST_READING_STD = {
     "ax": 0.05, "ay": 0.05, "az": 0.05, "phi": 0.006, "theta": 0.006, "psi": 0.008,
     "h": 0.005, "vn": 0.02, "ve": 0.02, "vd": 0.02, "pn": 0.004, "pe": 0.004, "v": 0.02,
 }  # fmt: skip
-"""Where the card states no noise, readings are not believed more than this.
+"""Least std taken for a reading where the card states no noise; units of CHANNEL_UNITS.
 
 A motion capture is far finer than any rigid-body model (vibration, jitter of the time stamps): with
 its true noise the likelihood would be spent on what no parameter can correct.
@@ -289,9 +289,9 @@ def record_of(run: Run) -> Record:
 
 
 def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
-    """Noise to start from: readings as the card says or the data show, gusts by guess.
+    """Noise to start from: of readings by the card or their scatter, of gusts by guess.
 
-    A vehicle's vibration is noise to the filter, on top of what the card says: its phase is not known.
+    A vehicle's vibration is noise to the filter, on top of the card's: its phase is not known.
     """
     weight = vehicle["mass"].value * vehicle["gravity"].value
     arm = vehicle["arm_upper"].value

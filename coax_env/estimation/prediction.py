@@ -1,4 +1,4 @@
-"""What the simulation gets wrong: the filtered state flown open loop over a horizon (contract.md).
+"""What the simulation gets wrong: the filtered state flown open loop over a horizon.
 
 From starts every quarter of a second, after one second of filtering, the filtered state is flown
 with the recorded commands and compared with the measurement at the horizon's end. The gust states are
@@ -242,7 +242,7 @@ def _spread(
 
 @dataclass(frozen=True)
 class Replay:
-    """Result of `replay`: what `replay.json` says, and the traces behind it."""
+    """Result of `replay`: the content of `replay.json`, and the traces behind it."""
 
     findings: dict[str, Any]
     runs: list[RunReplay]

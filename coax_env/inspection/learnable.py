@@ -29,7 +29,7 @@ NOTHING = 1e-6
 
 @dataclass(frozen=True)
 class EffectCheck:
-    """What these flights would tell of an effect, were it there at its usual size.
+    """What these flights would determine of an effect, were it there at its usual size.
 
     nats: expected evidence. std, usual: by parameter, expected std where it is the only effect, and
     the usual size. verdict: "shows", "may show" or "hidden". run: that shows it best. alike: effects

@@ -52,7 +52,7 @@ N_COMMANDS = len(COMMANDS)
 TIME = 4  # the kernel's input is the four commands and the time since the run's start [s]
 N_INPUTS = N_COMMANDS + 1
 
-# --- measurement channels (contract.md) -----------------------------------------------------------
+# --- measurement channels -----------------------------------------------------------------------
 CHANNEL_UNITS = {
     "rpm_upper": "rev/min", "rpm_lower": "rev/min",
     "p": "rad/s", "q": "rad/s", "r": "rad/s",

@@ -1,4 +1,4 @@
-"""Orthogonal multisines with optimised phases: every input stirred at once, and told apart after.
+"""Orthogonal multisines with optimised phases: every input excited at once, and separated after.
 
 Each input gets its own harmonics of the record's base frequency, interleaved with the others', so that
 over a whole record the inputs are orthogonal in time and in frequency whatever their phases (Morelli

@@ -21,7 +21,7 @@ from coax_env.logs.flight import Run
 from coax_env.model.vehicle import Vehicle
 
 EDGE = 0.5
-"""Seconds at either end of a run that are left out: the filter and the flap angles settle there."""
+"""Seconds at either end of a run that are left out: the filter's and the flap angles' transients."""
 DRAWS = 60
 """Of the sensors' noise, per run."""
 IMU = ("p", "q", "r", "ax", "ay", "az")

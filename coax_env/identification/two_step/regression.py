@@ -308,7 +308,7 @@ class Direction:
 
 @dataclass(frozen=True)
 class Collinearity:
-    """What a set of regressors cannot tell apart, the intercept aside.
+    """What a set of regressors does not determine, the intercept aside.
 
     inflation: name -> how much larger its variance is than were it alone (VIF). singular: singular
     values of the columns about their means, each scaled to length 1. directions: the weak ones.
