@@ -156,7 +156,7 @@ def test_a_late_command_is_its_mean_over_the_row(delay):
 
 
 @pytest.mark.parametrize("gain", P.COMMAND_GAINS)
-def test_news_corrects_the_states_it_tells_of(gain):
+def test_an_input_innovation_corrects_its_states(gain):
     """Tilts: a pilot who pulls (lon > 0, tilts back) has seen the nose low, or a push forward."""
     taken = {  # state -> how it takes (upper, lower, lon, lat)
         "command_gain.rate_xy": {"p": (0, 0, 0, 1), "q": (0, 0, 1, 0)},

@@ -32,13 +32,13 @@ from coax_env.model import parameters as P
 from coax_env.model import state as S
 
 CLIP = 2.0
-"""Robust standard deviations at which an innovation is clipped: more is a maneuver."""
+"""Robust standard deviations at which an innovation is clipped: more is a maneuver; ours."""
 _ROUNDS = 5  # of reweighting
-_EVERY = 37  # rows between samples of the filter's covariance, prime to all sensors' cycles
-_SETTLED = 100  # rows that a filter takes to forget its start
+_SAMPLE_ROWS = 37  # rows between samples of the filter's covariance, prime to all sensors' cycles
+_TRANSIENT_ROWS = 100  # rows that a filter takes to forget its start
 _SEEN = (S.U, S.V, S.W, S.P, S.Q, S.R, S.PHI, S.THETA, S.PSI, S.X, S.Y, S.Z)  # by a pilot
 _HEADING, _NORTH, _EAST = (_SEEN.index(state) for state in (S.PSI, S.X, S.Y))
-_LEAST = 1e-9  # std [rad, rad/s] below which a command is not flown by anyone
+_LEAST_COMMAND_STD = 1e-9  # std [rad, rad/s] below which a command is not flown by anyone
 
 # per gain: the states it corrects, and what of the innovations (upper, lower, lon, lat) it takes
 _CORRECTED = (
@@ -96,7 +96,7 @@ def _with(records: Sequence[Record], found: Sequence[np.ndarray]) -> list[Record
 
 
 def _passes(engine: Engine, fit: Fit) -> list[RunPass]:
-    rows = [np.arange(_SETTLED, r.t.size, _EVERY) for r in engine.records]
+    rows = [np.arange(_TRANSIENT_ROWS, r.t.size, _SAMPLE_ROWS) for r in engine.records]
     return engine.filter(fit.values, fit.noise, start_rows=rows)
 
 
@@ -156,6 +156,6 @@ def _gains(passes: Sequence[RunPass], found: Sequence[np.ndarray]) -> list[FreeP
     gains = []
     for name, corrected, taken in zip(P.COMMAND_GAINS, _CORRECTED, _TAKEN, strict=True):
         std = float(np.sqrt(np.mean((spread @ taken.T) ** 2)))
-        if std > _LEAST:
+        if std > _LEAST_COMMAND_STD:
             gains.append(FreeParameter(name, 0.0, float(unknown[list(corrected)].mean()) / std))
     return gains

@@ -26,7 +26,7 @@ from coax_env.diagnosis.fits import fitted, linearise, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.estimation.engine import RunPass
-from coax_env.estimation.helicopter import FARTHEST
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import whiteness
@@ -363,7 +363,7 @@ def parameters(axis: str, terms: Sequence[Term]) -> list[FreeParameter]:
     """Coefficients of terms on an axis under their priors."""
     known = dict(zip(effects.GROUPS[axis].names(), effects.GROUPS[axis].parameters, strict=True))
     return [
-        FreeParameter(full, 0.0, p.usual, -FARTHEST * p.usual, FARTHEST * p.usual)
+        FreeParameter(full, 0.0, p.usual, -MOST_USUAL_SIZES * p.usual, MOST_USUAL_SIZES * p.usual)
         for full, p in ((name(axis, t), known[name(axis, t)]) for t in terms)
     ]
 

@@ -19,8 +19,8 @@ from coax_env.model import inputs as U
 from coax_env.model import state as S
 from coax_env.model.layout import N_COMMANDS, N_FULL, PLACE, RATE, VELOCITY
 
-HEIGHT = 1.5  # [m] of the centre of gravity above ground
-CONTROL_PERIOD = 0.01  # [s]
+HEIGHT = 1.5  # [m] of the centre of gravity above ground; ours
+CONTROL_PERIOD = 0.01  # [s], the paper's
 
 _DEGREE = math.pi / 180.0
 
@@ -58,7 +58,7 @@ REWARD_WEIGHTS = {
 REWARD_TERMS = tuple(REWARD_WEIGHTS)
 N_TERMS = len(REWARD_TERMS)
 CRASHED_COST = 1000.0
-"""Cost of every step that an episode ended too early to fly."""
+"""Cost of every step that an episode ended too early to fly: more than any hover has; ours."""
 
 START = {
     "tilt": 5.0 * _DEGREE, "heading": 20.0 * _DEGREE, "rate": 10.0 * _DEGREE,
@@ -68,9 +68,9 @@ START = {
 
 LOWEST = 0.05  # [m] centre of gravity: the skids touch
 HIGHEST = 6.0  # [m] the sonar's range ends soon after
-FARTHEST = 25.0  # [m]
-FASTEST = 15.0  # [m/s]
-STEEPEST = 60.0 * _DEGREE
+FARTHEST = 25.0  # [m] from the start; ours
+FASTEST = 15.0  # [m/s]; ours
+STEEPEST = 60.0 * _DEGREE  # of the rotor axis from the vertical; ours
 
 NORTH, EAST, DOWN, HEADING = range(4)
 """Columns of a target [m, m, m, rad]: the state's x y z psi."""

@@ -39,11 +39,11 @@ from coax_env.model.layout import (
 )
 from coax_env.model.vehicle import Vehicle
 
-FARTHEST = 5.0
-"""Usual sizes that an effect may have at most."""
+MOST_USUAL_SIZES = 5.0
+"""Usual sizes that an effect may have at most; ours."""
 
-UNUSUAL = 2.5
-"""Usual sizes beyond which an effect's name is to be taken with care."""
+UNUSUAL_FROM = 2.5
+"""Usual sizes beyond which an effect's name is to be taken with care; ours."""
 
 GUST_LEVELS = ("force_xy", "force_z", "moment_xy", "moment_z")
 """Std of the gust states [N, N m]; x and y share one level."""
@@ -236,7 +236,7 @@ class HeliModel:
     def effect_parameters(effect: str) -> list[FreeParameter]:
         """An effect's parameters; the prior is centred on its off-value.
 
-        Nothing is taken to be more than FARTHEST usual sizes: beyond that it is another effect.
+        Nothing is taken to be more than MOST_USUAL_SIZES usual sizes: beyond that it is another effect.
         """
         entry = effects.CATALOGUE[effect]
         return [
@@ -244,8 +244,8 @@ class HeliModel:
                 full,
                 p.off,
                 p.usual,
-                max(p.lower, p.off - FARTHEST * p.usual),
-                min(p.upper, p.off + FARTHEST * p.usual),
+                max(p.lower, p.off - MOST_USUAL_SIZES * p.usual),
+                min(p.upper, p.off + MOST_USUAL_SIZES * p.usual),
                 p.probe,
                 entry.stage == effects.SENSOR,
             )

@@ -32,9 +32,9 @@ from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 
 HEADING = CHANNELS.index("psi")
-WARM_UP = 1.0  # s of filtering before the first start
-EVERY = 0.25  # s between starts
-TAIL = 0.15  # s before the horizon's end in which a reading counts as at it
+WARM_UP = 1.0  # [s] of filtering before the first start
+EVERY = 0.25  # [s] between starts
+TAIL = 0.15  # [s] before the horizon's end in which a reading counts as at it
 FLOOR_EVERY = 4  # starts; each floor takes as many flights as there are states
 COMPARED = ("p", "q", "r", "phi", "theta", "psi", "h", "vn", "ve", "vd", "pn", "pe", "v")
 """Channels of the gain: attitude, rates, velocity, position and height."""

@@ -16,8 +16,8 @@ from coax_env.errors import InputError
 
 UPDATE = 0.05
 """Seconds between the steps by which an input follows its sum of sines."""
-LOWEST = 0.2  # Hz
-HIGHEST = 2.5  # Hz: flapping and attitude answer below
+LOWEST = 0.2  # [Hz] ours: slower, and the machine drifts away
+HIGHEST = 2.5  # [Hz] flapping and attitude answer below
 
 
 def harmonics(

@@ -35,7 +35,7 @@ from study.store import code_hash
 GUSTS = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003, "memory": 0.5}
 """Std of the generator's gusts [N, N m] and their correlation time [s]."""
 
-SURE = 3.0
+SHOWN_FROM = 3.0
 """Thresholds that an effect of a flight of kind "many" must be expected to be worth on all its runs; a
 quarter of them is held out, and two are then left."""
 
@@ -135,7 +135,7 @@ def showing(planned: PlannedFlight, place: Path) -> tuple[PlannedFlight, Path, d
         shown = {
             effect: sizes
             for effect, sizes in planned.effects.items()
-            if (expected[effect] or 0.0) > SURE * SETTINGS.evidence
+            if (expected[effect] or 0.0) > SHOWN_FROM * SETTINGS.evidence
         }
         if len(shown) == len(planned.effects):
             return planned, folder, truth
