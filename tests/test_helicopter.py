@@ -11,10 +11,10 @@ import pytest
 
 from coax_env import load_vehicle
 from coax_env.estimation.helicopter import (
-    FARTHEST,
     GUST_LEVELS,
     HELD,
     LEAST_READING_STD,
+    MOST_USUAL_SIZES,
     WHITE_LEVELS,
     HeliModel,
     record_of,
@@ -266,6 +266,6 @@ def test_what_may_be_fitted_lies_within_its_bounds():
         for free, own in zip(MODEL.effect_parameters(name), entry.parameters, strict=True):
             assert own.lower <= free.lower <= own.off <= free.upper <= own.upper
             assert free.reading_only == (entry.stage == effects.SENSOR)
-            farthest = FARTHEST * own.usual
+            farthest = MOST_USUAL_SIZES * own.usual
             assert free.upper - own.off == pytest.approx(min(farthest, own.upper - own.off))
             assert own.off - free.lower == pytest.approx(min(farthest, own.off - own.lower))

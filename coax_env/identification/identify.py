@@ -27,6 +27,7 @@ from coax_env.estimation.prediction import RunReplay, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 from coax_env.identification.maximum_likelihood import (
+    OwnNumbers,
     RunEstimate,
     each_run,
     free_parameters,
@@ -170,25 +171,13 @@ def _by_maximum_likelihood(
     quadratic = Quadratic.of(lin, found.free, values)
     names = [f.name for f in found.free]
     inflation = np.array([quadratic.variance_inflation([name], names) for name in names])
-    covariance = found.estimate.covariance * np.sqrt(np.outer(inflation, inflation))
-    std = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    dt = median_step(engine.records)
-    where = flight.path.name if flight.path else "flight"
-    after = fitted_vehicle(
-        vehicle,
-        found.free,
-        found.estimate.values,
-        {f.name: with_timing(f, std[f.name], dt) for f in found.free},
-        covariance,
-        f"identified from {where} (maximum likelihood)",
-        flight,
-    )
+    after = _identified_vehicle(vehicle, found, inflation, median_step(engine.records), flight)
     report("flying the runs open loop")
     again = Engine(model, [record_of(run) for run in held.runs])
     return Identification(
         held,
         vehicle,
-        replace(after, description=f"{vehicle.description}; identified from {where}"),
+        after,
         tuple(names),
         found.estimate,
         found.noise,
@@ -199,6 +188,25 @@ def _by_maximum_likelihood(
         each_run(engine, found.free, lin, values, inflation),
         found.widened,
     )
+
+
+def _identified_vehicle(
+    vehicle: Vehicle, found: OwnNumbers, inflation: np.ndarray, dt: float, flight: Flight
+) -> Vehicle:
+    """The vehicle with what was found, its covariance inflated; `dt` seconds between rows."""
+    covariance = found.estimate.covariance * np.sqrt(np.outer(inflation, inflation))
+    stds = np.sqrt(np.diag(covariance)).tolist()
+    where = flight.path.name if flight.path else "flight"
+    after = fitted_vehicle(
+        vehicle,
+        found.free,
+        found.estimate.values,
+        {f.name: with_timing(f, std, dt) for f, std in zip(found.free, stds, strict=True)},
+        covariance,
+        f"identified from {where} (maximum likelihood)",
+        flight,
+    )
+    return replace(after, description=f"{vehicle.description}; identified from {where}")
 
 
 def _split(flight: Flight, hold_out: Collection[str]) -> tuple[Flight, Flight]:
