@@ -21,11 +21,29 @@ from scipy.linalg import schur
 
 from coax_env.env import hover
 from coax_env.env.actions import Nominal, action_map
+from coax_env.env.hover import DOWN, EAST, HEADING, HORIZONTAL, NORTH
 from coax_env.env.period import DT
 from coax_env.errors import InputError
 from coax_env.kernel.angles import wrap_angle, wrap_angles
 from coax_env.kernel.compilation import compiled
-from coax_env.model.layout import CHANNELS, FULL_STATES, N_COMMANDS
+from coax_env.model import inputs as U
+from coax_env.model import state as S
+from coax_env.model.layout import (
+    ACTUATORS,
+    CHANNELS,
+    FLYBAR,
+    FULL_STATES,
+    GUST_FORCE,
+    GUSTS,
+    LOWER_FLAP,
+    N_COMMANDS,
+    N_FULL,
+    PLACE,
+    RATE,
+    ROTOR_SPEED,
+    SWASH,
+    VELOCITY,
+)
 from coax_env.model.linear import sampled
 from coax_env.model.sampling import is_new
 from coax_env.model.sensors import BASE_RATE, Sensor, slow_instruments, suite
@@ -33,7 +51,7 @@ from coax_env.model.vehicle import Vehicle
 from controllers.feedback import Feedback
 from controllers.target import TargetView, turned
 
-DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; not the fly-bar's, from which it must be told
+DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; unlike the fly-bar's, to be distinguished
 FORCE_SHARE = 0.05  # std of the disturbing force, of the weight
 MOMENT_ARM = 0.002  # [m] std of the disturbing roll and pitch moment, of the weight
 TORQUE_SHARE = 0.07  # std of the disturbing yaw moment, of one rotor's torque
@@ -52,7 +70,7 @@ _PAIRS = (("vn", "ve"), ("pn", "pe"), ("x", "y"))
 """Horizontal pairs, which are turned into the heading before use: the design is for psi = 0."""
 _NAMES = (*(name for name, _ in FULL_STATES), *(f"bias_{name}" for name in BIAS_STD))
 _UNITS = dict(FULL_STATES)
-_N_FULL = len(FULL_STATES)
+_BIASES = slice(N_FULL, None)
 _SPEED = CHANNELS.index("v")  # the unsigned one, not the state
 
 
@@ -136,19 +154,24 @@ class EstimatorDesign:
 def design_estimator(
     vehicle: Vehicle, nominal: Nominal = None, sensors: str = "onboard"
 ) -> EstimatorDesign:
-    """The filter for a vehicle and a sensor suite. A pure servo delay is taken as a lag."""
+    """The filter for a vehicle and a sensor suite. A pure servo delay is taken as a lag.
+
+    Args:
+        vehicle: the filter is designed on. sensors: name of the suite.
+        nominal: whose trim and scale the actions have, see `action_map`.
+    """
     used = [s for s in suite(sensors, vehicle) if s.index != _SPEED]  # |V| has no slope at hover
     A_flown, B_flown, C_channels, D_channels, x_trim, u_trim = sampled(delay_as_lag(vehicle), DT)
     A, B = np.eye(len(_NAMES)), np.zeros((len(_NAMES), N_COMMANDS))
-    A[:_N_FULL, :_N_FULL], B[:_N_FULL] = A_flown, B_flown
-    A[20:26, 20:26] = np.eye(6) * math.exp(-DT / DISTURBANCE_MEMORY)
-    A[_N_FULL:, _N_FULL:] *= math.exp(-DT / BIAS_MEMORY)
+    A[:N_FULL, :N_FULL], B[:N_FULL] = A_flown, B_flown
+    A[GUSTS, GUSTS] = np.eye(6) * math.exp(-DT / DISTURBANCE_MEMORY)
+    A[N_FULL:, N_FULL:] *= math.exp(-DT / BIAS_MEMORY)
     # readings of the channels, then, for the suite ``state``, the states as they are
-    C_all = np.eye(len(CHANNELS) + _N_FULL, len(_NAMES), k=-len(CHANNELS))
-    C_all[: len(CHANNELS), :_N_FULL] = C_channels
+    C_all = np.eye(len(CHANNELS) + N_FULL, len(_NAMES), k=-len(CHANNELS))
+    C_all[: len(CHANNELS), :N_FULL] = C_channels
     for k, name in enumerate(BIAS_STD):
-        C_all[CHANNELS.index(name), _N_FULL + k] = 1.0
-    D_all = np.vstack([D_channels, np.zeros((_N_FULL, N_COMMANDS))])
+        C_all[CHANNELS.index(name), N_FULL + k] = 1.0
+    D_all = np.vstack([D_channels, np.zeros((N_FULL, N_COMMANDS))])
     rows = [s.index for s in used]
     y_trim = np.concatenate([_trim_readings(vehicle, x_trim, u_trim), x_trim])[rows]
 
@@ -206,7 +229,7 @@ def integrated_readings(design: EstimatorDesign) -> dict[str, float]:
 class Tracker:
     """The running filter, for one helicopter or many, and the integrals of some readings.
 
-    In every control period: `see` the observation, then tell what was done with `acted`. Where the
+    In every control period: `see` the observation, then report what was done with `acted`. Where the
     observation has a target, all is relative to it (controllers/target.py).
     """
 
@@ -226,7 +249,7 @@ class Tracker:
         self._turn = design.index("psi") if "psi" in design.states else -1
         self.offset = design.action_trim - design.command_trim
         self._first = np.zeros(len(design.states))
-        for k, name in enumerate(_NAMES[16:20]):
+        for k, name in enumerate(_NAMES[ACTUATORS]):
             if name in design.states:
                 self._first[design.index(name)] = self.offset[k]
         self._A, self._B, self._C, self._D, self._first_gain, self._gains = (
@@ -253,7 +276,7 @@ class Tracker:
     def see(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
         """Take in observations (count, n_obs), only in the rows of a mask where one is given.
 
-        A reading that is no finite number tells nothing, and changes nothing.
+        A reading that is no finite number carries no information, and changes nothing.
 
         Returns:
             what is known, (count, n + i): the estimate and the integrals.
@@ -275,13 +298,13 @@ class Tracker:
         """Observations from the point asked for; where that has moved, the estimate moves too."""
         seen, asked, there = self._view.relative_to_target(observations)
         moved = np.where((self._rows > 0)[:, None], asked - self._asked, 0.0)[which]
-        heading = asked[which, 3] + seen[which, self._view.names.index("psi")]
-        forward, right = turned(moved[:, :2], -heading).T
+        heading = asked[which, HEADING] + seen[which, self._view.names.index("psi")]
+        forward, right = turned(moved[:, HORIZONTAL], -heading).T
         changes = {
             "x": forward,
             "y": right,
-            "z": moved[:, 2],
-            "psi": wrap_angles(moved[:, 3]),
+            "z": moved[:, DOWN],
+            "psi": wrap_angles(moved[:, HEADING]),
         }
         for name, change in changes.items():
             if name in self.design.states:
@@ -369,13 +392,14 @@ def _correct(
                 y[heading] = expected[heading] + trim[heading]
             cosine, sine = math.cos(y[heading]), math.sin(y[heading])
             for j in range(len(pairs)):
-                north, east = y[pairs[j, 0]], y[pairs[j, 1]]
-                y[pairs[j, 0]] = cosine * north + sine * east
-                y[pairs[j, 1]] = cosine * east - sine * north
+                a, b = pairs[j, NORTH], pairs[j, EAST]
+                north, east = y[a], y[b]
+                y[a] = cosine * north + sine * east
+                y[b] = cosine * east - sine * north
         gain = first_gain[0] if rows[i] == 0 else gains[rows[i] % len(gains)]
         for k in range(m):
             y[k] -= trim[k]
-            if not math.isfinite(y[k]):  # a reading that is no number tells nothing
+            if not math.isfinite(y[k]):  # no number, no information
                 y[k] = expected[k]
                 continue
             if k == heading:
@@ -394,7 +418,7 @@ def _predict(command, A_by_state, B_by_command, turn, state):
     """Move states (count, n) on by one control period, in place: x = A x + B du.
 
     The heading, state number `turn` (-1: none), stays within -pi .. pi: whatever a compass has made
-    of it, nobody shall fly a whole turn back.
+    of it, no controller is to fly a whole turn back.
     """
     before = np.empty(state.shape[1])
     for i in range(len(state)):
@@ -413,37 +437,42 @@ def _trim_readings(vehicle: Vehicle, x: np.ndarray, u: np.ndarray) -> np.ndarray
     return np.array([found[name] for name in CHANNELS])
 
 
+def _growth(memory: float) -> float:
+    """What a state of this memory [s] and unit std gains in a control period, as a std."""
+    return math.sqrt(1.0 - math.exp(-2.0 * DT / memory))
+
+
 def _spreads(vehicle: Vehicle, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Std of every full state at a flight's start, and of what one period adds to it."""
     values = vehicle.values()
     weight = values["mass"] * values["gravity"]
     k_Q = values["air_density"] * math.pi * values["rotor_radius"] ** 5
-    torque = values["torque_coefficient_upper"] * k_Q * command[0] ** 2
+    torque = values["torque_coefficient_upper"] * k_Q * command[U.OMEGA_U] ** 2
     first = np.array([_FIRST_STD.get(_UNITS.get(n, ""), 1.0) for n in _NAMES])
     process = np.array([_PROCESS_STD.get(_UNITS.get(n, ""), 0.0) for n in _NAMES])
     start = hover.START
-    first[0:3] = start["velocity"] / math.sqrt(3.0)
-    first[3:6] = start["rate"] / math.sqrt(3.0)
-    first[6:10] = 0.01
-    first[10:12] = start["tilt"] / math.sqrt(3.0)
-    first[12] = start["heading"] / math.sqrt(3.0)
-    first[15] = start["height"] / math.sqrt(3.0)
-    first[13:15] = 0.01
-    first[16:20] = 1e-3
-    first[20:23] = FORCE_SHARE * weight
-    first[23:25] = MOMENT_ARM * weight
-    first[25] = TORQUE_SHARE * torque
-    process[16:18], process[18:20] = 0.2, 1e-4
-    first[26:] = list(BIAS_STD.values())
-    process[26:] = first[26:] * math.sqrt(1.0 - math.exp(-2.0 * DT / BIAS_MEMORY))
-    process[20:26] = first[20:26] * math.sqrt(1.0 - math.exp(-2.0 * DT / DISTURBANCE_MEMORY))
+    first[VELOCITY] = start["velocity"] / math.sqrt(3.0)
+    first[RATE] = start["rate"] / math.sqrt(3.0)
+    first[LOWER_FLAP] = first[FLYBAR] = 0.01
+    first[[S.PHI, S.THETA]] = start["tilt"] / math.sqrt(3.0)
+    first[S.PSI] = start["heading"] / math.sqrt(3.0)
+    first[S.Z] = start["height"] / math.sqrt(3.0)
+    first[PLACE] = 0.01
+    first[ACTUATORS] = 1e-3
+    first[GUST_FORCE] = FORCE_SHARE * weight
+    first[[S.GUST_L, S.GUST_M]] = MOMENT_ARM * weight
+    first[S.GUST_N] = TORQUE_SHARE * torque
+    first[_BIASES] = list(BIAS_STD.values())
+    process[ROTOR_SPEED], process[SWASH] = 0.2, 1e-4
+    process[_BIASES] = first[_BIASES] * _growth(BIAS_MEMORY)
+    process[GUSTS] = first[GUSTS] * _growth(DISTURBANCE_MEMORY)
     return first, process
 
 
 def _unobserved(
     A: np.ndarray, C: np.ndarray, first: np.ndarray, noise: np.ndarray
 ) -> tuple[str, ...]:
-    """States whose error the readings never show and time does not heal.
+    """States whose error the readings never show and that does not decay.
 
     From the information matrix sum (A^k)' C' R^-1 C A^k of five seconds, with states in units of
     their first std: its directions with next to no information that do not decay by themselves,
@@ -493,8 +522,8 @@ def _gains(
 def _gain(P: np.ndarray, C: np.ndarray, R: np.ndarray, new: np.ndarray) -> np.ndarray:
     K = np.zeros((len(P), len(C)))
     C_new = C[new]
-    S = C_new @ P @ C_new.T + R[np.ix_(new, new)]
-    K[:, new] = np.linalg.solve(S, C_new @ P).T
+    innovation = C_new @ P @ C_new.T + R[np.ix_(new, new)]
+    K[:, new] = np.linalg.solve(innovation, C_new @ P).T
     return K
 
 

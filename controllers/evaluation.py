@@ -199,7 +199,7 @@ class _Totals:
             return
         if self.place is None:
             self.place = states[:, PLACE].copy()
-        place = self.place if self.task == "hover" else targets[:, 0:2]
+        place = self.place if self.task == "hover" else targets[:, hover.HORIZONTAL]
         errors = hover.squared_errors(states, targets)
         for name, total in self.squares.items():
             total += np.where(finite, errors[name], 0.0)

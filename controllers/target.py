@@ -12,6 +12,8 @@ import math
 import numpy as np
 
 from coax_env.env import hover, tasks
+from coax_env.env.hover import DOWN, HEADING, HORIZONTAL
+from coax_env.env.tasks import FORWARD, RIGHT, TURN, UP
 from coax_env.model.sensors import slow_instruments, suite
 
 REACH = {"place": 0.5, "height": 0.15, "heading": math.radians(10.0)}
@@ -59,21 +61,21 @@ class TargetView:
         seen = np.array(observations[:, : self.width], dtype=float)
         way = np.array(observations[:, self.width :], dtype=float)
         whole = way.copy()
-        distance = np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
-        way[:, :2] *= np.minimum(1.0, REACH["place"] / distance)[:, None]
-        way[:, 2] = np.clip(way[:, 2], -REACH["height"], REACH["height"])
-        way[:, 3] = np.clip(way[:, 3], -REACH["heading"], REACH["heading"])
+        distance = np.maximum(np.hypot(way[:, FORWARD], way[:, RIGHT]), 1e-9)
+        way[:, HORIZONTAL] *= np.minimum(1.0, REACH["place"] / distance)[:, None]
+        way[:, UP] = np.clip(way[:, UP], -REACH["height"], REACH["height"])
+        way[:, TURN] = np.clip(way[:, TURN], -REACH["heading"], REACH["heading"])
         x, y, z, psi = self._places
         heading = seen[:, psi].copy()
         setpoint = np.empty((len(seen), 4))
-        setpoint[:, :2] = seen[:, [x, y]] + turned(way[:, :2], heading)
-        setpoint[:, 2] = -self._up * seen[:, z] - way[:, 2]
-        setpoint[:, 3] = heading + way[:, 3]
-        seen[:, psi] = -way[:, 3]
-        seen[:, [x, y]] = -turned(way[:, :2], seen[:, psi])
-        seen[:, z] = self._up * (hover.HEIGHT - way[:, 2])
+        setpoint[:, HORIZONTAL] = seen[:, [x, y]] + turned(way[:, HORIZONTAL], heading)
+        setpoint[:, DOWN] = -self._up * seen[:, z] - way[:, UP]
+        setpoint[:, HEADING] = heading + way[:, TURN]
+        seen[:, psi] = -way[:, TURN]
+        seen[:, [x, y]] = -turned(way[:, HORIZONTAL], seen[:, psi])
+        seen[:, z] = self._up * (hover.HEIGHT - way[:, UP])
         if self._speed:
-            seen[:, self._speed] = turned(seen[:, self._speed], -setpoint[:, 3])
+            seen[:, self._speed] = turned(seen[:, self._speed], -setpoint[:, HEADING])
         return seen, setpoint, (way == whole).all(axis=1)
 
 

@@ -106,7 +106,13 @@ class FleetVecEnv(_base.VecEnv):  # type: ignore[name-defined]
     def report_ends(
         self, infos: list[dict[str, Any]], which: np.ndarray, by_time: np.ndarray, last: np.ndarray
     ) -> None:
-        """What Stable-Baselines3 wants to know of the flights that have ended, into their `infos`."""
+        """What Stable-Baselines3 wants to know of the flights that have ended, into their `infos`.
+
+        Args:
+            infos: one of each env, in place. which: those that have ended, (n,) bool.
+            by_time: those that the time limit ended, (n,) bool.
+            last: their last observations, (n, n_obs).
+        """
         for i in np.flatnonzero(which).tolist():
             infos[i] = {
                 "terminal_observation": last[i],
@@ -131,7 +137,11 @@ class FleetVecEnv(_base.VecEnv):  # type: ignore[name-defined]
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the batch: it holds for all envs."""
+        """Set an attribute of the batch: it holds for all envs.
+
+        Args:
+            attr_name: of the batch. value: its new value. indices: not looked at.
+        """
         setattr(self.env, attr_name, value)
 
     def env_method(

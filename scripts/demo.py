@@ -1,8 +1,8 @@
 """The main job on a bundled flight: where the simulation is wrong, why, and what correcting it gains.
 
 The bundled flight is synthetic: an independent simulator flew it with effects hidden in it, and
-truth.json beside it says which. Where ../shared/flights/skybotix_coax is present, real flights of a
-real helicopter follow.
+truth.json beside it says which. Where recorded flights of a Skybotix CoaX are
+present, they follow.
 """
 
 import json

@@ -122,7 +122,12 @@ class Flying:
         return actions
 
     def check(self, what: str, values: np.ndarray, low: Any, high: Any) -> None:
-        """Raise a Fault where a value is not a number, or out of bounds."""
+        """Raise a Fault where a value is not a number, or out of bounds.
+
+        Args:
+            what: name of the values in the message. values: any shape.
+            low, high: bounds, broadcast against the values.
+        """
         fine = (values >= low) & (values <= high)  # false for NaN
         if not fine.all():
             place = tuple(int(i) for i in np.argwhere(~fine)[0])
@@ -158,6 +163,10 @@ def fly(
     steps: int, envs: int, seed: int, flown: Callable[[int], object] = lambda rows: None
 ) -> list[dict[str, Any]]:
     """Fly so many steps in all, every world its share.
+
+    Args:
+        steps: of all rows together. envs: rows flown at once. seed: of the first world.
+        flown: called with the number of rows after every step.
 
     Raises:
         Fault: a number that is not finite or out of bounds.

@@ -78,9 +78,9 @@ async def _visit(path: Path, look: Callable[[Page], Awaitable[Any]]) -> Any:
         page = Page(await browser.create_tab("about:blank"))
 
         async def fault(message: dict[str, Any]) -> None:
-            told = message["params"]
-            if told.get("type") in (None, "error", "warning", "assert"):
-                page.faults.append(str(told))
+            parameters = message["params"]
+            if parameters.get("type") in (None, "error", "warning", "assert"):
+                page.faults.append(str(parameters))
 
         async def request(message: dict[str, Any]) -> None:
             url = message["params"]["request"]["url"]

@@ -23,7 +23,7 @@ _PRIOR = {
 
 
 def say_what_was_found(findings: Mapping[str, Any]) -> dict[str, Any]:
-    """Effect -> what it cannot be told from, and its parameters."""
+    """Effect -> what it is confounded with, and its parameters."""
     return {
         cause["effect"]: [cause["confusable_with"], cause["parameters"]]
         for cause in findings["causes"]

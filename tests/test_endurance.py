@@ -35,9 +35,15 @@ def test_a_fault_is_seen(column, what, monkeypatch):
 
     def spoilt(actions):
         observation, reward, terminated, truncated, info = keep(actions)
-        told = {"observation": observation, "state": info["state"].copy()}
-        told[what][5, column] = np.nan
-        return told["observation"], reward, terminated, truncated, info | {"state": told["state"]}
+        results = {"observation": observation, "state": info["state"].copy()}
+        results[what][5, column] = np.nan
+        return (
+            results["observation"],
+            reward,
+            terminated,
+            truncated,
+            info | {"state": results["state"]},
+        )
 
     monkeypatch.setattr(flying.env, "step", spoilt)
     with pytest.raises(

@@ -321,20 +321,20 @@ def test_disabled_autoreset_leaves_ended_rows_until_asked():
 @pytest.mark.parametrize("n", [3, 11])  # one by one, and in lanes
 def test_states_once_told_stay_as_they_were(mode, n):
     env = CoaxVectorEnv(n, max_episode_steps=30, autoreset_mode=mode)
-    told = [env.reset(seed=0)[1]["state"]]
-    copies = [told[0].copy()]
+    states = [env.reset(seed=0)[1]["state"]]
+    copies = [states[0].copy()]
     for action in actions(0, 80, n, 4):
         *_, truncated, info = env.step(action)
-        told.append(info["state"])
+        states.append(info["state"])
         if "final_info" in info:
-            told.append(info["final_info"]["state"])
-        copies += [state.copy() for state in told[len(copies) :]]
+            states.append(info["final_info"]["state"])
+        copies += [state.copy() for state in states[len(copies) :]]
         if mode == AutoresetMode.DISABLED and truncated.any():
             env.reset(options={"reset_mask": truncated})
-    assert all(np.array_equal(*pair) for pair in zip(copies, told, strict=True))
-    assert not np.array_equal(told[0], told[1])
+    assert all(np.array_equal(*pair) for pair in zip(copies, states, strict=True))
+    assert not np.array_equal(states[0], states[1])
     with pytest.raises(ValueError, match="read-only"):
-        told[-1][0] = 0.0
+        states[-1][0] = 0.0
 
 
 def test_the_action_is_centred_on_the_nominal_vehicle_whatever_flies():

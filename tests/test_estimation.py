@@ -207,7 +207,7 @@ def test_records_add_up():
 
 
 def test_the_clock_may_start_anywhere():
-    """A log that begins in the middle of a flight: same likelihood, slopes and stretches."""
+    """A log that begins in the middle of a flight: same likelihood, slopes and blocks."""
     record = with_holes(swing(4), 0.2, 6)
     found = []
     for start in (0.0, 137.0):
@@ -492,9 +492,9 @@ def test_a_run_without_readings_has_no_signature(parameter):
     silent = replace(record, z=np.full_like(record.z, np.nan))
     both, alone = Engine(Pendulum(), [record, silent]), Engine(Pendulum(), [record])
     _, lin = both.linearise(TRUTH, NOISE, [parameter])
-    _, heard = alone.linearise(TRUTH, NOISE, [parameter])
-    assert heard.information[0, 0, 0] > 0.0
-    assert lin.information[0] == pytest.approx(heard.information[0])
+    _, linearised = alone.linearise(TRUTH, NOISE, [parameter])
+    assert linearised.information[0, 0, 0] > 0.0
+    assert lin.information[0] == pytest.approx(linearised.information[0])
     assert not lin.information[1].any()
 
 

@@ -150,8 +150,8 @@ def test_gains_act_on_what_is_new_in_their_row(onboard):
     assert len(onboard.gains) == 10, "40 Hz and 100 Hz meet every ten rows, 20 and 10 Hz too"
     for row, gain in enumerate(onboard.gains):
         for k, name in enumerate(onboard.readings):
-            told = bool(is_new(row + 10, rates[name])) and not name.startswith("rpm")
-            assert gain[:, k].any() == told, (row, name)  # a rotor without lag is its command
+            has_sample = bool(is_new(row + 10, rates[name])) and not name.startswith("rpm")
+            assert gain[:, k].any() == has_sample, (row, name)  # a rotor without lag is its command
 
 
 def test_the_errors_of_the_linear_system_have_the_spread_that_is_stated(onboard, spreads):

@@ -93,9 +93,9 @@ def test_a_wrong_unit_or_sign_is_suspected(what):
     factors, words = PLANTED[what]
     flight = flown("heading_turn", "climb_descend", "lon_3211", "lat_3211")
     assert suspicions(flight) == ""
-    told = suspicions(changed(flight, **factors))
+    found = suspicions(changed(flight, **factors))
     for word in words:
-        assert word in told, told
+        assert word in found, found
 
 
 def test_a_frozen_and_a_saturated_sensor_are_told():
@@ -106,10 +106,10 @@ def test_a_frozen_and_a_saturated_sensor_are_told():
     flight = Flight(
         "lama400d", (replace(run, measured={**run.measured, "p": still, "az": limited}),)
     )
-    told = suspicions(flight)
-    assert "p reads one and the same value for 2.0 s" in told
-    assert "az stands at its extreme value" in told
-    assert "frozen" not in told.replace("p reads", "", 1).partition("frozen")[2]
+    found = suspicions(flight)
+    assert "p reads one and the same value for 2.0 s" in found
+    assert "az stands at its extreme value" in found
+    assert "frozen" not in found.replace("p reads", "", 1).partition("frozen")[2]
 
 
 # --- what can be learned --------------------------------------------------------------------------
@@ -117,7 +117,7 @@ def test_a_frozen_and_a_saturated_sensor_are_told():
 
 @pytest.mark.slow
 def test_what_is_not_excited_stays_hidden():
-    """At one height nothing tells ground effect from a constant; a descent to the ground does."""
+    """At one height ground effect and a constant are confounded; a descent separates them."""
     hover = {e.effect: e for e in checked("hover").effects}
     both = {e.effect: e for e in checked("hover", "low_hover").effects}
     assert hover["ground_effect"].verdict == "hidden"
@@ -127,7 +127,7 @@ def test_what_is_not_excited_stays_hidden():
 
 
 def test_more_flight_tells_more(monkeypatch):
-    """Information adds up: the same run twice tells twice as much, where no noise level is fitted."""
+    """Information adds up: the same run twice has twice of it, where no noise level is fitted."""
 
     def as_given(problem: Problem, noise: Noise) -> Fit:
         off = {f.name: f.value for f in problem.parameters}

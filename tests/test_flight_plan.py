@@ -5,7 +5,7 @@ import pytest
 
 from coax_env import identify, load_vehicle, read_flight, simulate
 from coax_env.design.candidates import Envelope
-from coax_env.design.flight_plan import plan_flight, stirring, write_plan
+from coax_env.design.flight_plan import multisine_maneuvers, plan_flight, write_plan
 from coax_env.errors import InputError
 from coax_env.simulation.multisine import UPDATE, harmonics, multisines, relative_peak_factor
 from coax_env.simulation.simulate import fly
@@ -44,7 +44,7 @@ def test_a_record_too_short_for_its_inputs_is_refused():
 
 
 def test_all_inputs_are_stirred_by_the_multisine():
-    for option in stirring():
+    for option in multisine_maneuvers():
         flown = fly(LAMA, option, dt=0.02)
         assert not flown.ended and set(option.injected) == {
             "collective", "differential", "delta_lon", "delta_lat",
@@ -63,7 +63,7 @@ def test_what_is_learned_decides_what_is_flown():
 
 @pytest.mark.slow
 def test_the_expected_std_is_what_identification_then_reports(tmp_path):
-    """Promised before, kept after: fly the plan with noise and identify."""
+    """Expected before, found after: fly the plan with noise and identify."""
     plan = plan_flight(LAMA, ["flap_time_constant", "swash_to_flap"], runs=3)
     folder = write_plan(plan, tmp_path / "plan")
     assert len(read_flight(folder).runs) == 3 and (folder / "asked_03.csv").exists()

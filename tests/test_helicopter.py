@@ -1,4 +1,4 @@
-"""The helicopter as the engine sees it: noise levels, first states, late inputs, the commands' news.
+"""The helicopter as the engine sees it: noise, first states, delayed inputs, innovations.
 
 Variances follow from stationary processes, delays from the command's own integral, first states from
 readings that were made up here.
@@ -11,10 +11,10 @@ import pytest
 
 from coax_env import load_vehicle
 from coax_env.estimation.helicopter import (
-    FARTHEST,
     GUST_LEVELS,
     HELD,
     LEAST_READING_STD,
+    MOST_USUAL_SIZES,
     WHITE_LEVELS,
     HeliModel,
     record_of,
@@ -130,14 +130,14 @@ def test_what_is_not_measured_starts_anywhere_a_hover_can_be():
 # --- inputs ---------------------------------------------------------------------------------------
 
 
-def test_inputs_are_commands_time_and_news():
+def test_inputs_are_commands_time_and_innovations():
     one = record()
     u = MODEL.inputs(one, LAMA.vector)
     assert np.array_equal(u[:, :4], one.command)
     np.testing.assert_allclose(u[:, 4], one.t - 4.0)
-    news = np.random.default_rng(0).standard_normal((one.t.size, 4))
-    heard = Record(one.name, one.t, one.command, one.z, one.origin, news)
-    assert np.array_equal(MODEL.inputs(heard, LAMA.vector), np.hstack([u, news]))
+    innovations = np.random.default_rng(0).standard_normal((one.t.size, 4))
+    with_innovations = Record(one.name, one.t, one.command, one.z, one.origin, innovations)
+    assert np.array_equal(MODEL.inputs(with_innovations, LAMA.vector), np.hstack([u, innovations]))
 
 
 @pytest.mark.parametrize("delay", [0.007, 0.02, 0.05, 0.063])
@@ -156,7 +156,7 @@ def test_a_late_command_is_its_mean_over_the_row(delay):
 
 
 @pytest.mark.parametrize("gain", P.COMMAND_GAINS)
-def test_news_corrects_the_states_it_tells_of(gain):
+def test_an_input_innovation_corrects_its_states(gain):
     """Tilts: a pilot who pulls (lon > 0, tilts back) has seen the nose low, or a push forward."""
     taken = {  # state -> how it takes (upper, lower, lon, lat)
         "command_gain.rate_xy": {"p": (0, 0, 0, 1), "q": (0, 0, 1, 0)},
@@ -170,25 +170,25 @@ def test_news_corrects_the_states_it_tells_of(gain):
     rng = np.random.default_rng(2)
     x, work, out = 0.1 * rng.standard_normal(26), np.zeros(dynamics.WORK_SIZE), np.zeros(26)
     x[16:18] = 210.0
-    command, news = np.array([210.0, 220.0, 0.02, -0.01]), rng.standard_normal(4)
+    command, innovations = np.array([210.0, 220.0, 0.02, -0.01]), rng.standard_normal(4)
     vector = MODEL.vector({gain: 0.01})
-    told = x.copy()
+    corrected = x.copy()
     for state, weights in taken.items():
-        told[X[state]] += 0.01 * np.dot(weights, news)
+        corrected[X[state]] += 0.01 * np.dot(weights, innovations)
     expected = np.zeros(26)
-    dynamics.step(told, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
-    heard = np.append(dynamics.kernel_input(command), news)
-    MODEL.step.__wrapped__(x, heard, 0.01, vector, work, out)
+    dynamics.step(corrected, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
+    u_with_innovations = np.append(dynamics.kernel_input(command), innovations)
+    MODEL.step.__wrapped__(x, u_with_innovations, 0.01, vector, work, out)
     np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-14)
-    # the drift says the same to first order: what is heard comes on top of what is flown
+    # the drift is the same to first order: the correction comes on top of what is flown
     both, flown = np.zeros((2, 26 + len(CHANNELS)))
-    MODEL.drift_and_readings.__wrapped__(x, heard, 0.01, vector, work, both)
+    MODEL.drift_and_readings.__wrapped__(x, u_with_innovations, 0.01, vector, work, both)
     dynamics.drift_and_readings(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, flown)
-    heeded = both - flown
-    np.testing.assert_allclose(heeded[:26], told - x, rtol=1e-9, atol=1e-13)
-    assert not heeded[26:].any()
+    drift = both - flown
+    np.testing.assert_allclose(drift[:26], corrected - x, rtol=1e-9, atol=1e-13)
+    assert not drift[26:].any()
     # and who hears nothing flies the kernel's own step
-    MODEL.step.__wrapped__(x, heard[:5].copy(), 0.01, vector, work, out)
+    MODEL.step.__wrapped__(x, u_with_innovations[:5].copy(), 0.01, vector, work, out)
     dynamics.step(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
     assert np.array_equal(out, expected)
 
@@ -266,6 +266,6 @@ def test_what_may_be_fitted_lies_within_its_bounds():
         for free, own in zip(MODEL.effect_parameters(name), entry.parameters, strict=True):
             assert own.lower <= free.lower <= own.off <= free.upper <= own.upper
             assert free.reading_only == (entry.stage == effects.SENSOR)
-            farthest = FARTHEST * own.usual
+            farthest = MOST_USUAL_SIZES * own.usual
             assert free.upper - own.off == pytest.approx(min(farthest, own.upper - own.off))
             assert own.off - free.lower == pytest.approx(min(farthest, own.off - own.lower))

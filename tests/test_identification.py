@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from coax_env import identify, load_vehicle, simulate
 from coax_env.errors import InputError
 from coax_env.estimation.helicopter import HeliModel
-from coax_env.estimation.prediction import fly_again, pooled_rms
+from coax_env.estimation.prediction import pooled_rms, replay_runs
 
 LAMA = load_vehicle("lama400d")
 AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
@@ -48,7 +48,7 @@ def test_from_a_file_with_every_number_a_fifth_off(flight, factors):
     assert ratio == pytest.approx(exact, rel=0.01)
     predicted = pooled_rms(result.replay_after)
     engine = _engine(flight)
-    best = pooled_rms(fly_again(engine, HeliModel(LAMA).bare_values, result.noise))
+    best = pooled_rms(replay_runs(engine, HeliModel(LAMA).bare_values, result.noise))
     for channel, rms in predicted.items():
         assert rms < 1.1 * best[channel], channel  # four runs; twelve give 1.05
 

@@ -17,7 +17,7 @@ from coax_env.diagnosis.input_innovations import (
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation import kalman
 from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
-from coax_env.estimation.prediction import fly_again
+from coax_env.estimation.prediction import replay_runs
 from coax_env.model import parameters as P
 from coax_env.model.layout import CHANNELS, GUSTS
 from coax_env.model.vehicle_file import load_vehicle
@@ -79,9 +79,9 @@ def test_a_replay_has_no_innovations_in_its_open_loop(tmp_path):
     injector.fly(tmp_path, {}, gusts=True, sensors="onboard", seed=5, runs=("hover",))
     problem, fit = problem_on(tmp_path)
     engine = with_input_innovations(problem.engine, fit)
-    plain, same = (fly_again(e, fit.values, fit.noise)[0] for e in (problem.engine, engine))
+    plain, same = (replay_runs(e, fit.values, fit.noise)[0] for e in (problem.engine, engine))
     gains = {**fit.values, "command_gain.moment_xy": 5e-3}
-    moved = fly_again(engine, gains, fit.noise)[0]
+    moved = replay_runs(engine, gains, fit.noise)[0]
     (run,) = engine.filter(gains, fit.noise)
     for channel in ("phi", "h"):
         np.testing.assert_array_equal(plain.channels[channel].predicted,

@@ -43,7 +43,7 @@ def alternative(effect: str, base_free: bool = True, **values: float) -> Alterna
 def tied_on_a_hover(
     truth, effects: tuple[str, ...], common: tuple[str, ...], gusts: Gusts
 ) -> tuple[list[Alternative], Noise, dict[str, float]]:
-    """Both descriptions fitted to one windy hover, with what it told of their numbers."""
+    """Both descriptions fitted to one windy hover, with what it determined of their numbers."""
     flight = simulate(truth, maneuver("hover", duration=12.0), gusts=gusts, seed=3)
     records = [record_of(run) for run in flight.runs]
     problem = Problem.of(MODEL, records, (*effects, *common))
@@ -77,7 +77,7 @@ def test_a_model_is_no_distance_from_itself():
 def test_a_scale_error_of_the_accelerometer_in_closed_form():
     """Bias for scale: what stays of az is its scatter times the scale error, sample by sample.
 
-    With nothing else free the half square of it is the distance, up to what the gust states soak up.
+    With nothing else free the half square of it is the distance, up to what the gust states absorb.
     """
     scale = 0.03
     truth = alternative("accel_scale", base_free=False, z=scale)

@@ -17,10 +17,10 @@ from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.prediction import (
     ChannelReplay,
     RunReplay,
-    fly_again,
     gusts_of,
     pooled_rms,
     replay,
+    replay_runs,
     rms,
     run_table,
 )
@@ -57,7 +57,7 @@ def flown(record: Record, noise: Noise = NOISE, horizon: float = 1.0, heavier: f
     """The record's replay by the bare model, its mass so much too large."""
     engine = Engine(HeliModel(LAMA), [record])
     values = {"mass": LAMA["mass"].value * (1.0 + heavier), "gust_memory": MEMORY}
-    (run,) = fly_again(engine, values, noise, horizon, **more)
+    (run,) = replay_runs(engine, values, noise, horizon, **more)
     assert not run.diverged
     return run
 
@@ -164,7 +164,7 @@ def test_the_floor_is_the_start_flown_forward():
 
 def test_a_model_without_a_likelihood_has_diverged():
     engine = Engine(HeliModel(LAMA), [hover()])
-    (run,) = fly_again(engine, {"inertia_xx": 1e-7}, NOISE, 1.0)
+    (run,) = replay_runs(engine, {"inertia_xx": 1e-7}, NOISE, 1.0)
     assert run.diverged
 
 

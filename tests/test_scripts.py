@@ -1,4 +1,4 @@
-"""The scripts as a user runs them: help, bad input in one line and exit code 2, results where told.
+"""The scripts as a user runs them: help, bad input in one line with exit code 2, results where asked.
 
 A process of its own costs seconds of imports, so most calls run the script's file inside this one;
 each kind of refusal is also seen once from outside.
@@ -289,7 +289,7 @@ def test_diagnose_writes_what_the_contract_says(tmp_path):
 
 @pytest.mark.slow
 def test_diagnose_writes_the_next_flight_of_a_tie(tmp_path):
-    """A hover cannot tell a scale error of az from a bias; a second diagnosis replaces the first."""
+    """On a hover a scale of az is confounded with a bias; a second diagnosis replaces the first."""
     flight = injector.fly(tmp_path / "flight", {"accel_scale": {}}, runs=["hover"], seed=4)
     others = [name for name in CATALOGUE if name not in ("accel_scale", "accel_bias")]
     for _ in range(2):

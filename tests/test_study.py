@@ -150,7 +150,7 @@ def study(
 def test_a_study_goes_on_where_it_stopped(study: Callable, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         study(stops=plan.plan(8, 16)[10].name)
-    assert (tmp_path / "table.md").exists(), "what there is is told at any stop"
+    assert (tmp_path / "table.md").exists(), "what there is is written at any stop"
     flown, flights = study()
     assert flown == [f.name for f in flights[10:]]
     assert study()[0] == []
@@ -509,7 +509,7 @@ def test_sizes_in_the_catalogues_form() -> None:
 
 @pytest.mark.slow
 def test_one_flight_from_plan_to_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A strong gyro bias: found, worth about what was expected, and told in every file."""
+    """A strong gyro bias: found, worth about what was expected, and reported in every file."""
     monkeypatch.setenv("COAX_THREADS", "1")
     effects = {"gyro_bias": {"x": 0.05, "y": -0.04, "z": 0.03}}
     flight = PlannedFlight("one", 0, effects, True, "full", 5, ("lon_3211", "yaw_3211"))

@@ -924,7 +924,7 @@ def test_a_planted_vehicle_comes_back_and_flies(tmp_path):
 
 @pytest.mark.slow
 def test_pooled_regressions_are_one_where_the_file_is_right():
-    """Mean over flights of each factor, and the scatter that its std promises."""
+    """Mean over flights of each factor, and the scatter that its std predicts."""
     z = []
     for seed in range(6):
         flight = simulate(

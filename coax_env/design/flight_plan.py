@@ -4,7 +4,7 @@ The purpose of the paper's section III, taken further. Data flow::
 
     candidates (next_maneuver.py) and multisines -> flown with the vehicle and with draws of it
         -> outside the envelope: left out, and why -> expected information of each
-        -> picked one by one, each the one that tells most beside those picked -> flight card
+        -> picked one by one, each the most informative beside those picked -> flight card
 
 What is gained is the sum of the logarithms of the wanted numbers' std (all of them alike, whatever
 their units: the log determinant of what is left beside the others, D_s-optimality, Atkinson and
@@ -101,35 +101,24 @@ def plan_flight(
     vehicle = load_vehicle(vehicle)
     model = HeliModel(vehicle)
     free, wanted = _to_learn(model, learn)
-    suite = log_suite(sensors, vehicle)
-    rates = {s.name: s.rate for s in suite}
-    noise = _air(starting_noise(Flight(vehicle.name, ()), vehicle), gusts)
-    noise = replace(noise, reading={s.name: max(s.noise, LEAST_READING_STD[s.name]) for s in suite})
     envelope = envelope or Envelope()
     rng = np.random.default_rng(seed)
     spread = [vehicle.draw(rng) for _ in range(DRAWS)]
-    known = np.diag([f.std**-2 for f in free])
-    safe: list[tuple[Maneuver, Track, np.ndarray]] = []
+    safe: list[tuple[Maneuver, Track]] = []
     refused = []
-    options = (*candidates(), *stirring())
+    options = (*candidates(), *multisine_maneuvers())
     for k, option in enumerate(options):
         report(f"flying {option.name} ({k + 1} of {len(options)})")
         flown, why = _safe(vehicle, spread, option, envelope)
         if flown is None:
             refused.append((option, why))
         else:
-            safe.append((option, flown, expected_information(flown, vehicle, free, noise, rates)))
+            safe.append((option, flown))
     if not safe:
         raise InputError(f"no maneuver stays inside the envelope: {refused[0][1]}")
+    information = _information(safe, vehicle, free, sensors, gusts)
     index = np.array([k for k, f in enumerate(free) if f.name in wanted])
-    picked = []
-    for _ in range(runs):
-        before = _uncertainty(known, index)
-        gains = [before - _uncertainty(known + information, index) for *_, information in safe]
-        best = int(np.argmax(gains))
-        option, flown, information = safe[best]
-        known = known + information
-        picked.append(PlannedRun(option, flown, float(gains[best])))
+    picked, known = _pick(safe, information, np.diag([f.std**-2 for f in free]), index, runs)
     after = np.sqrt(np.diag(np.linalg.inv(known)))
     return FlightPlan(
         vehicle,
@@ -142,7 +131,44 @@ def plan_flight(
     )
 
 
-def stirring() -> tuple[Maneuver, ...]:
+def _information(
+    safe: Sequence[tuple[Maneuver, Track]],
+    vehicle: Vehicle,
+    free: Sequence[FreeParameter],
+    sensors: str,
+    gusts: Gusts | None,
+) -> list[np.ndarray]:
+    """Information expected of each maneuver on the free parameters, (k, k) each."""
+    suite = log_suite(sensors, vehicle)
+    rates = {s.name: s.rate for s in suite}
+    noise = _air(starting_noise(Flight(vehicle.name, ()), vehicle), gusts)
+    noise = replace(noise, reading={s.name: max(s.noise, LEAST_READING_STD[s.name]) for s in suite})
+    return [expected_information(flown, vehicle, free, noise, rates) for _, flown in safe]
+
+
+def _pick(
+    safe: Sequence[tuple[Maneuver, Track]],
+    information: Sequence[np.ndarray],
+    known: np.ndarray,
+    index: np.ndarray,
+    runs: int,
+) -> tuple[list[PlannedRun], np.ndarray]:
+    """Maneuvers one by one, each the most informative on the numbers at `index` beside those before.
+
+    Returns:
+        the maneuvers, and the information `known` (k, k) with theirs.
+    """
+    picked = []
+    for _ in range(runs):
+        before = _uncertainty(known, index)
+        gains = [before - _uncertainty(known + more, index) for more in information]
+        best = int(np.argmax(gains))
+        known = known + information[best]
+        picked.append(PlannedRun(*safe[best], float(gains[best])))
+    return picked, known
+
+
+def multisine_maneuvers() -> tuple[Maneuver, ...]:
     """Multisines on all four inputs at once, at half and at full size, with a pilot."""
     waves = multisines(len(AXES), LENGTH)
     return tuple(

@@ -120,7 +120,7 @@ def _smallest(
 
 
 def advise(result: Design | None, evidence: float) -> dict[str, Any] | None:
-    """`next_maneuver` of findings.json (contract.md), or None where nothing is confounded.
+    """`next_maneuver` of findings.json, or None where nothing is confounded.
 
     evidence: nats that a decision takes.
     """

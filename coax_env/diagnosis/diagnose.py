@@ -42,7 +42,7 @@ from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine, Progress
 from coax_env.estimation.fitted_vehicle import double_counting
 from coax_env.estimation.helicopter import HeliModel, record_of, sensor_std, starting_noise
-from coax_env.estimation.prediction import RunReplay, fly_again, gusts_of
+from coax_env.estimation.prediction import RunReplay, gusts_of, replay_runs
 from coax_env.estimation.state_space import Record
 from coax_env.estimation.whiteness import Whiteness, whiteness
 from coax_env.logs.flight import Flight, read_flight
@@ -238,15 +238,15 @@ def _gain(
     bare, refitted, fit = fits
     own = with_input_innovations(engine, fit) if has_command_gains(problem) else engine
     before, own_numbers, after = (
-        fly_again(engine, bare.values, bare.noise, horizon),
-        fly_again(engine, refitted.values, refitted.noise, horizon),
-        fly_again(own, fit.values, fit.noise, horizon, floor=True),
+        replay_runs(engine, bare.values, bare.noise, horizon),
+        replay_runs(engine, refitted.values, refitted.noise, horizon),
+        replay_runs(own, fit.values, fit.noise, horizon, floor=True),
     )
     flexible: list[RunReplay] = []
     if ceiling:
         problem.report("fitting a black box, for comparison")
         box = black_box(problem, refitted)
-        flexible = fly_again(engine, box.values, box.noise, horizon)
+        flexible = replay_runs(engine, box.values, box.noise, horizon)
     gain = gain_of(before, own_numbers, after, sensors, horizon, flexible)
     gain["held_out"] = [r.name for r in held]
     return [before, own_numbers, after], gain

@@ -1,7 +1,7 @@
 """What correcting the model gains: prediction error before and after, on runs it has not seen.
 
 Per channel e^2 = max(rms^2 - noise_rms^2, 0); the share removed is one minus the mean of
-e_after/e_before (contract.md). Intervals by a block bootstrap over runs and blocks of starts.
+e_after/e_before. Intervals by a block bootstrap over runs and blocks of starts.
 """
 
 from collections.abc import Mapping, Sequence

@@ -29,17 +29,21 @@ from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.state_space import FreeParameter, Record
 from coax_env.estimation.whiteness import is_white
 from coax_env.model import parameters as P
+from coax_env.model import state as S
 
 CLIP = 2.0
-"""Robust standard deviations at which an innovation is clipped: more is a maneuver."""
+"""Robust standard deviations at which an innovation is clipped: more is a maneuver; ours."""
 _ROUNDS = 5  # of reweighting
-_EVERY = 37  # rows between samples of the filter's covariance, prime to all sensors' cycles
-_SETTLED = 100  # rows that a filter takes to forget its start
-_SEEN = (0, 1, 2, 3, 4, 5, 10, 11, 12, 13, 14, 15)  # states that a pilot can see
-_LEAST = 1e-9  # std [rad, rad/s] below which a command is not flown by anyone
+_SAMPLE_ROWS = 37  # rows between samples of the filter's covariance, prime to all sensors' cycles
+_TRANSIENT_ROWS = 100  # rows that a filter takes to forget its start
+_SEEN = (S.U, S.V, S.W, S.P, S.Q, S.R, S.PHI, S.THETA, S.PSI, S.X, S.Y, S.Z)  # by a pilot
+_HEADING, _NORTH, _EAST = (_SEEN.index(state) for state in (S.PSI, S.X, S.Y))
+_LEAST_COMMAND_STD = 1e-9  # std [rad, rad/s] below which a command is not flown by anyone
 
 # per gain: the states it corrects, and what of the innovations (upper, lower, lon, lat) it takes
-_CORRECTED = ((3, 4), (23, 24), (20, 21), (5,), (25,), (2,), (22,))
+_CORRECTED = (
+    (S.P, S.Q), (S.GUST_L, S.GUST_M), (S.GUST_X, S.GUST_Y), (S.R,), (S.GUST_N,), (S.W,), (S.GUST_Z,),
+)  # fmt: skip
 _TILTS = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 _TURN = np.array([[1.0, -1.0, 0.0, 0.0]])
 _LIFT = np.array([[1.0, 1.0, 0.0, 0.0]])
@@ -92,7 +96,7 @@ def _with(records: Sequence[Record], found: Sequence[np.ndarray]) -> list[Record
 
 
 def _passes(engine: Engine, fit: Fit) -> list[RunPass]:
-    rows = [np.arange(_SETTLED, r.t.size, _EVERY) for r in engine.records]
+    rows = [np.arange(_TRANSIENT_ROWS, r.t.size, _SAMPLE_ROWS) for r in engine.records]
     return engine.filter(fit.values, fit.noise, start_rows=rows)
 
 
@@ -101,9 +105,10 @@ def _innovations(passes: Sequence[RunPass]) -> list[np.ndarray]:
     known, change = [], []
     for run in passes:
         seen = run.states[:, _SEEN].copy()
-        north, east = seen[:, 9].copy(), seen[:, 10].copy()
-        cosine, sine = np.cos(seen[:, 8]), np.sin(seen[:, 8])
-        seen[:, 9], seen[:, 10] = cosine * north + sine * east, cosine * east - sine * north
+        north, east = seen[:, _NORTH].copy(), seen[:, _EAST].copy()
+        cosine, sine = np.cos(seen[:, _HEADING]), np.sin(seen[:, _HEADING])
+        seen[:, _NORTH] = cosine * north + sine * east  # ahead and to the right, for a pilot
+        seen[:, _EAST] = cosine * east - sine * north
         u = run.record.command
         rows = np.hstack([seen[2:], seen[1:-1], u[1:-1], u[:-2]])
         known.append(rows - rows.mean(axis=0))
@@ -151,6 +156,6 @@ def _gains(passes: Sequence[RunPass], found: Sequence[np.ndarray]) -> list[FreeP
     gains = []
     for name, corrected, taken in zip(P.COMMAND_GAINS, _CORRECTED, _TAKEN, strict=True):
         std = float(np.sqrt(np.mean((spread @ taken.T) ** 2)))
-        if std > _LEAST:
+        if std > _LEAST_COMMAND_STD:
             gains.append(FreeParameter(name, 0.0, float(unknown[list(corrected)].mean()) / std))
     return gains

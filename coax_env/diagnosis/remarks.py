@@ -7,7 +7,7 @@ import numpy as np
 from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.vibration import Line
-from coax_env.estimation.helicopter import FARTHEST, UNUSUAL, WHITE_LEVELS
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM, WHITE_LEVELS
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
 
@@ -54,12 +54,12 @@ def _unusual_sizes(problem: Problem, fit: Fit) -> list[str]:
     for f in (f for effect in fit.active for f in problem.own[effect]):
         value = fit.values[f.name]
         size = abs(value - f.value)
-        if size > 0.99 * FARTHEST * f.std:
+        if size > 0.99 * MOST_USUAL_SIZES * f.std:
             texts.append(
                 f"{f.name} stands at the limit of what is believed, {value:.3g}:"
                 " something else hides behind this name"
             )
-        elif size > UNUSUAL * f.std:
+        elif size > UNUSUAL_FROM * f.std:
             texts.append(
                 f"{f.name} = {value:.3g} is outside its usual range"
                 f" ({f.value:g} +- {f.std:g}): take the name with care"

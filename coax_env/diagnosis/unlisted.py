@@ -1,6 +1,6 @@
 """What no effect of the catalogue explains: generic terms on the six axes, found by their signatures.
 
-The filter's gust states soak up a force or moment that the model lacks. Terms of generic_terms.py are
+The filter's gust states absorb a force or moment that the model lacks. Terms of generic_terms.py are
 screened by how much of those estimates they follow; the best are weighed as effects are, by their
 signatures with the base parameters and the causes in place projected out; what passes the threshold,
 and is large enough to matter in prediction, becomes part of the model and is refitted with it. Then
@@ -26,7 +26,7 @@ from coax_env.diagnosis.fits import fitted, linearise, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.estimation.engine import RunPass
-from coax_env.estimation.helicopter import FARTHEST
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import whiteness
@@ -363,7 +363,7 @@ def parameters(axis: str, terms: Sequence[Term]) -> list[FreeParameter]:
     """Coefficients of terms on an axis under their priors."""
     known = dict(zip(effects.GROUPS[axis].names(), effects.GROUPS[axis].parameters, strict=True))
     return [
-        FreeParameter(full, 0.0, p.usual, -FARTHEST * p.usual, FARTHEST * p.usual)
+        FreeParameter(full, 0.0, p.usual, -MOST_USUAL_SIZES * p.usual, MOST_USUAL_SIZES * p.usual)
         for full, p in ((name(axis, t), known[name(axis, t)]) for t in terms)
     ]
 

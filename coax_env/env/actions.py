@@ -11,8 +11,8 @@ from coax_env.model.dynamics import hover_trim
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import SHIPPED, load_vehicle
 
-ROTOR_RANGE = 0.15  # of the nominal hover speed
-SWASH_RANGE = 0.2  # [rad]
+ROTOR_RANGE = 0.15  # of the nominal hover speed: an action of 1; ours, some 30 % of thrust
+SWASH_RANGE = 0.2  # [rad]: an action of 1; ours
 Nominal = str | Path | Vehicle | tuple[Any, Any] | None
 """What centres the action: a vehicle, or (trim, scale) as a controller stores them."""
 

@@ -8,7 +8,16 @@ is filled up with copies, whose results are dropped.
 import numpy as np
 
 from coax_env.env import hover
-from coax_env.env.period import DT, add_gusts, command, copy_row, next_azimuth, take_samples
+from coax_env.env.period import (
+    DT,
+    FORCE,
+    MOMENT,
+    add_gusts,
+    command,
+    copy_row,
+    next_azimuth,
+    take_samples,
+)
 from coax_env.env.threads import in_threads
 from coax_env.errors import InputError
 from coax_env.kernel.compilation import compiled, looked_up_once
@@ -105,7 +114,7 @@ def _step_of(own):
             p = simd_view(p_block)
         else:
             p = params[0]
-        gusty = gust[0] > 0.0 or gust[1] > 0.0
+        gusty = gust[FORCE] > 0.0 or gust[MOMENT] > 0.0
         limited = np.isfinite(limits).any()
         n, after = _next_group(first, last, active, which)
         while n > 0:

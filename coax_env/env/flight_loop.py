@@ -9,8 +9,13 @@ import math
 import numpy as np
 
 from coax_env.env import hover, tasks
+from coax_env.env.hover import EAST, NORTH
 from coax_env.env.period import (
     DT,
+    FORCE,
+    LAT,
+    LON,
+    MOMENT,
     add_gusts,
     command,
     copy_row,
@@ -20,15 +25,16 @@ from coax_env.env.period import (
     take_samples,
     true_readings,
 )
-from coax_env.env.turbulence import draw_filters, turbulence_step
+from coax_env.env.turbulence import ACROSS, ALONG, DOWN, draw_filters, turbulence_step
 from coax_env.kernel.compilation import compiled
 from coax_env.kernel.random_streams import two_normals, uniform
 from coax_env.model import effects
+from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model.actuators import limit
 from coax_env.model.dynamics import WORK_SIZE
-from coax_env.model.layout import N_CHANNELS, N_COMMANDS, TIME
+from coax_env.model.layout import N_CHANNELS, N_COMMANDS
 from coax_env.model.sampling import BIAS, BIAS_STD, DELAY, delayed, measured_quantities
 
 WIND_NORTH = effects.parameter_index("wind.north")
@@ -50,30 +56,35 @@ def _sense(i, x, p, heli, world, readings, values, work, out):
 
 
 @compiled()
-def _blow(x, p, stream, filters, steady, turbulence, air):
-    """Turbulence for the coming period, along and across the steady wind (2,), into `p`."""
+def _move_air(x, p, stream, filters, steady, turbulence, air):
+    """Wind of the coming period into `p`: steady (2,), turbulence along and across it, and down."""
     turbulence_step(stream, filters, -x[S.Z], turbulence, DT, air)
-    speed = math.sqrt(steady[0] * steady[0] + steady[1] * steady[1])
-    north = steady[0] / speed if speed > 0.0 else 1.0
-    east = steady[1] / speed if speed > 0.0 else 0.0
-    p[WIND_NORTH] = steady[0] + north * air[0] - east * air[1]
-    p[WIND_EAST] = steady[1] + east * air[0] + north * air[1]
-    p[P.AIR_DOWN] = air[2]
+    speed = math.sqrt(steady[NORTH] * steady[NORTH] + steady[EAST] * steady[EAST])
+    north = steady[NORTH] / speed if speed > 0.0 else 1.0
+    east = steady[EAST] / speed if speed > 0.0 else 0.0
+    p[WIND_NORTH] = steady[NORTH] + north * air[ALONG] - east * air[ACROSS]
+    p[WIND_EAST] = steady[EAST] + east * air[ALONG] + north * air[ACROSS]
+    p[P.AIR_DOWN] = air[DOWN]
 
 
 @compiled(makes_arrays=True)
 def disturb_rows(first, last, active, x, heli, world):
-    """Gusts and turbulence of the coming period for the active rows first..last-1."""
+    """Gusts and turbulence of the coming period for the active rows first..last-1.
+
+    Args:
+        first, last: the share of the rows. active: which of them fly, (n,) bool.
+        x: full states, (n, 26), whose gusts change. heli, world: the batch's arrays, arrays.py.
+    """
     air = np.empty(3)
     many = len(heli.params) > 1
     gust = world.gust
     for i in range(first, last):
         if active[i]:
             p = heli.params[i if many else 0]
-            if gust[0] > 0.0 or gust[1] > 0.0:
+            if gust[FORCE] > 0.0 or gust[MOMENT] > 0.0:
                 add_gusts(x[i], p, gust, heli.streams[i])
             if world.turbulence > 0.0:
-                _blow(
+                _move_air(
                     x[i], p, heli.streams[i], heli.filters[i], heli.steady_wind[i],
                     world.turbulence, air,
                 )  # fmt: skip
@@ -107,7 +118,7 @@ def fly_rows(first, last, active, actions, x, heli, world, mission, outcome):
         fly_period(x[i], u, p, ring, row, DT, work)
         heli.rows[i] = row + 1
         heli.azimuth[i] = next_azimuth(heli.azimuth[i], x[i, S.OMEGA_U], DT)
-        u[TIME] = (row + 1) * DT
+        u[U.TIME] = (row + 1) * DT
         rewards[i] = hover.reward(
             x[i], actions[i], heli.targets[i], mission.weights, mission.scales, terms[i]
         )
@@ -117,7 +128,12 @@ def fly_rows(first, last, active, actions, x, heli, world, mission, outcome):
 
 @compiled()
 def pay_waypoints(first, last, active, x, heli, mission, outcome):
-    """Pay the active rows first..last-1 that have reached their targets, and give them others."""
+    """Pay the active rows first..last-1 that have reached their targets, and give them others.
+
+    Args:
+        first, last: the share of the rows. active: which of them fly, (n,) bool.
+        x: full states, (n, 26). heli, mission, outcome: the batch's arrays, arrays.py.
+    """
     bonus = mission.weights[hover.N_TERMS]
     for i in range(first, last):
         target, progress = heli.targets[i], heli.progress[i]
@@ -131,7 +147,12 @@ def pay_waypoints(first, last, active, x, heli, mission, outcome):
 
 @compiled()
 def observe_targets(first, last, which, heli, mission, observations):
-    """The way to the target by the readings held, observed, for the rows first..last-1 of a mask."""
+    """The way to the target by the readings held, observed, for the rows first..last-1 of a mask.
+
+    Args:
+        first, last: the share of the rows. which: those of them to observe, (n,) bool.
+        heli, mission: the batch's arrays, arrays.py. observations: (n, n_observed), in place.
+    """
     begin = heli.held.shape[1] - tasks.N_WAY
     for i in range(first, last):
         if which[i]:
@@ -169,7 +190,8 @@ def restart_rows(first, last, which, keep_state, x, heli, world, mission, observ
         if not keep_state:
             hover.random_start(stream, trim, x[i])
         if world.turbulence > 0.0:
-            heli.steady_wind[i, 0], heli.steady_wind[i, 1] = p[WIND_NORTH], p[WIND_EAST]
+            steady = heli.steady_wind[i]
+            steady[NORTH], steady[EAST] = p[WIND_NORTH], p[WIND_EAST]
             draw_filters(stream, heli.filters[i])
         progress = heli.progress[i]
         progress[tasks.WITHIN] = progress[tasks.REACHED] = 0
@@ -178,11 +200,11 @@ def restart_rows(first, last, which, keep_state, x, heli, world, mission, observ
         for k in range(N_COMMANDS):
             u[k] = heli.last_commands[i, k] = trim[k]
         limit(u, heli.last_commands[i], world.limits[heli.kinds[i]], DT)
-        u[TIME] = 0.0
+        u[U.TIME] = 0.0
         heli.rows[i] = 0
         heli.azimuth[i] = 0.0
         for k in range(len(ring)):
-            ring[k, 0], ring[k, 1] = u[2], u[3]
+            ring[k, LON], ring[k, LAT] = u[U.DELTA_LON], u[U.DELTA_LAT]
         for k in range(heli.held.shape[1]):
             heli.held[i, k] = 0.0
         _sense(i, x[i], p, heli, world, readings, values, work, observations[i])
@@ -194,4 +216,5 @@ def _draw_bias(stream, sensors, bias):
     for k in range(len(sensors)):
         bias[k] = sensors[k, BIAS]
         if sensors[k, BIAS_STD] > 0.0:
-            bias[k] += sensors[k, BIAS_STD] * two_normals(stream)[0]
+            drawn, _ = two_normals(stream)
+            bias[k] += sensors[k, BIAS_STD] * drawn

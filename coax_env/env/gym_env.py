@@ -82,7 +82,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     lost samples, as of a sonar's echoes: the last value is held, and its flag is 0. The previous
     action is not observed: whoever gave it knows it.
 
-    ``position`` and ``waypoints`` append the way to the target as the readings tell it, in the
+    ``position`` and ``waypoints`` append the way to the target by the readings, in the
     heading's axes; they need ``mocap`` or ``state``, and other sensors are an InputError. With
     ``mocap``:
 

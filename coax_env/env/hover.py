@@ -3,7 +3,7 @@
 Reward and cost can be taken about another target: the other tasks (tasks.py) do.
 
 Controllers are compared by a quadratic cost: squared errors in units of LIMITS, the success
-conditions of contract.md. The reward has a term 1/(1 + |error|/scale) per error, in (0, 1]: sharp
+conditions (tasks.py). The reward has a term 1/(1 + |error|/scale) per error, in (0, 1]: sharp
 at the goal, and with a slope far from it, so that a policy can be learnt from nothing.
 """
 
@@ -15,11 +15,12 @@ from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled
 from coax_env.kernel.random_streams import uniform
 from coax_env.kernel.simd import negated, select
+from coax_env.model import inputs as U
 from coax_env.model import state as S
 from coax_env.model.layout import N_COMMANDS, N_FULL, PLACE, RATE, VELOCITY
 
-HEIGHT = 1.5  # [m] of the centre of gravity above ground
-CONTROL_PERIOD = 0.01  # [s]
+HEIGHT = 1.5  # [m] of the centre of gravity above ground; ours
+CONTROL_PERIOD = 0.01  # [s], the paper's
 
 _DEGREE = math.pi / 180.0
 
@@ -57,7 +58,7 @@ REWARD_WEIGHTS = {
 REWARD_TERMS = tuple(REWARD_WEIGHTS)
 N_TERMS = len(REWARD_TERMS)
 CRASHED_COST = 1000.0
-"""Cost of every step that an episode ended too early to fly."""
+"""Cost of every step that an episode ended too early to fly: more than any hover has; ours."""
 
 START = {
     "tilt": 5.0 * _DEGREE, "heading": 20.0 * _DEGREE, "rate": 10.0 * _DEGREE,
@@ -67,29 +68,43 @@ START = {
 
 LOWEST = 0.05  # [m] centre of gravity: the skids touch
 HIGHEST = 6.0  # [m] the sonar's range ends soon after
-FARTHEST = 25.0  # [m]
-FASTEST = 15.0  # [m/s]
-STEEPEST = 60.0 * _DEGREE
+FARTHEST = 25.0  # [m] from the start; ours
+FASTEST = 15.0  # [m/s]; ours
+STEEPEST = 60.0 * _DEGREE  # of the rotor axis from the vertical; ours
+
+NORTH, EAST, DOWN, HEADING = range(4)
+"""Columns of a target [m, m, m, rad]: the state's x y z psi."""
+HORIZONTAL = slice(0, 2)
+
+(
+    ALIVE, HEIGHT_ERROR, POSITION_ERROR, SPEED_ERROR, HEADING_ERROR, RATES_ERROR, EFFORT,
+) = range(N_TERMS)  # fmt: skip
+"""Places of the reward's terms, in REWARD_TERMS' order."""
 
 _LIMITS = np.array(list(LIMITS.values()))
 _COST_WEIGHTS = np.array(list(COST_WEIGHTS.values()))
 _COS_STEEPEST = math.cos(STEEPEST)
-_TILT, _HEADING = START["tilt"], START["heading"]
-_RATE, _VELOCITY, _RISE = START["rate"], START["velocity"], START["height"]
+_START_TILT, _START_HEADING = START["tilt"], START["heading"]
+_START_RATE, _START_VELOCITY, _START_RISE = START["rate"], START["velocity"], START["height"]
 
 
 @compiled()
 def random_start(stream, command, x):
-    """A random start into the full state `x` (26,): rotors and swash settled on `command` (4,)."""
+    """A random start into the full state `x` (26,): rotors and swash settled on `command` (4,).
+
+    Args:
+        stream: key and counter, (2,) uint64. command: [rad/s, rad/s, rad, rad], (4,).
+        x: full state, (26,), is put here.
+    """
     for i in range(N_FULL):
         x[i] = 0.0
     for i in range(3):
-        x[S.U + i] = uniform(stream, -_VELOCITY, _VELOCITY)
-        x[S.P + i] = uniform(stream, -_RATE, _RATE)
-    x[S.PHI] = uniform(stream, -_TILT, _TILT)
-    x[S.THETA] = uniform(stream, -_TILT, _TILT)
-    x[S.PSI] = uniform(stream, -_HEADING, _HEADING)
-    x[S.Z] = -HEIGHT - uniform(stream, -_RISE, _RISE)
+        x[S.U + i] = uniform(stream, -_START_VELOCITY, _START_VELOCITY)
+        x[S.P + i] = uniform(stream, -_START_RATE, _START_RATE)
+    x[S.PHI] = uniform(stream, -_START_TILT, _START_TILT)
+    x[S.THETA] = uniform(stream, -_START_TILT, _START_TILT)
+    x[S.PSI] = uniform(stream, -_START_HEADING, _START_HEADING)
+    x[S.Z] = -HEIGHT - uniform(stream, -_START_RISE, _START_RISE)
     for i in range(N_COMMANDS):
         x[S.OMEGA_U + i] = command[i]
 
@@ -103,21 +118,21 @@ def reward(x, action, target, weights, scales, terms):
         weights, scales: in REWARD_TERMS' order, (N_TERMS,) or more.
         terms: the weighted terms are put here, (N_TERMS,) or more.
     """
-    north, east = x[S.X] - target[0], x[S.Y] - target[1]
-    heading = wrap_angle(x[S.PSI] - target[3])
-    up = x[S.Z] - target[2]
-    # errors squared, in REWARD_TERMS' order
-    terms[0] = 0.0  # alive
-    terms[1] = up * up
-    terms[2] = north * north + east * east
-    terms[3] = x[S.U] * x[S.U] + x[S.V] * x[S.V] + x[S.W] * x[S.W]
-    terms[4] = heading * heading
-    terms[5] = x[S.P] * x[S.P] + x[S.Q] * x[S.Q] + x[S.R] * x[S.R]
-    terms[6] = (
-        action[0] * action[0] + action[1] * action[1]
-        + action[2] * action[2] + action[3] * action[3]
+    north, east = x[S.X] - target[NORTH], x[S.Y] - target[EAST]
+    heading = wrap_angle(x[S.PSI] - target[HEADING])
+    down = x[S.Z] - target[DOWN]
+    # errors squared
+    terms[ALIVE] = 0.0
+    terms[HEIGHT_ERROR] = down * down
+    terms[POSITION_ERROR] = north * north + east * east
+    terms[SPEED_ERROR] = x[S.U] * x[S.U] + x[S.V] * x[S.V] + x[S.W] * x[S.W]
+    terms[HEADING_ERROR] = heading * heading
+    terms[RATES_ERROR] = x[S.P] * x[S.P] + x[S.Q] * x[S.Q] + x[S.R] * x[S.R]
+    terms[EFFORT] = (
+        action[U.OMEGA_U] * action[U.OMEGA_U] + action[U.OMEGA_L] * action[U.OMEGA_L]
+        + action[U.DELTA_LON] * action[U.DELTA_LON] + action[U.DELTA_LAT] * action[U.DELTA_LAT]
     )  # fmt: skip
-    total = 0.0 * up
+    total = 0.0 * down
     for k in range(N_TERMS):
         terms[k] = weights[k] * scales[k] / (scales[k] + math.sqrt(terms[k]))
         total += terms[k]
@@ -130,8 +145,8 @@ def reward(x, action, target, weights, scales, terms):
 @compiled()
 def is_over(x):
     """Whether the flight has ended: ground, tilt, too fast, too far, too high, or not a number."""
-    nought = 0.0 * x[0]
-    for i in range(1, N_FULL):
+    nought = 0.0 * x[S.U]
+    for i in range(S.V, N_FULL):
         nought += 0.0 * x[i]  # NaN where a state is not finite
     inside = (
         (nought == 0.0)
@@ -155,10 +170,10 @@ def squared_errors(states: np.ndarray, targets: np.ndarray | None = None) -> dic
         height, position (horizontal), speed, heading, rates: each of shape (...).
     """
     goal = np.array([0.0, 0.0, -HEIGHT, 0.0]) if targets is None else targets
-    heading = (states[..., S.PSI] - goal[..., 3] + math.pi) % (2.0 * math.pi) - math.pi
+    heading = (states[..., S.PSI] - goal[..., HEADING] + math.pi) % (2.0 * math.pi) - math.pi
     return {
-        "height": (states[..., S.Z] - goal[..., 2]) ** 2,
-        "position": ((states[..., PLACE] - goal[..., 0:2]) ** 2).sum(-1),
+        "height": (states[..., S.Z] - goal[..., DOWN]) ** 2,
+        "position": ((states[..., PLACE] - goal[..., HORIZONTAL]) ** 2).sum(-1),
         "speed": (states[..., VELOCITY] ** 2).sum(-1),
         "heading": heading**2,
         "rates": (states[..., RATE] ** 2).sum(-1),

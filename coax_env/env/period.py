@@ -24,11 +24,11 @@ from coax_env.kernel.random_streams import (
 )
 from coax_env.kernel.simd import any_lane, select
 from coax_env.model import effects
+from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model.actuators import limit
 from coax_env.model.dynamics import measure, step
-from coax_env.model.layout import TIME
 from coax_env.model.sampling import (
     DROPOUT,
     FLAG,
@@ -48,7 +48,10 @@ DT = hover.CONTROL_PERIOD
 
 _DELAY = effects.parameter_index("servo_delay.time")
 _VIBRATION = effects.parameter_index("vibration.amplitude")
-_LON, _LAT = 2, 3  # the swash commands, of the four
+LON, LAT = range(2)
+"""Columns of the ring of swash commands."""
+FORCE, MOMENT = range(2)
+"""Places of the gusts' std."""
 
 
 # --- commands -----------------------------------------------------------------------------------------
@@ -56,7 +59,12 @@ _LON, _LAT = 2, 3  # the swash commands, of the four
 
 @compiled()
 def command(action, trim, scale, u):
-    """An action (4,), clipped in place to [-1, 1], as commands into `u`."""
+    """An action (4,), clipped in place to [-1, 1], as commands into `u`.
+
+    Args:
+        action: (4,). trim, scale: command = trim + scale action, (4,) each [rad/s, rad/s, rad, rad].
+        u: commands and time, (5,); its commands are put here.
+    """
     for k in range(4):
         a = action[k]
         a = select(a < -1.0, -1.0, a)
@@ -82,8 +90,8 @@ def give_command(u, last, limits, ring, row, dt):
     """
     limit(u, last, limits, dt)
     slot = row % len(ring)
-    ring[slot, 0], ring[slot, 1] = u[_LON], u[_LAT]
-    u[TIME] = row * dt
+    ring[slot, LON], ring[slot, LAT] = u[U.DELTA_LON], u[U.DELTA_LAT]
+    u[U.TIME] = row * dt
 
 
 @compiled()
@@ -96,7 +104,11 @@ def _split(delay, slots, dt):
 
 @compiled()
 def apply_servo_delay(u, p, ring, row, dt):
-    """Put into `u` the swash command that is in force as a row begins; arguments as `give_command`."""
+    """Put into `u` the swash command that is in force as a row begins; arguments as `give_command`.
+
+    Args:
+        u, ring, row, dt: as in `give_command`. p: parameter vector.
+    """
     slots = len(ring)
     if p[_DELAY] <= 0.0 or slots == 1:
         return
@@ -108,7 +120,7 @@ def apply_servo_delay(u, p, ring, row, dt):
 def _take_swash(ring, row, u):
     """The swash command that was given in a row, into `u`."""
     slot = row % len(ring)
-    u[_LON], u[_LAT] = ring[slot, 0], ring[slot, 1]
+    u[U.DELTA_LON], u[U.DELTA_LAT] = ring[slot, LON], ring[slot, LAT]
 
 
 # --- flight -------------------------------------------------------------------------------------------
@@ -133,7 +145,7 @@ def fly_period(x, u, p, ring, row, dt, work):
     if rest > 0.0:
         _take_swash(ring, row - whole - 1, u)
         step(x, u, rest, p, work, x)
-        u[TIME] += rest
+        u[U.TIME] += rest
     _take_swash(ring, row - whole, u)
     if dt - rest > 1e-9:
         step(x, u, dt - rest, p, work, x)
@@ -141,7 +153,11 @@ def fly_period(x, u, p, ring, row, dt, work):
 
 @compiled()
 def next_azimuth(azimuth, speed, dt):
-    """Azimuth [rad] of a rotor of this speed [rad/s] after `dt` seconds, within a turn."""
+    """Azimuth [rad] of a rotor of this speed [rad/s] after `dt` seconds, within a turn.
+
+    Args:
+        azimuth: [rad] now. speed: of the rotor [rad/s]. dt: [s].
+    """
     azimuth = azimuth + dt * speed
     return azimuth - TURN * math.floor(azimuth / TURN)
 
@@ -154,11 +170,15 @@ def gust_growth(dt, memory):
 
 @compiled()
 def add_gusts(x, p, gust, stream):
-    """Move the gust states on by one period: exponential memory, stationary std `gust` (2,)."""
+    """Move the gust states on by one period: exponential memory, stationary std `gust` (2,).
+
+    Args:
+        x: full state, (26,), in place. p: parameter vector.
+        gust: std of force [N] and moment [N m], (2,). stream: key and counter, (2,) uint64.
+    """
     share = gust_growth(DT, p[P.GUST_MEMORY])
-    for half in range(2):
+    for half, first in ((FORCE, S.GUST_X), (MOMENT, S.GUST_L)):
         if gust[half] > 0.0:
-            first = S.GUST_X + 3 * half
             a, b = two_normals(stream)
             c, _ = two_normals(stream)
             x[first] += share * gust[half] * a

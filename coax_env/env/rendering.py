@@ -48,7 +48,7 @@ _TRACE, _TARGET, _WIND = (90, 60, 150), (20, 140, 80), (0, 130, 160)
 
 
 class Renderer:
-    """Draws views; opens a window when told to show them."""
+    """Draws views; opens a window where they are to be shown."""
 
     def __init__(self) -> None:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")

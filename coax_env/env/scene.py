@@ -174,7 +174,11 @@ def flybar(view: View) -> np.ndarray:
 
 
 def ellipse(first: Any, second: Any, count: int) -> np.ndarray:
-    """Closed curve cos(t) first + sin(t) second, (count, 3)."""
+    """Closed curve cos(t) first + sin(t) second, (count, 3).
+
+    Args:
+        first, second: conjugate half axes, (3,) each [m]. count: of points; the last is the first.
+    """
     t = np.linspace(0.0, 2.0 * math.pi, count)[:, None]
     return np.cos(t) * np.asarray(first, dtype=float) + np.sin(t) * np.asarray(second, dtype=float)
 

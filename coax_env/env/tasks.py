@@ -5,7 +5,7 @@ it moves on from one target to the next. All tasks start, end and are rewarded b
 target in force; ``hover`` has its target fixed over the start. A target is (north, east, height,
 heading) [m, rad] for the user, and x y z psi of the state in the kernel.
 
-Success is contract.md's, about the target: see `judge`, and `succeeded` for one recorded flight.
+Success is SUCCESS's, about the target: see `judge`, and `succeeded` for one recorded flight.
 """
 
 import math
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from coax_env.env import hover
+from coax_env.env.hover import DOWN, EAST, HEADING, HORIZONTAL, NORTH
 from coax_env.errors import InputError
 from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled
@@ -39,7 +40,7 @@ SUCCESS = {
     "heading": hover.LIMITS["heading"],
     "drift": hover.LIMITS["position"],
 }
-"""Contract.md: rms of the errors of height [m], speed [m/s] and heading [rad]; farthest drift [m]."""
+"""Ours: rms of the errors of height [m], speed [m/s] and heading [rad]; farthest drift [m]."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,10 @@ WAY = (
 Target minus *measured* position, turned by the measured heading; target minus measured heading.
 """
 N_WAY = len(WAY)
+LOW, HIGH = range(2)
+"""Rows of the box that targets are drawn from."""
+FORWARD, RIGHT, UP, TURN = range(N_WAY)
+"""Places of the way to the target."""
 _BOUNDS = np.array([bound for *_, bound in WAY])
 
 WITHIN, REACHED = range(2)
@@ -140,8 +145,8 @@ def course(name: str, target: Any = None) -> np.ndarray:
         raise InputError("a target is (north, east, height, heading) in m and rad, all finite")
     if len(given) > 1 and not own.moves_on:
         raise InputError(f"task {name!r} takes one target, found {len(given)}")
-    outside = (given[:, 2] <= hover.LOWEST) | (given[:, 2] >= hover.HIGHEST)
-    if (outside | (np.hypot(given[:, 0], given[:, 1]) >= hover.FARTHEST)).any():
+    outside = (given[:, DOWN] <= hover.LOWEST) | (given[:, DOWN] >= hover.HIGHEST)
+    if (outside | (np.hypot(given[:, NORTH], given[:, EAST]) >= hover.FARTHEST)).any():
         raise InputError(
             f"a target must be {hover.LOWEST:g} to {hover.HIGHEST:g} m high and within "
             f"{hover.FARTHEST:g} m of the start"
@@ -175,7 +180,7 @@ def places(name: str, sensors: Sequence[Sensor]) -> np.ndarray:
 def height_sign(name: str, sensors: Sequence[Sensor]) -> float:
     """What makes the height reading at `places` the state z: 1 for z itself, -1 for h."""
     place = places(name, sensors)
-    return 1.0 if len(place) and sensors[place[2]].name == "z" else -1.0
+    return 1.0 if len(place) and sensors[place[DOWN]].name == "z" else -1.0
 
 
 @compiled()
@@ -192,7 +197,7 @@ def next_target(stream, course, box, reached, target):
             target[i] = course[k, i]
     else:
         for i in range(4):
-            target[i] = uniform(stream, box[0, i], box[1, i])
+            target[i] = uniform(stream, box[LOW, i], box[HIGH, i])
 
 
 @compiled()
@@ -203,8 +208,8 @@ def reaches(x, target, dwell, progress, course):
         x: full state, (26,). target: x y z psi, (4,). dwell: rows that complete it; 0: none do.
         progress: WITHIN and REACHED, (2,), in place. course: targets given, (k, 4).
     """
-    east, north, down = x[S.Y] - target[1], x[S.X] - target[0], x[S.Z] - target[2]
-    turn = wrap_angle(x[S.PSI] - target[3])
+    north, east, down = x[S.X] - target[NORTH], x[S.Y] - target[EAST], x[S.Z] - target[DOWN]
+    turn = wrap_angle(x[S.PSI] - target[HEADING])
     there = (
         north * north + east * east + down * down < RADIUS * RADIUS
         and abs(turn) < HEADING_TOLERANCE
@@ -226,13 +231,13 @@ def way_to_target(held, places, height_sign, target, out):
         held: readings. places, height_sign: from the functions of these names.
         target: x y z psi, (4,). out: is put here, (4,).
     """
-    psi = held[places[3]]
-    north = target[0] - held[places[0]]
-    east = target[1] - held[places[1]]
-    out[0] = math.cos(psi) * north + math.sin(psi) * east
-    out[1] = math.cos(psi) * east - math.sin(psi) * north
-    out[2] = height_sign * held[places[2]] - target[2]
-    out[3] = wrap_angle(target[3] - psi)
+    psi = held[places[HEADING]]
+    north = target[NORTH] - held[places[NORTH]]
+    east = target[EAST] - held[places[EAST]]
+    out[FORWARD] = math.cos(psi) * north + math.sin(psi) * east
+    out[RIGHT] = math.cos(psi) * east - math.sin(psi) * north
+    out[UP] = height_sign * held[places[DOWN]] - target[DOWN]
+    out[TURN] = wrap_angle(target[HEADING] - psi)
     for i in range(N_WAY):
         out[i] = min(max(out[i], -_BOUNDS[i]), _BOUNDS[i])
 
@@ -281,7 +286,7 @@ def succeeded(
     x, goal = states[FIRST_JUDGED - 1 :], targets[FIRST_JUDGED - 1 :]
     errors = dict.fromkeys(SUCCESS, np.array([np.inf]))
     if len(x):
-        place = x[0, PLACE] if name == "hover" else goal[:, 0:2]
+        place = x[0, PLACE] if name == "hover" else goal[:, HORIZONTAL]
         squares = hover.squared_errors(x, goal)
         errors = {k: np.sqrt([squares[k].mean()]) for k in ("height", "speed", "heading")}
         errors["drift"] = np.linalg.norm(x[:, PLACE] - place, axis=1).max(keepdims=True)

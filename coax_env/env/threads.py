@@ -12,6 +12,9 @@ def in_threads(function: Callable[[int, int], None], count: int, threads: int) -
     """Call function(first, last) on equal shares; the compiled kernel lets other threads run.
 
     The calling thread flies the first share itself: waking one that sleeps takes as long as many rows.
+
+    Args:
+        function: of the first row and of the one after the last. count: of rows. threads: of shares.
     """
     if threads == 1:
         function(0, count)

@@ -32,7 +32,10 @@ SEVERITIES = {"light": 15.0 * _KNOT, "moderate": 30.0 * _KNOT, "severe": 45.0 * 
 """Wind at 6 m [m/s] of MIL-F-8785C's three severities."""
 
 N_FILTERS = 5
-"""States of the forming filters: one of u, two of v, two of w."""
+ALONG_FILTER, ACROSS_FILTER, DOWN_FILTER = 0, 1, 3
+"""First states of the forming filters: one of u, two each of v and w."""
+ALONG, ACROSS, DOWN = range(3)
+"""Components of the turbulent velocity: u v w in the axes of the mean wind."""
 
 _ROOT_3 = math.sqrt(3.0)
 
@@ -80,8 +83,8 @@ def draw_filters(stream, filters):
 
     A first-order state has variance 1; of a pair, the covariance is [[1, 1/2], [1/2, 1/2]].
     """
-    filters[0], _ = two_normals(stream)
-    for k in (1, 3):
+    filters[ALONG_FILTER], _ = two_normals(stream)
+    for k in (ACROSS_FILTER, DOWN_FILTER):
         first, second = two_normals(stream)
         filters[k] = first
         filters[k + 1] = 0.5 * (first + second)
@@ -102,11 +105,10 @@ def turbulence_step(stream, filters, height, wind, dt, air):
     sigma, sigma_w, tau, tau_w = dryden(height, wind)
     a, _ = two_normals(stream)
     keep = math.exp(-dt / tau)
-    filters[0] = keep * filters[0] + math.sqrt(1.0 - keep * keep) * a
-    air[0] = sigma * filters[0]
-    for axis in (1, 2):
-        s = dt / (tau if axis == 1 else tau_w)
-        k = 2 * axis - 1
+    filters[ALONG_FILTER] = keep * filters[ALONG_FILTER] + math.sqrt(1.0 - keep * keep) * a
+    air[ALONG] = sigma * filters[ALONG_FILTER]
+    for axis, k in ((ACROSS, ACROSS_FILTER), (DOWN, DOWN_FILTER)):
+        s = dt / (tau if axis == ACROSS else tau_w)
         a, b = two_normals(stream)
         keep = math.exp(-s)
         square = keep * keep
@@ -116,12 +118,17 @@ def turbulence_step(stream, filters, height, wind, dt, air):
         first, second = filters[k], filters[k + 1]
         filters[k] = keep * first + l11 * a
         filters[k + 1] = keep * (s * first + second) + l21 * a + l22 * b
-        level = (sigma if axis == 1 else sigma_w) / math.sqrt(2.0)
+        level = (sigma if axis == ACROSS else sigma_w) / math.sqrt(2.0)
         air[axis] = level * (_ROOT_3 * filters[k] + (1.0 - _ROOT_3) * filters[k + 1])
 
 
 def spectrum(frequency: np.ndarray, sigma: float, tau: float, along: bool) -> np.ndarray:
-    """One-sided Dryden spectrum at frequencies [Hz], (m/s)^2/Hz; `along` the wind, or across it."""
+    """One-sided Dryden spectrum at frequencies [Hz], (m/s)^2/Hz; `along` the wind, or across it.
+
+    Args:
+        frequency: [Hz], any shape. sigma: std [m/s]. tau: memory [s], see `dryden`.
+        along: the wind, or across it and downwards.
+    """
     square = (2.0 * math.pi * np.asarray(frequency, dtype=float) * tau) ** 2
     if along:
         return 4.0 * sigma**2 * tau / (1.0 + square)

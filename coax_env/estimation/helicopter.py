@@ -14,22 +14,36 @@ from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.kernel.compilation import compiled, pointer
 from coax_env.logs.flight import Flight, Run
 from coax_env.model import dynamics, effects
+from coax_env.model import inputs as U
 from coax_env.model import parameters as P
+from coax_env.model import state as S
 from coax_env.model.layout import (
+    ACTUATORS,
     ANGLES,
+    ATTITUDE,
     CHANNELS,
+    FLYBAR,
+    GUST_FORCE,
+    GUST_MOMENT,
+    GUSTS,
+    LOWER_FLAP,
     N_FULL,
     N_INPUTS,
     N_STATES,
+    POSITION,
+    RATE,
+    ROTOR_SPEED,
+    SWASH,
     TIME,
+    VELOCITY,
 )
 from coax_env.model.vehicle import Vehicle
 
-FARTHEST = 5.0
-"""Usual sizes that an effect may have at most."""
+MOST_USUAL_SIZES = 5.0
+"""Usual sizes that an effect may have at most; ours."""
 
-UNUSUAL = 2.5
-"""Usual sizes beyond which an effect's name is to be taken with care."""
+UNUSUAL_FROM = 2.5
+"""Usual sizes beyond which an effect's name is to be taken with care; ours."""
 
 GUST_LEVELS = ("force_xy", "force_z", "moment_xy", "moment_z")
 """Std of the gust states [N, N m]; x and y share one level."""
@@ -54,7 +68,7 @@ LEAST_READING_STD = {
     "ax": 0.05, "ay": 0.05, "az": 0.05, "phi": 0.006, "theta": 0.006, "psi": 0.008,
     "h": 0.005, "vn": 0.02, "ve": 0.02, "vd": 0.02, "pn": 0.004, "pe": 0.004, "v": 0.02,
 }  # fmt: skip
-"""Where the card states no noise, readings are not believed more than this.
+"""Least std taken for a reading where the card states no noise; units of CHANNEL_UNITS.
 
 A motion capture is far finer than any rigid-body model (vibration, jitter of the time stamps): with
 its true noise the likelihood would be spent on what no parameter can correct.
@@ -68,22 +82,22 @@ MEASURE = types.void(_A, _A, _A, _A, _A)
 
 @compiled()
 def _take_in_innovations(u: Any, p: Any, x: Any) -> None:
-    """Correct a state (26,) in place by the input innovations u[5:9]; see input_innovations.py."""
+    """Correct a state (26,) in place by the innovations after the input; see input_innovations.py."""
     if u.size == N_INPUTS:
         return
-    gain = p[P.COMMAND_GAIN : P.N_FIXED]
-    lon, lat = u[N_INPUTS + 2], u[N_INPUTS + 3]
-    turn, lift = u[N_INPUTS] - u[N_INPUTS + 1], u[N_INPUTS] + u[N_INPUTS + 1]
-    x[3] += gain[0] * lat
-    x[4] += gain[0] * lon
-    x[23] += gain[1] * lat
-    x[24] += gain[1] * lon
-    x[20] += gain[2] * lon
-    x[21] -= gain[2] * lat
-    x[5] += gain[3] * turn
-    x[25] += gain[4] * turn
-    x[2] += gain[5] * lift
-    x[22] += gain[6] * lift
+    upper, lower = u[N_INPUTS + U.OMEGA_U], u[N_INPUTS + U.OMEGA_L]
+    lon, lat = u[N_INPUTS + U.DELTA_LON], u[N_INPUTS + U.DELTA_LAT]
+    turn, lift = upper - lower, upper + lower
+    x[S.P] += p[P.COMMAND_GAIN_RATE_XY] * lat
+    x[S.Q] += p[P.COMMAND_GAIN_RATE_XY] * lon
+    x[S.GUST_L] += p[P.COMMAND_GAIN_MOMENT_XY] * lat
+    x[S.GUST_M] += p[P.COMMAND_GAIN_MOMENT_XY] * lon
+    x[S.GUST_X] += p[P.COMMAND_GAIN_FORCE_XY] * lon
+    x[S.GUST_Y] -= p[P.COMMAND_GAIN_FORCE_XY] * lat
+    x[S.R] += p[P.COMMAND_GAIN_RATE_Z] * turn
+    x[S.GUST_N] += p[P.COMMAND_GAIN_MOMENT_Z] * turn
+    x[S.W] += p[P.COMMAND_GAIN_SPEED_Z] * lift
+    x[S.GUST_Z] += p[P.COMMAND_GAIN_FORCE_Z] * lift
 
 
 @pointer(STEP)
@@ -108,6 +122,15 @@ def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) 
     _take_in_innovations(u, p, out)
 
 
+def _small_changes() -> np.ndarray:
+    """Size of a small change of each state, for differences (26,)."""
+    size = np.empty(N_FULL)
+    size[VELOCITY] = size[RATE] = size[POSITION] = size[GUST_FORCE] = 1e-4
+    size[LOWER_FLAP] = size[FLYBAR] = size[ATTITUDE] = size[SWASH] = size[GUST_MOMENT] = 1e-5
+    size[ROTOR_SPEED] = 1e-2
+    return size
+
+
 class HeliModel:
     """A vehicle, through the engine's protocol."""
 
@@ -118,10 +141,7 @@ class HeliModel:
     drift_and_readings = _drift_and_readings
     exact = np.arange(N_FULL) >= N_STATES
     work_size = dynamics.WORK_SIZE
-    state_scale = np.array(
-        [1e-4] * 6 + [1e-5] * 4 + [1e-5] * 3 + [1e-4] * 3 + [1e-2] * 2 + [1e-5] * 2
-        + [1e-4] * 3 + [1e-5] * 3
-    )  # fmt: skip
+    state_scale = _small_changes()
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
@@ -141,7 +161,7 @@ class HeliModel:
         u[:, TIME] = record.t - record.origin
         delay = vector[_DELAY]
         if delay > 0.0:
-            for column in (2, 3):
+            for column in (U.DELTA_LON, U.DELTA_LAT):
                 u[:, column] = _delayed_mean(record.t, record.command[:, column], delay)
         if record.input_innovations is None:
             return u
@@ -162,42 +182,44 @@ class HeliModel:
 
         x = np.zeros(N_FULL)
         spread = np.zeros(N_FULL)
-        for i, channel in ((10, "phi"), (11, "theta"), (12, "psi")):
+        for i, channel in ((S.PHI, "phi"), (S.THETA, "theta"), (S.PSI, "psi")):
             x[i], spread[i] = first(channel, 0.0, 0.2)
-        height, spread[15] = first("h", 1.0, 1.0)
-        x[15] = -height
-        x[13], spread[13] = first("pn", 0.0, 1e-3)
-        x[14], spread[14] = first("pe", 0.0, 1e-3)
-        spread[0:3] = 1.0
-        spread[3:6] = 0.6
-        spread[6:10] = 0.06
-        x[16:20] = record.command[0]
-        spread[16:18] = 4.0
-        spread[18:20] = 0.03
+        height, spread[S.Z] = first("h", 1.0, 1.0)
+        x[S.Z] = -height
+        x[S.X], spread[S.X] = first("pn", 0.0, 1e-3)
+        x[S.Y], spread[S.Y] = first("pe", 0.0, 1e-3)
+        spread[VELOCITY] = 1.0
+        spread[RATE] = 0.6
+        spread[LOWER_FLAP] = spread[FLYBAR] = 0.06
+        x[ACTUATORS] = record.command[0]
+        spread[ROTOR_SPEED] = 4.0
+        spread[SWASH] = 0.03
         return x, np.diag(spread**2 + 1e-12)
 
     def start_noise(self, noise: Noise) -> np.ndarray:
         """Variances of the gusts at the start of a run (26,)."""
-        return np.append(np.zeros(N_FULL - 6), _gust_levels(noise) ** 2)
+        variance = np.zeros(N_FULL)
+        variance[GUSTS] = _gust_levels(noise) ** 2
+        return variance
 
     def process_noise(self, noise: Noise) -> np.ndarray:
         """Growth of the states' variances per second (26,): gusts, and a little everywhere."""
         q = np.zeros(N_FULL)
-        q[0:3] = 1e-4**2
-        q[3:6] = 1e-3**2
-        q[6:10] = 1e-4**2
-        q[10:16] = 1e-5**2
-        q[16:18] = 0.1**2
-        q[18:20] = 1e-4**2
+        q[VELOCITY] = 1e-4**2
+        q[RATE] = 1e-3**2
+        q[LOWER_FLAP] = q[FLYBAR] = 1e-4**2
+        q[ATTITUDE] = q[POSITION] = 1e-5**2
+        q[ROTOR_SPEED] = 0.1**2
+        q[SWASH] = 1e-4**2
         level = noise.process
         p = self.vehicle
         mass = p["mass"].value
-        q[0:2] += (level.get("white_force_xy", 0.0) / mass) ** 2
-        q[2] += (level.get("white_force_z", 0.0) / mass) ** 2
-        q[3] += (level.get("white_moment_xy", 0.0) / p["inertia_xx"].value) ** 2
-        q[4] += (level.get("white_moment_xy", 0.0) / p["inertia_yy"].value) ** 2
-        q[5] += (level.get("white_moment_z", 0.0) / p["inertia_zz"].value) ** 2
-        q[20:26] = 2.0 * _gust_levels(noise) ** 2 / noise.process["memory"]
+        q[[S.U, S.V]] += (level.get("white_force_xy", 0.0) / mass) ** 2
+        q[S.W] += (level.get("white_force_z", 0.0) / mass) ** 2
+        q[S.P] += (level.get("white_moment_xy", 0.0) / p["inertia_xx"].value) ** 2
+        q[S.Q] += (level.get("white_moment_xy", 0.0) / p["inertia_yy"].value) ** 2
+        q[S.R] += (level.get("white_moment_z", 0.0) / p["inertia_zz"].value) ** 2
+        q[GUSTS] = 2.0 * _gust_levels(noise) ** 2 / noise.process["memory"]
         return q
 
     # --- what may be fitted -------------------------------------------------------------------------
@@ -214,7 +236,7 @@ class HeliModel:
     def effect_parameters(effect: str) -> list[FreeParameter]:
         """An effect's parameters; the prior is centred on its off-value.
 
-        Nothing is taken to be more than FARTHEST usual sizes: beyond that it is another effect.
+        Nothing is taken to be more than MOST_USUAL_SIZES usual sizes: beyond that it is another effect.
         """
         entry = effects.CATALOGUE[effect]
         return [
@@ -222,8 +244,8 @@ class HeliModel:
                 full,
                 p.off,
                 p.usual,
-                max(p.lower, p.off - FARTHEST * p.usual),
-                min(p.upper, p.off + FARTHEST * p.usual),
+                max(p.lower, p.off - MOST_USUAL_SIZES * p.usual),
+                min(p.upper, p.off + MOST_USUAL_SIZES * p.usual),
                 p.probe,
                 entry.stage == effects.SENSOR,
             )
@@ -267,9 +289,9 @@ def record_of(run: Run) -> Record:
 
 
 def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
-    """Noise to start from: readings as the card says or the data show, gusts by guess.
+    """Noise to start from: of readings by the card or their scatter, of gusts by guess.
 
-    A vehicle's vibration is noise to the filter, on top of what the card says: its phase is not known.
+    A vehicle's vibration is noise to the filter, on top of the card's: its phase is not known.
     """
     weight = vehicle["mass"].value * vehicle["gravity"].value
     arm = vehicle["arm_upper"].value

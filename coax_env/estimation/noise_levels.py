@@ -11,7 +11,7 @@ from coax_env.estimation.engine import Engine, Progress
 from coax_env.estimation.state_space import Noise, Record
 
 STEP_OF_LOG = 1e-3  # of a noise level, for the slopes of the model's variances
-LARGEST = 1e4  # times its floor that a level may have
+LARGEST = 1e4  # times its floor that a level may have; ours
 
 
 def fit_noise(

@@ -1,4 +1,4 @@
-"""What the simulation gets wrong: the filtered state flown open loop over a horizon (contract.md).
+"""What the simulation gets wrong: the filtered state flown open loop over a horizon.
 
 From starts every quarter of a second, after one second of filtering, the filtered state is flown
 with the recorded commands and compared with the measurement at the horizon's end. The gust states are
@@ -6,7 +6,7 @@ set to zero; the version in which they decay is computed beside it. Where a chan
 the end itself, its last one within the final TAIL seconds is used, at its own time.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,14 +26,16 @@ from coax_env.estimation.helicopter import (
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import Noise
 from coax_env.logs.flight import Flight, read_flight
+from coax_env.model import state as S
 from coax_env.model.layout import CHANNEL_UNITS, CHANNELS, GUSTS, N_FULL
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 
 HEADING = CHANNELS.index("psi")
-WARM_UP = 1.0  # s of filtering before the first start
-EVERY = 0.25  # s between starts
-TAIL = 0.15  # s
+WARM_UP = 1.0  # [s] of filtering before the first start
+EVERY = 0.25  # [s] between starts
+TAIL = 0.15  # [s] before the horizon's end in which a reading counts as at it
+FLOOR_EVERY = 4  # starts; each floor takes as many flights as there are states
 COMPARED = ("p", "q", "r", "phi", "theta", "psi", "h", "vn", "ve", "vd", "pn", "pe", "v")
 """Channels of the gain: attitude, rates, velocity, position and height."""
 
@@ -56,7 +58,7 @@ class ChannelReplay:
 
 @dataclass(frozen=True)
 class RunReplay:
-    """One run flown again from many starts."""
+    """One run flown open loop from many starts."""
 
     name: str
     channels: Mapping[str, ChannelReplay]
@@ -65,7 +67,7 @@ class RunReplay:
     """Std by channel that the uncertainty of the start alone gives at the end; empty unless asked."""
 
 
-def fly_again(
+def replay_runs(
     engine: Engine,
     values: Mapping[str, float],
     noise: Noise,
@@ -84,54 +86,87 @@ def fly_again(
     starts = [_starts(r.t, horizon) for r in engine.records]
     passes = engine.filter(values, noise, start_rows=starts)
     p = engine.model.vector(values)
-    result = []
-    for run, dt in zip(passes, engine.intervals, strict=True):
-        record = run.record
-        # open loop: what a command shows of the state is no part of the prediction
-        inputs = engine.model.inputs(replace(record, input_innovations=None), p)
-        present = np.isfinite(record.z)
-        used = [i for i in range(len(CHANNELS)) if present[:, i].any()]
-        rows = run.start_rows
-        shape = (rows.size, len(CHANNELS))
-        t, measured, predicted, decaying = (np.full(shape, np.nan) for _ in range(4))
-        diverged = not np.isfinite(run.log_likelihood)
-        variance = np.zeros(shape)
-        turns = _unwrapped(record.z)
-        for s, first in enumerate(rows):
-            last = int(np.searchsorted(record.t, record.t[first] + horizon + 1e-6) - 1)
-            targets = _targets(present, record.t, last, used)
-            for gust, out in ((0.0, predicted), (1.0, decaying)):
-                x = run.states[first].copy()
-                x[GUSTS] *= gust
-                ok = kalman.fly_open_loop(engine.compiled, dt, inputs, x, p, first, targets, out[s])
-                diverged |= not ok
-            for i in used:
-                if targets[i] >= 0:
-                    t[s, i] = record.t[targets[i]]
-                    measured[s, i] = turns[targets[i], i]
-            turn = (
-                2.0
-                * np.pi
-                * np.round((run.states[first, 12] - turns[first, HEADING]) / (2.0 * np.pi))
+    return [
+        _replay_run(engine, run, dt, p, horizon, floor)
+        for run, dt in zip(passes, engine.intervals, strict=True)
+    ]
+
+
+def _replay_run(
+    engine: Engine, run: RunPass, dt: np.ndarray, p: np.ndarray, horizon: float, floor: bool
+) -> RunReplay:
+    # open loop: the input innovations, which know the state, are no part of the prediction
+    inputs = engine.model.inputs(replace(run.record, input_innovations=None), p)
+    targets = _targets(run, horizon)
+    used = np.flatnonzero(np.isfinite(run.record.z).any(axis=0))
+    t, measured = _readings_at(run, targets)
+    predicted, decaying, finite = _fly_all(engine, run, inputs, dt, p, targets)
+    diverged = not (finite and np.isfinite(run.log_likelihood))
+    return RunReplay(
+        run.record.name,
+        {
+            CHANNELS[i]: _channel(
+                CHANNELS[i], t[:, i], measured[:, i], predicted[:, i], decaying[:, i]
             )
-            if np.isfinite(turn):
-                measured[s, HEADING] += turn
-            if floor and not diverged and s % 4 == 0:
-                variance[s] = _spread(engine, run, inputs, dt, p, first, targets, s)
-        result.append(
-            RunReplay(
-                record.name,
-                {
-                    CHANNELS[i]: _channel(
-                        CHANNELS[i], *(a[:, i] for a in (t, measured, predicted, decaying))
-                    )
-                    for i in used
-                },
-                diverged,
-                {CHANNELS[i]: float(np.sqrt(variance[::4, i].mean())) for i in used} if floor else {},
+            for i in used
+        },
+        diverged,
+        _floor(engine, run, inputs, dt, p, targets, used) if floor and not diverged else {},
+    )
+
+
+def _fly_all(
+    engine: Engine,
+    run: RunPass,
+    inputs: np.ndarray,
+    dt: np.ndarray,
+    p: np.ndarray,
+    targets: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Readings (s, 18) flown to from every start, with gusts set to zero and with gusts that decay.
+
+    Returns:
+        both, and whether every flight stayed finite.
+    """
+    predicted, decaying = np.full(targets.shape, np.nan), np.full(targets.shape, np.nan)
+    finite = True
+    for s, first in enumerate(run.start_rows):
+        for gust, out in ((0.0, predicted), (1.0, decaying)):
+            x = run.states[first].copy()
+            x[GUSTS] *= gust
+            finite &= kalman.fly_open_loop(
+                engine.compiled, dt, inputs, x, p, first, targets[s], out[s]
             )
-        )  # fmt: skip
-    return result
+    return predicted, decaying, finite
+
+
+def _readings_at(run: RunPass, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Time and value of the readings at the targets, (s, 18); the heading with the state's turns."""
+    there = targets >= 0
+    t = np.where(there, run.record.t[targets], np.nan)
+    unwrapped = _unwrapped(run.record.z)
+    measured = np.where(there, np.take_along_axis(unwrapped, targets, axis=0), np.nan)
+    rows = run.start_rows
+    turns = np.round((run.states[rows, S.PSI] - unwrapped[rows, HEADING]) / (2.0 * np.pi))
+    measured[:, HEADING] += np.where(np.isfinite(turns), 2.0 * np.pi * turns, 0.0)
+    return t, measured
+
+
+def _floor(
+    engine: Engine,
+    run: RunPass,
+    inputs: np.ndarray,
+    dt: np.ndarray,
+    p: np.ndarray,
+    targets: np.ndarray,
+    used: np.ndarray,
+) -> dict[str, float]:
+    """Std by channel that the uncertainty of every fourth start alone gives at the end."""
+    every = range(0, len(targets), FLOOR_EVERY)
+    variance = np.zeros((len(every), len(CHANNELS)))
+    for row, s in zip(variance, every, strict=True):
+        row[:] = _spread(engine, run, inputs, dt, p, targets[s], s)
+    return {CHANNELS[i]: float(np.sqrt(variance[:, i].mean())) for i in used}
 
 
 def _unwrapped(z: np.ndarray) -> np.ndarray:
@@ -151,15 +186,14 @@ def _starts(t: np.ndarray, horizon: float) -> np.ndarray:
     return np.unique(rows[rows < t.size]).astype(np.int64)
 
 
-def _targets(present: np.ndarray, t: np.ndarray, last: int, used: Sequence[int]) -> np.ndarray:
-    """Row of each channel's last reading within TAIL before `last`, or -1."""
-    targets = np.full(len(CHANNELS), -1, np.int64)
-    first = int(np.searchsorted(t, t[last] - TAIL))
-    for i in used:
-        rows = np.flatnonzero(present[first : last + 1, i])
-        if rows.size:
-            targets[i] = first + rows[-1]
-    return targets
+def _targets(run: RunPass, horizon: float) -> np.ndarray:
+    """Row of each channel's last reading within TAIL of each start's horizon, (s, 18); -1 for none."""
+    t, present = run.record.t, np.isfinite(run.record.z)
+    ends = np.searchsorted(t, t[run.start_rows] + horizon + 1e-6) - 1
+    begins = np.searchsorted(t, t[ends] - TAIL)
+    latest = np.maximum.accumulate(np.where(present, np.arange(t.size)[:, None], -1), axis=0)
+    found = latest[ends]
+    return np.ascontiguousarray(np.where(found >= begins[:, None], found, -1), dtype=np.int64)
 
 
 def _channel(
@@ -179,14 +213,14 @@ def _spread(
     inputs: np.ndarray,
     dt: np.ndarray,
     p: np.ndarray,
-    first: int,
     targets: np.ndarray,
-    slot: int,
+    s: int,
 ) -> np.ndarray:
-    """Variance by channel of a perfect model's prediction: the start's covariance flown forward."""
+    """Variance by channel of a perfect model's prediction: start s's covariance flown forward."""
+    first = run.start_rows[s]
     base = np.full(len(CHANNELS), np.nan)
     moved = np.full(len(CHANNELS), np.nan)
-    S = np.zeros((len(CHANNELS), N_FULL))
+    sensitivity = np.zeros((len(CHANNELS), N_FULL))
     x0 = run.states[first].copy()
     x0[GUSTS] = 0.0
 
@@ -194,13 +228,13 @@ def _spread(
         kalman.fly_open_loop(engine.compiled, dt, inputs, x, p, first, targets, out)
 
     fly(x0.copy(), base)
-    for j in range(20):
+    for j in range(GUSTS.start):
         x = x0.copy()
         x[j] += engine.model.state_scale[j]
         fly(x, moved)
-        S[:, j] = (moved - base) / engine.model.state_scale[j]
-    S[~np.isfinite(S)] = 0.0
-    return np.einsum("ij,jk,ik->i", S, run.start_covariances[slot], S)
+        sensitivity[:, j] = (moved - base) / engine.model.state_scale[j]
+    sensitivity[~np.isfinite(sensitivity)] = 0.0
+    return np.einsum("ij,jk,ik->i", sensitivity, run.start_covariances[s], sensitivity)
 
 
 # --- what the scripts call -------------------------------------------------------------------------
@@ -208,7 +242,7 @@ def _spread(
 
 @dataclass(frozen=True)
 class Replay:
-    """Result of `replay`: what `replay.json` says, and the traces behind it."""
+    """Result of `replay`: the content of `replay.json`, and the traces behind it."""
 
     findings: dict[str, Any]
     runs: list[RunReplay]
@@ -247,8 +281,8 @@ def replay(
         progress("estimating gusts and noise")
     noise = fit_noise(engine, model.bare_values, noise, GUST_LEVELS)
     if progress:
-        progress("flying again")
-    runs = fly_again(engine, model.bare_values, noise, horizon)
+        progress("flying the runs open loop")
+    runs = replay_runs(engine, model.bare_values, noise, horizon)
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     findings = {
         "horizon_s": horizon,

@@ -17,9 +17,9 @@ from coax_env.logs.flight import Flight
 from coax_env.model.layout import ATTITUDE, CHANNELS, GUST_FORCE, GUST_MOMENT, POSITION
 from coax_env.model.vehicle import Vehicle
 
-FRAME = 0.1  # s
-RESTART = 3.0  # s
-SETTLED = 1.5  # s of filtering before the first frame
+FRAME = 0.1  # [s] between poses
+RESTART = 3.0  # [s] of simulation before it is put onto the measured path again
+SETTLED = 1.5  # [s] of filtering before the first frame
 MOST_FRAMES = 12_000  # of all runs together; longer flights have fewer a second
 
 

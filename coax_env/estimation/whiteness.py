@@ -15,9 +15,9 @@ from scipy.stats import chi2
 
 from coax_env.estimation.engine import RunPass
 
-LAGS = 20
-SETTLING = 1.0  # s at the start of each run that are not counted
-P_VALUE = 1e-5
+LAGS = 20  # readings back to which correlations are taken
+SETTLING = 1.0  # [s] at the start of each run that are not counted
+P_VALUE = 1e-5  # of all lags' chi square: long flights show correlations that do not matter
 SHARE = 0.04  # of a channel's innovation variance that its own past predicts
 SPREAD = 1.25  # std of whitened innovations (1 where model and noise are right)
 

@@ -23,10 +23,11 @@ from coax_env.estimation.fitted_vehicle import (
 )
 from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel, record_of, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
-from coax_env.estimation.prediction import RunReplay, fly_again
+from coax_env.estimation.prediction import RunReplay, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 from coax_env.identification.maximum_likelihood import (
+    OwnNumbers,
     RunEstimate,
     each_run,
     free_parameters,
@@ -170,35 +171,42 @@ def _by_maximum_likelihood(
     quadratic = Quadratic.of(lin, found.free, values)
     names = [f.name for f in found.free]
     inflation = np.array([quadratic.variance_inflation([name], names) for name in names])
-    covariance = found.estimate.covariance * np.sqrt(np.outer(inflation, inflation))
-    std = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    dt = median_step(engine.records)
-    where = flight.path.name if flight.path else "flight"
-    after = fitted_vehicle(
-        vehicle,
-        found.free,
-        found.estimate.values,
-        {f.name: with_timing(f, std[f.name], dt) for f in found.free},
-        covariance,
-        f"identified from {where} (maximum likelihood)",
-        flight,
-    )
-    report("flying again")
+    after = _identified_vehicle(vehicle, found, inflation, median_step(engine.records), flight)
+    report("flying the runs open loop")
     again = Engine(model, [record_of(run) for run in held.runs])
     return Identification(
         held,
         vehicle,
-        replace(after, description=f"{vehicle.description}; identified from {where}"),
+        after,
         tuple(names),
         found.estimate,
         found.noise,
-        fly_again(again, model.bare_values, first),
-        fly_again(again, values, found.noise),
+        replay_runs(again, model.bare_values, first),
+        replay_runs(again, values, found.noise),
         (*known, *([found.remark] if found.remark else [])),
         *left_open(found.free, found.estimate.covariance),
         each_run(engine, found.free, lin, values, inflation),
         found.widened,
     )
+
+
+def _identified_vehicle(
+    vehicle: Vehicle, found: OwnNumbers, inflation: np.ndarray, dt: float, flight: Flight
+) -> Vehicle:
+    """The vehicle with what was found, its covariance inflated; `dt` seconds between rows."""
+    covariance = found.estimate.covariance * np.sqrt(np.outer(inflation, inflation))
+    stds = np.sqrt(np.diag(covariance)).tolist()
+    where = flight.path.name if flight.path else "flight"
+    after = fitted_vehicle(
+        vehicle,
+        found.free,
+        found.estimate.values,
+        {f.name: with_timing(f, std, dt) for f, std in zip(found.free, stds, strict=True)},
+        covariance,
+        f"identified from {where} (maximum likelihood)",
+        flight,
+    )
+    return replace(after, description=f"{vehicle.description}; identified from {where}")
 
 
 def _split(flight: Flight, hold_out: Collection[str]) -> tuple[Flight, Flight]:

@@ -20,14 +20,14 @@ from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.whiteness import is_white
 from coax_env.model.effects import CATALOGUE
 
-MOST_TURNS = 8
-ENOUGH = 1.0
+MOST_TURNS = 8  # of numbers and noise levels, fitted in turn
+LEAST_GAIN = 1.0
 """nats that another turn of numbers and noise levels must gain; ours."""
 CONFLICT = 4.0
 """Times the expected squared move, in prior std, from which the file's std count as too small; ours."""
 MARGIN = 2.0
 """Times what would do on average by which priors are widened then: errors are not all alike; ours."""
-MOST_WIDENING = 30.0
+MOST_WIDENING = 30.0  # factor on a prior's std; ours
 STEPS, TOLERANCE = 4, 0.3  # of one fit of the numbers; nats
 NOISE_EVALUATIONS = 8
 Progress = Callable[[str], None]
@@ -145,11 +145,11 @@ def _by_turns(
             free = [replace(f, std=factor * f.std) for f in free]
             progress(f"the file's std are too small: {widened:.1f} times as wide")
             best = math.inf
-        elif best - estimate.objective < ENOUGH:
+        elif best - estimate.objective < LEAST_GAIN:
             break
         else:
             best = estimate.objective
-        noise = fit_noise(engine, values, noise, GUST_LEVELS, NOISE_EVALUATIONS, ENOUGH)
+        noise = fit_noise(engine, values, noise, GUST_LEVELS, NOISE_EVALUATIONS, LEAST_GAIN)
     return OwnNumbers(free, estimate, noise, widened)
 
 

@@ -126,6 +126,6 @@ def _next_step(where: str, vehicle: str, suspect: bool, found: Sequence[EffectCh
     if suspect:
         return f"correct what is suspicious (card.toml), then scripts/check_flight.py {where} again"
     if not shown:
-        return f"these flights tell too little; plan others: {plan}"
+        return f"these flights are not informative enough; plan others: {plan}"
     diagnose = f"scripts/diagnose.py {where} --vehicle {vehicle}"
     return f"{diagnose}" + (f"; for what stays hidden, {plan}" if hidden else "")

@@ -21,15 +21,15 @@ from coax_env.logs.flight import Flight
 from coax_env.model import effects
 from coax_env.model.vehicle import Vehicle
 
-SURE = 2.0
-"""Times EVIDENCE that an effect of usual size must be worth to be expected to show."""
-NOTHING = 1e-6
+SHOWN_FROM = 2.0
+"""Times EVIDENCE that an effect of usual size must be worth to be expected to show; ours."""
+ROUNDING_INFORMATION = 1e-6
 """Information below this, in units of usual sizes, is rounding."""
 
 
 @dataclass(frozen=True)
 class EffectCheck:
-    """What these flights would tell of an effect, were it there at its usual size.
+    """What these flights would determine of an effect, were it there at its usual size.
 
     nats: expected evidence. std, usual: by parameter, expected std where it is the only effect, and
     the usual size. verdict: "shows", "may show" or "hidden". run: that shows it best. alike: effects
@@ -131,7 +131,9 @@ def _effect_checks(
 
 
 def _verdict(nats: float, evidence: float) -> str:
-    return "shows" if nats >= SURE * evidence else "may show" if nats >= evidence else "hidden"
+    if nats >= SHOWN_FROM * evidence:
+        return "shows"
+    return "may show" if nats >= evidence else "hidden"
 
 
 def _usual(problem: Problem, effect: str) -> np.ndarray:
@@ -153,9 +155,9 @@ def _stds(problem: Problem, quadratic: Quadratic, effect: str) -> list[float]:
     usual = _usual(problem, effect)
     information, _ = quadratic.projected(own, problem.base_names([effect]))
     shares, vectors = np.linalg.eigh(information * np.outer(usual, usual))
-    known = shares > NOTHING
+    known = shares > ROUNDING_INFORMATION
     variance = vectors[:, known] ** 2 @ (1.0 / shares[known])
-    variance[(np.abs(vectors[:, ~known]) > NOTHING).any(axis=1)] = np.inf
+    variance[(np.abs(vectors[:, ~known]) > ROUNDING_INFORMATION).any(axis=1)] = np.inf
     return (usual * np.sqrt(variance)).tolist()
 
 

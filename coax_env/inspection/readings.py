@@ -11,7 +11,7 @@ from coax_env.logs.flight import Flight, Run
 from coax_env.logs.repairs import GAP
 from coax_env.model.layout import CHANNEL_UNITS
 
-FROZEN = 1.0  # s
+FROZEN = 1.0  # [s] for which a channel may read one and the same value
 SATURATED = 0.005
 """Share of the readings that may stand at one extreme value."""
 

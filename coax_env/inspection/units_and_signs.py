@@ -10,18 +10,18 @@ from coax_env.model.dynamics import hover_trim
 from coax_env.model.layout import ANGLES, RPM_PER_RAD_S
 from coax_env.model.vehicle import Vehicle
 
-ALIKE = 0.95
-"""Correlation above which two channels are one quantity and its rate, whatever their units."""
-WINDOW = 1.0  # s
-FEWEST_WINDOWS = 12
-RIGHT = (0.7, 1.4)
-"""Ratios that are taken for 1."""
+LEAST_CORRELATION = 0.95
+"""Correlation above which two channels are one quantity and its rate, in any units; ours."""
+WINDOW = 1.0  # [s] over which a rate is summed: long beside its noise, short beside a maneuver
+FEWEST_WINDOWS = 12  # that a correlation is taken of; ours
+RATIOS_TAKEN_FOR_ONE = (0.7, 1.4)
+"""Ratios that are taken for 1: between them no unit is another one; ours."""
 RATE_OF = (
     ("phi", "p", 1.0), ("theta", "q", 1.0), ("psi", "r", 1.0),
     ("h", "vd", -1.0), ("pn", "vn", 1.0), ("pe", "ve", 1.0),
 )  # fmt: skip
 """Channel, the one that is its rate near hover, and the sign between them."""
-MOST = {"phi": 1.6, "theta": 1.6, "p": 15.0, "q": 15.0, "r": 15.0}
+LARGEST_IN_FLIGHT = {"phi": 1.6, "theta": 1.6, "p": 15.0, "q": 15.0, "r": 15.0}
 """What a helicopter that flies on stays under [rad, rad/s]; degrees do not."""
 
 
@@ -33,17 +33,21 @@ def unit_and_sign_faults(flight: Flight, vehicle: Vehicle) -> list[str]:
     found = _rotor_speeds(flight, vehicle) + _weight(flight, vehicle) + _sizes(flight)
     for channel, rate, sign in RATE_OF:
         slope = _slope(flight, channel, rate)
-        if slope is None or RIGHT[0] < sign * slope < RIGHT[1]:
+        if slope is None or _is_one(sign * slope):
             continue
         said = (
             f"{channel} and {rate} disagree: {channel} moves {sign * slope:+.3g} times as much as"
         )
         said += f" {rate} says"
-        if RIGHT[0] < -sign * slope < RIGHT[1]:
+        if _is_one(-sign * slope):
             found.append(f"{said}: one axis is turned, give one of them scale = -1 under [columns]")
         else:
             found.append(f"{said}: look at the units of both under [columns]")
     return found
+
+
+def _is_one(ratio: float) -> bool:
+    return RATIOS_TAKEN_FOR_ONE[0] < ratio < RATIOS_TAKEN_FOR_ONE[1]
 
 
 def _slope(flight: Flight, channel: str, rate: str) -> float | None:
@@ -65,9 +69,9 @@ def _slope(flight: Flight, channel: str, rate: str) -> float | None:
         return None
     # with a bias of the rate, not of its changes
     correlation = float(np.corrcoef(x, y)[0, 1])
-    return (
-        math.copysign(float(y.std() / x.std()), correlation) if abs(correlation) > ALIKE else None
-    )
+    if abs(correlation) <= LEAST_CORRELATION:
+        return None
+    return math.copysign(float(y.std() / x.std()), correlation)
 
 
 def _interpolated(run: Run, channel: str, times: np.ndarray) -> np.ndarray:
@@ -102,10 +106,10 @@ def _weight(flight: Flight, vehicle: Vehicle) -> list[str]:
     if values.size == 0:
         return []
     usual, g = float(np.median(values)), vehicle["gravity"].value
-    if RIGHT[0] < -usual / g < RIGHT[1]:
+    if _is_one(-usual / g):
         return []
     said = f"az is {usual:.3g} m/s2 most of the time, -{g:.3g} is expected (specific force, z down)"
-    if RIGHT[0] < usual / g < RIGHT[1]:
+    if _is_one(usual / g):
         return [f"{said}: z points up? then y points left, too: scale = -1 for ay, az, q and r"]
     if abs(usual) < 0.2 * g and not (hint := _perhaps("az", usual, -g)):
         return [f"{said}: gravity has been taken out, and is needed"]
@@ -115,7 +119,7 @@ def _weight(flight: Flight, vehicle: Vehicle) -> list[str]:
 def _sizes(flight: Flight) -> list[str]:
     """Angles and rates that are degrees, and heights that point down."""
     found = []
-    for channel, most in MOST.items():
+    for channel, most in LARGEST_IN_FLIGHT.items():
         values = np.abs(_all(flight, channel))
         if values.size and float(np.quantile(values, 0.99)) > most:
             unit = "deg" if LOG_UNITS[channel] == "rad" else "deg/s"
@@ -138,5 +142,5 @@ def _all(flight: Flight, channel: str) -> np.ndarray:
 
 
 def _perhaps(channel: str, found: float, expected: float) -> str:
-    unit = unit_that_makes(channel, expected / found, RIGHT)
+    unit = unit_that_makes(channel, expected / found, RATIOS_TAKEN_FOR_ONE)
     return f': in {unit}? say unit = "{unit}" under [columns]' if unit else ""

@@ -1,7 +1,7 @@
 """numba, with a cache that stays true.
 
 numba's own cache looks at the file of the function being compiled, not at the files of the functions
-it calls: edit a callee in another module and the old machine code still runs (numerics.md, traps).
+it calls: edit a callee in another module and the old machine code still runs.
 So the cache folder here is named by a hash over every source that takes part in the kernel; any edit
 gives a new folder, and the old one is left to age.
 """

@@ -1,4 +1,4 @@
-"""PX4 (ULog) and ArduPilot (DataFlash) logs as flights: columns, units and time stamps of contract.md.
+"""PX4 (ULog) and ArduPilot (DataFlash) logs as flights: columns, units and time stamps of flight.py.
 
 Data flow::
 

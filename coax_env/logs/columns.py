@@ -15,9 +15,9 @@ from coax_env.files import read_bytes, write_text
 from coax_env.logs.units import LOG_UNITS, factor_to_canonical
 
 DELIMITERS = ",;\t"
-MOST_SHOWN = 12
-LONGEST_NAME = 60
-SLOW_ROWS = 0.2  # s
+MOST_SHOWN = 12  # columns in an error message
+LONGEST_NAME = 60  # characters; of a longer one this many are looked at and shown
+SLOW_ROWS = 0.2  # [s] between rows; what is slower has its time in another unit
 
 USUAL_NAMES: Mapping[str, str] = {
     "t": "t time timestamp seconds sec stamp elapsed timestart timesinceboot",

@@ -18,7 +18,7 @@ from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
 SHORTEST_RUN = 2.0
 """A run must last this long [s]."""
-LONGEST_RUN = 24 * 3600.0
+LONGEST_RUN = 24 * 3600.0  # [s]
 SLOWEST_ROWS = 0.5
 """A run that lasts longer, or whose rows come more seldom [s], has its time in another unit."""
 GAP = 0.1
@@ -26,7 +26,7 @@ GAP = 0.1
 
 STALL = 2.2
 """A step this many times the usual one is a gap, and one that many times shorter is catching up."""
-CATCH_UP_ROWS = 12
+CATCH_UP_ROWS = 12  # most rows in which a logger catches up after a stall
 
 _MEASURED_ROTOR = ("rpm_upper", "rpm_lower")
 

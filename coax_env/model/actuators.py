@@ -33,6 +33,10 @@ def limit(command, before, limits, dt):
     """Hold a command (4,), in place, within the limits (3, 4), coming from the one `before`.
 
     The limited command is kept in `before` (4,). A command that is not a number stays so.
+
+    Args:
+        command: [rad/s, rad/s, rad, rad], (4,), in place. before: of the period before, (4,), in place.
+        limits: of the function of that name, (3, 4). dt: control period [s].
     """
     for k in range(N_COMMANDS):
         most = limits[FASTEST, k] * dt

@@ -21,7 +21,7 @@ kernel (MOTOR_LAG_*, SERVO_LAG, discretised exactly, so that zero is a limit and
 pure delay of the command is a shift of the input (helicopter.py), of a reading its rate of change.
 
 A stage whose effects are all off is skipped by one test, so that the bare model pays nothing.
-Signs, sizes and confounded effects follow design/effects.md; "usual" is also the width of the prior.
+Signs and usual sizes are stated with each effect; "usual" is also the width of the prior.
 What physics gives one sign only (drag, damping, stiffness, lag) is bounded at zero: a fit that wants
 the other sign is explaining something else.
 """

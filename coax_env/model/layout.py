@@ -39,6 +39,7 @@ POSITION = slice(13, 16)
 PLACE = slice(13, 15)  # north and east of it
 ROTOR_SPEED = slice(16, 18)
 SWASH = slice(18, 20)
+ACTUATORS = slice(16, 20)
 GUST_FORCE = slice(20, 23)
 GUST_MOMENT = slice(23, 26)
 GUSTS = slice(20, 26)
@@ -51,7 +52,7 @@ N_COMMANDS = len(COMMANDS)
 TIME = 4  # the kernel's input is the four commands and the time since the run's start [s]
 N_INPUTS = N_COMMANDS + 1
 
-# --- measurement channels (contract.md) -----------------------------------------------------------
+# --- measurement channels -----------------------------------------------------------------------
 CHANNEL_UNITS = {
     "rpm_upper": "rev/min", "rpm_lower": "rev/min",
     "p": "rad/s", "q": "rad/s", "r": "rad/s",

@@ -72,6 +72,10 @@ COMMAND_GAINS = {
 """Gains by which input innovations correct the filter's state (input_innovations.py); zero in a
 simulation."""
 COMMAND_GAIN = AIR_DOWN + 1
+(
+    COMMAND_GAIN_RATE_XY, COMMAND_GAIN_MOMENT_XY, COMMAND_GAIN_FORCE_XY,
+    COMMAND_GAIN_RATE_Z, COMMAND_GAIN_MOMENT_Z, COMMAND_GAIN_SPEED_Z, COMMAND_GAIN_FORCE_Z,
+) = range(COMMAND_GAIN, COMMAND_GAIN + len(COMMAND_GAINS))  # fmt: skip
 
 N_FIXED = COMMAND_GAIN + len(COMMAND_GAINS)
 # after it: one switch per stage, then the effects' parameters

@@ -55,6 +55,9 @@ def add_vibration(readings, azimuth, amplitude):
 
     An unbalance turns with the rotor: a line at rotor speed on every axis (effect `vibration`). An
     amplitude [m/s2] of zero changes nothing.
+
+    Args:
+        readings: (18,), in place. azimuth: of the upper rotor [rad]. amplitude: [m/s2].
     """
     readings[_ACCELEROMETER] += amplitude * math.sin(azimuth)
     readings[_ACCELEROMETER + 1] += amplitude * math.cos(azimuth)
@@ -63,7 +66,12 @@ def add_vibration(readings, azimuth, amplitude):
 
 @compiled()
 def measured_quantities(x, readings, sensors, out):
-    """What each sensor measures, of the readings (18,) and the full state (26,), into `out`."""
+    """What each sensor measures, of the readings (18,) and the full state (26,), into `out`.
+
+    Args:
+        x: full state, (26,). readings: without errors, (18,). sensors: `sensor_table`.
+        out: is put here, (n_sensors,), each in its channel's unit.
+    """
     for k in range(len(sensors)):
         index = int(sensors[k, INDEX])
         out[k] = readings[index] if index < N_CHANNELS else x[index - N_CHANNELS]
@@ -75,6 +83,10 @@ def delayed(value, past, row, k, delay):
 
     Keeps `value` in column `k` of the ring `past` (slots, n_sensors), with two slots more than the
     whole rows of the delay. Before the first row all was as in it.
+
+    Args:
+        value: in this row. past: (slots, n_sensors), in place. row: since the flight's start.
+        k: which sensor. delay: rows, whole or not.
     """
     slots = len(past)
     if row == 0:
@@ -114,6 +126,10 @@ def received(new, row, chance, dropout):
     """`new`, or zero where the sample is lost: where `chance` in [0, 1) is less than `dropout`.
 
     A flight's first sample is never lost.
+
+    Args:
+        new: samples since the row before. row: since the flight's start.
+        chance: drawn in [0, 1). dropout: probability that a sample is lost.
     """
     return select((row <= 0) | (chance >= dropout), new, 0.0)
 

@@ -3,7 +3,7 @@
 One table of suites serves the env, simulated flight folders and the controllers' estimator. True
 readings come from `dynamics.measure`, eq. (45), sensor effects included; sampling.py gives them delay,
 noise, bias, a rate, limits and lost samples. Sources of the numbers: Table V (noise), Table VI
-(ranges), contract.md (the rest). A vehicle file may have its own numbers for a channel
+(ranges), the rest ours. A vehicle file may have its own numbers for a channel
 (file_numbers.py); they take the place of the suites', in all suites but ``state``, which is exact.
 
 A channel slower than the 100 Hz of the control loop holds its last value, and its instrument has a

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.estimation.helicopter import UNUSUAL
+from coax_env.estimation.helicopter import UNUSUAL_FROM
 from coax_env.model import effects
 from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import bounds
@@ -122,13 +122,13 @@ def described(cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicle) -> st
 
 
 def outside_usual(effect: str, values: Values) -> bool:
-    """Whether a value is beyond UNUSUAL times its usual size, or has no meaning."""
+    """Whether a value is beyond UNUSUAL_FROM times its usual size, or has no meaning."""
     known = {p.name: p for p in effects.CATALOGUE[effect].parameters}
     return any(
         name in known
         and not known[name].shape
         and (
-            abs(value - known[name].off) > UNUSUAL * known[name].usual
+            abs(value - known[name].off) > UNUSUAL_FROM * known[name].usual
             or not known[name].lower <= value <= known[name].upper
         )
         for name, value in values.items()

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 Findings = Mapping[str, Any]
 MOST_CAUSES_NAMED = 4
 """Causes in the headline; of more, the strongest three."""
-MOST_RUNS_NAMED = 12
+MOST_RUNS_NAMED = 12  # of more, their number
 
 
 def diagnosis_page(

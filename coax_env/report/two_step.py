@@ -9,7 +9,13 @@ from coax_env.identification.two_step.published import (
 )
 from coax_env.plain_words import and_list, capital, number, plain, with_std
 from coax_env.report.page import Section, bullets, callout, command, details, page, prose, table
-from coax_env.report.two_step_modes import FAR, LETTERS, far_from_physics, in_letters, mode_blocks
+from coax_env.report.two_step_modes import (
+    LETTERS,
+    MARKED_FROM,
+    far_from_physics,
+    in_letters,
+    mode_blocks,
+)
 from coax_env.report.two_step_states import (
     flapping_figure,
     longitudinal_run,
@@ -25,7 +31,7 @@ def two_step_page(result: TwoStep, command_line: str = "") -> str:
     if far:
         lead.append(
             f"In {and_list([fit.mode.name for fit in far])} the paper's form leaves entries more than "
-            f"{FAR:.0f} standard deviations from what the vehicle file's physics gives."
+            f"{MARKED_FROM:.0f} standard deviations from what the vehicle file's physics gives."
         )
     tied = [fit for fit in result.modes if fit.tied.directions]
     if tied:
@@ -158,7 +164,7 @@ def _published_rows(result: TwoStep) -> list[list[str]]:
                     f"{printed.response}, {LETTERS.get(name, name)}",
                     f"{value:g} ({std:g})",
                     number(expected, 3),
-                    f"**{away:.0f}**" if away > FAR else f"{away:.1f}",
+                    f"**{away:.0f}**" if away > MARKED_FROM else f"{away:.1f}",
                 ]
             )
     return rows

@@ -10,7 +10,7 @@ from coax_env.report.page import bullets, figure, prose, table
 
 POINTS = 500
 """Per curve of a figure."""
-FAR = 3.0
+MARKED_FROM = 3.0
 """Standard deviations from the physics at which an entry is marked."""
 LETTERS = {
     "1": "0", "alpha_u": "α_u", "alpha_l": "α_l", "beta_u": "β_u", "beta_l": "β_l",
@@ -104,7 +104,7 @@ def _inflation(fit: ModeFit, name: str) -> str:
 def far_from_physics(fit: ModeFit) -> list[str]:
     """Entries of the paper's form that are far from the physics, the intercept aside."""
     away = np.abs(fit.total.values - [fit.expected[n] for n in fit.total.names]) / fit.total.std
-    return [n for n, a in zip(fit.total.names, away, strict=True) if a > FAR and n != "1"]
+    return [n for n, a in zip(fit.total.names, away, strict=True) if a > MARKED_FROM and n != "1"]
 
 
 def in_letters(text: str) -> str:

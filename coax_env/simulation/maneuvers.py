@@ -101,12 +101,20 @@ def _steps_at(t: np.ndarray, steps: Steps) -> np.ndarray:
 
 
 def doublet(amplitude: float, start: float = 2.0, side: float = 2.0) -> Steps:
-    """One side, then the other, then nothing."""
+    """One side, then the other, then nothing.
+
+    Args:
+        amplitude: of each side, in the input's unit. start: of the first [s]. side: its length [s].
+    """
     return [(start, amplitude), (start + side, -amplitude), (start + 2 * side, 0.0)]
 
 
 def steps_3211(amplitude: float, start: float = 2.0, unit: float = 0.5) -> Steps:
-    """Sides of three, two, one and one unit: a broad spectrum in few seconds."""
+    """Sides of three, two, one and one unit: a broad spectrum in few seconds.
+
+    Args:
+        amplitude: of each side, in the input's unit. start: of the first [s]. unit: [s].
+    """
     steps, time, level = [], start, amplitude
     for sides in (3, 2, 1, 1):
         steps.append((time, level))
@@ -115,7 +123,12 @@ def steps_3211(amplitude: float, start: float = 2.0, unit: float = 0.5) -> Steps
 
 
 def pulses(amplitude: float, start: float, width: float, pause: float, count: int) -> Steps:
-    """Short pulses of alternating sign with pauses between them."""
+    """Short pulses of alternating sign with pauses between them.
+
+    Args:
+        amplitude: in the input's unit. start: of the first [s].
+        width, pause: of and between pulses [s]. count: of pulses.
+    """
     steps = []
     for k in range(count):
         begin = start + k * (width + pause)

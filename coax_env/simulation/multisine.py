@@ -1,4 +1,4 @@
-"""Orthogonal multisines with optimised phases: every input stirred at once, and told apart after.
+"""Orthogonal multisines with optimised phases: every input excited at once, and separated after.
 
 Each input gets its own harmonics of the record's base frequency, interleaved with the others', so that
 over a whole record the inputs are orthogonal in time and in frequency whatever their phases (Morelli
@@ -16,14 +16,17 @@ from coax_env.errors import InputError
 
 UPDATE = 0.05
 """Seconds between the steps by which an input follows its sum of sines."""
-LOWEST = 0.2  # Hz
-HIGHEST = 2.5  # Hz: flapping and attitude answer below
+LOWEST = 0.2  # [Hz] ours: slower, and the machine drifts away
+HIGHEST = 2.5  # [Hz] flapping and attitude answer below
 
 
 def harmonics(
     inputs: int, duration: float, lowest: float = LOWEST, highest: float = HIGHEST
 ) -> list:
     """Harmonic numbers of each input, interleaved: input i gets every `inputs`-th one.
+
+    Args:
+        inputs: how many. duration: of the record [s]. lowest, highest: ends of the band [Hz].
 
     Raises:
         InputError: the record is too short to give each input two.
@@ -42,6 +45,9 @@ def multisines(inputs: int, duration: float, seed: int = 0) -> np.ndarray:
     """Histories of peak 1, one per input, each UPDATE seconds: shape (n, inputs).
 
     They begin and end near 0, where a run begins at trim.
+
+    Args:
+        inputs: how many. duration: of the record [s]. seed: of the second set of first phases.
     """
     t = np.arange(0.0, duration, UPDATE)
     rng = np.random.default_rng(seed)
@@ -68,7 +74,12 @@ def relative_peak_factor(wave: np.ndarray) -> float:
 
 
 def steps(wave: np.ndarray, size: float, start: float) -> Sequence[tuple[float, float]]:
-    """A history as the (time, level) steps of a maneuver, from `start` on, back to 0 at its end."""
+    """A history as the (time, level) steps of a maneuver, from `start` on, back to 0 at its end.
+
+    Args:
+        wave: one level each UPDATE seconds, (n,). size: level of 1, in the input's unit.
+        start: [s].
+    """
     levels = [(start + UPDATE * k, size * float(v)) for k, v in enumerate(wave)]
     return [*levels, (start + UPDATE * len(wave), 0.0)]
 

@@ -106,7 +106,7 @@ def doublet_table(vehicle: Vehicle | str = "lama400d") -> tuple[DoubletRow, ...]
 
 @dataclass(frozen=True)
 class Remark:
-    """A statement of design/paper.md about the doublet, checked by flying it."""
+    """A statement of ours about the paper's doublet, checked by flying it."""
 
     statement: str
     expected: tuple[float, ...]

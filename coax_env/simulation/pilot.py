@@ -16,16 +16,17 @@ from coax_env.model.layout import N_COMMANDS, N_STATES, PLACE
 from coax_env.model.linear import N_FLOWN, sampled
 from coax_env.model.vehicle import Vehicle
 
-TREMOR_MEMORY = 0.2  # [s]
+TREMOR_MEMORY = 0.2  # [s]; ours
 TREMOR = np.array([0.6, 0.6, 0.0035, 0.0035])
-"""Std of the pilot's hands on the commands [rad/s, rad/s, rad, rad]."""
+"""Std of the pilot's hands on the commands [rad/s, rad/s, rad, rad]; ours."""
 
 _HELD = [i for i in range(N_FLOWN) if i not in (S.X, S.Y)]  # all but the horizontal position
 _TOLERATED = np.array(
     [0.6, 0.6, 0.5, 1.2, 1.2, 0.9, 1.0, 1.0, 1.0, 1.0, 0.2, 0.2, 0.5, np.inf, np.inf, 0.25]
 )
-"""Deviation of each state that costs as much as one unit of effort."""
-_EFFORT = np.array([0.04, 0.04, 0.08, 0.08])  # rotor speeds as a fraction of trim; rad
+"""Deviation of each state that costs as much as one unit of effort [SI]; ours."""
+_EFFORT = np.array([0.04, 0.04, 0.08, 0.08])
+"""One unit of effort: rotor speeds as a fraction of trim, swash tilts in rad; ours."""
 
 CORNER = 1.0  # [s] over which the pilot rounds the corners of what he is asked for
 

@@ -11,7 +11,7 @@ from typing import Any
 from scipy.stats import binomtest
 
 TIES: tuple[frozenset[str], ...] = (
-    # first-order lag and pure delay differ above 3 Hz only, where gusts and gyro noise are (effects.md)
+    # first-order lag and pure delay differ above 3 Hz only, where gusts and gyro noise are
     frozenset({"servo_lag", "servo_delay"}),
     # the same acceleration; they part by the moments' gain alone, which K_b, I_xx, I_yy cover (3-5 %)
     frozenset({"added_mass", "thrust_scale"}),

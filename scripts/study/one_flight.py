@@ -21,7 +21,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
-from coax_env.estimation.prediction import fly_again
+from coax_env.estimation.prediction import replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
 from coax_env.logs.flight import Flight, read_flight
@@ -35,7 +35,7 @@ from study.store import code_hash
 GUSTS = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003, "memory": 0.5}
 """Std of the generator's gusts [N, N m] and their correlation time [s]."""
 
-SURE = 3.0
+SHOWN_FROM = 3.0
 """Thresholds that an effect of a flight of kind "many" must be expected to be worth on all its runs; a
 quarter of them is held out, and two are then left."""
 
@@ -135,7 +135,7 @@ def showing(planned: PlannedFlight, place: Path) -> tuple[PlannedFlight, Path, d
         shown = {
             effect: sizes
             for effect, sizes in planned.effects.items()
-            if (expected[effect] or 0.0) > SURE * SETTINGS.evidence
+            if (expected[effect] or 0.0) > SHOWN_FROM * SETTINGS.evidence
         }
         if len(shown) == len(planned.effects):
             return planned, folder, truth
@@ -211,10 +211,15 @@ def _worth(
 def gain_of_the_truth(
     result: Diagnosis, hidden: list[str], values: Mapping[str, float], held: Collection[str]
 ) -> dict[str, Any]:
-    """What the true structure removes on the same held-out runs, refitted on the same others."""
+    """What the true structure removes on the same held-out runs, refitted on the same others.
+
+    Args:
+        result: of the diagnosis. hidden: the flight's true effects.
+        values: of the generator, by its own names. held: names of the runs held out.
+    """
     fit, engine_held = forced(result.flight, hidden, values, held)
     horizon = SETTINGS.horizon
-    replayed = fly_again(engine_held, fit.values, fit.noise, horizon)
+    replayed = replay_runs(engine_held, fit.values, fit.noise, horizon)
     gain = gain_of(result.replay_before, result.replay_refitted, replayed, result.noise, horizon)
     return {key: gain[key] for key in ("error_removed_percent", "ci95")}
 
@@ -222,7 +227,12 @@ def gain_of_the_truth(
 def forced(
     flight: Flight, hidden: list[str], values: Mapping[str, float], held: Collection[str]
 ) -> tuple[Fit, Engine]:
-    """These effects fitted, from their true sizes on; and the engine of the held-out runs."""
+    """These effects fitted, from their true sizes on; and the engine of the held-out runs.
+
+    Args:
+        flight: its runs. hidden: names of the effects.
+        values: of the generator, by its own names. held: names of the runs held out.
+    """
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     model = HeliModel(vehicle)
     problem = Problem.of(model, _records(flight, held, within=False), hidden)

@@ -74,7 +74,7 @@ SIZES: dict[str, dict[str, tuple[float, float, bool]]] = {
     "vibration": {"amplitude": (0.2, 1.0, False)},
     "outside": {"heading_moment": (0.015, 0.03, False)},
 }
-"""effect -> parameter of the generator -> least, most, either sign: usual sizes of effects.md."""
+"""effect -> parameter of the generator -> least, most, either sign: the catalogue's usual sizes."""
 
 CARRIERS = {"wind": "rotor_drag"}
 """Effects that act only through another one, which is then hidden with them."""

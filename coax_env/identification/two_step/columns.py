@@ -18,10 +18,11 @@ from coax_env.identification.two_step.loads import loads, scales
 from coax_env.identification.two_step.processing import even_grid, lagrange_derivative, low_pass
 from coax_env.identification.two_step.reconstruction import flapping
 from coax_env.logs.flight import Run
+from coax_env.model import inputs as U
 from coax_env.model.vehicle import Vehicle
 
 EDGE = 0.5
-"""Seconds at either end of a run that are left out: the filter and the flap angles settle there."""
+"""Seconds at either end of a run that are left out: the filter's and the flap angles' transients."""
 DRAWS = 60
 """Of the sensors' noise, per run."""
 IMU = ("p", "q", "r", "ax", "ay", "az")
@@ -95,6 +96,22 @@ def _noise(
     return np.column_stack([np.interp(t, run.t[there], column) for column in read.T])
 
 
+def _tilts(
+    signals: Mapping[str, np.ndarray],
+    delta_lon: np.ndarray,
+    delta_lat: np.ndarray,
+    dt: float,
+    p: Mapping[str, float],
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Tilts [rad] of the upper and of the lower disc, back and right, by (26)-(29) from rest."""
+    bar, flap = p["flybar_time_constant"], p["flap_time_constant"]
+    alpha_u = p["flybar_to_rotor_lon"] * flapping(signals["q"], 0.0, dt, bar, 0.0)
+    beta_u = p["flybar_to_rotor_lat"] * flapping(signals["p"], 0.0, dt, bar, 0.0)
+    alpha_l = flapping(signals["q"], delta_lon, dt, flap, p["swash_to_flap"])
+    beta_l = flapping(signals["p"], delta_lat, dt, flap, p["swash_to_flap"])
+    return (alpha_u, alpha_l), (beta_u, beta_l)
+
+
 def columns_of(
     signals: Mapping[str, np.ndarray], command: np.ndarray, dt: float, vehicle: Vehicle
 ) -> Columns:
@@ -105,19 +122,14 @@ def columns_of(
         vehicle: whose numbers the columns take.
     """
     p = {name: parameter.value for name, parameter in vehicle.parameters.items()}
-    speeds = [
+    omega_u, omega_l = (
         signals[rpm] * math.pi / 30.0 if rpm in signals else command[:, i]
-        for i, rpm in enumerate(("rpm_upper", "rpm_lower"))
-    ]
-    force, moment = scales(vehicle, speeds[0])
-    tau, bar = p["flap_time_constant"], p["flybar_time_constant"]
-    delta_lon, delta_lat = command[:, 2], command[:, 3]
-    alpha_u = p["flybar_to_rotor_lon"] * flapping(signals["q"], 0.0, dt, bar, 0.0)
-    beta_u = p["flybar_to_rotor_lat"] * flapping(signals["p"], 0.0, dt, bar, 0.0)
-    alpha_l = flapping(signals["q"], delta_lon, dt, tau, p["swash_to_flap"])
-    beta_l = flapping(signals["p"], delta_lat, dt, tau, p["swash_to_flap"])
-    tilts = (alpha_u, alpha_l), (beta_u, beta_l)
-    flown = loads(vehicle, speeds[0], speeds[1], *tilts, (signals["p"], signals["q"]))
+        for i, rpm in ((U.OMEGA_U, "rpm_upper"), (U.OMEGA_L, "rpm_lower"))
+    )
+    force, moment = scales(vehicle, omega_u)
+    delta_lon, delta_lat = command[:, U.DELTA_LON], command[:, U.DELTA_LAT]
+    tilts = (alpha_u, alpha_l), (beta_u, beta_l) = _tilts(signals, delta_lon, delta_lat, dt, p)
+    flown = loads(vehicle, omega_u, omega_l, *tilts, (signals["p"], signals["q"]))
     moment_x, moment_y, moment_z = (
         p[inertia] * lagrange_derivative(signals[rate], dt)
         for inertia, rate in (("inertia_xx", "p"), ("inertia_yy", "q"), ("inertia_zz", "r"))
@@ -145,8 +157,8 @@ def columns_of(
         "C_n": moment_z / moment,
         # the same in newtons and with what ties them pooled: PHYSICS
         "weight": -p["mass"] * signals["az"],
-        "lift_u": -loads(vehicle, speeds[0], 0.0, *tilts).Z,
-        "lift_l": -loads(vehicle, 0.0, speeds[1], *tilts).Z,
+        "lift_u": -loads(vehicle, omega_u, 0.0, *tilts).Z,
+        "lift_l": -loads(vehicle, 0.0, omega_l, *tilts).Z,
         "moment_z": moment_z,
         "against_l": -flown.Q_l,
         "moment_y": moment_y,

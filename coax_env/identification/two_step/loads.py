@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coax_env.kernel.compilation import compiled
+from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model import workspace as F
@@ -66,16 +67,19 @@ def loads(
     return Loads(*(part.reshape(np.shape(flat[0])) for part in found))
 
 
+_OMEGA_U, _OMEGA_L, _ALPHA_F, _BETA_F, _ALPHA_L, _BETA_L, _P, _Q = range(8)
+
+
 @compiled(makes_arrays=True)
 def _load_rows(rows: np.ndarray, p: np.ndarray, found: np.ndarray) -> None:
     """Rows of omega_u, omega_l, alpha_f, beta_f, alpha_l, beta_l, p, q, (n, 8), to loads (10, n)."""
     x, u, work = np.zeros(N_FULL), np.zeros(N_INPUTS), np.empty(WORK_SIZE)
     readings = np.empty(N_CHANNELS)
     for i in range(len(rows)):
-        u[0], u[1] = rows[i, 0], rows[i, 1]
-        x[S.ALPHA_F], x[S.BETA_F] = rows[i, 2], rows[i, 3]
-        x[S.ALPHA_L], x[S.BETA_L] = rows[i, 4], rows[i, 5]
-        x[S.P], x[S.Q] = rows[i, 6], rows[i, 7]
+        u[U.OMEGA_U], u[U.OMEGA_L] = rows[i, _OMEGA_U], rows[i, _OMEGA_L]
+        x[S.ALPHA_F], x[S.BETA_F] = rows[i, _ALPHA_F], rows[i, _BETA_F]
+        x[S.ALPHA_L], x[S.BETA_L] = rows[i, _ALPHA_L], rows[i, _BETA_L]
+        x[S.P], x[S.Q] = rows[i, _P], rows[i, _Q]
         measure(x, u, p, work, readings)
         for k in range(len(_PLACES)):
             found[k, i] = work[_PLACES[k]]

@@ -111,11 +111,7 @@ def two_step(
     Raises:
         InputError: no run has gyros, accelerometers and a height.
     """
-
-    def report_progress(text: str) -> None:
-        if progress:
-            progress(text)
-
+    report_progress = progress or (lambda text: None)
     usable = [run for run in flight.runs if all(c in run.measured for c in IMU)]
     if not usable:
         raise InputError(
@@ -132,30 +128,14 @@ def two_step(
     if left_out:
         remarks.append(f"without gyros or accelerometers, left out: {', '.join(left_out)}")
     report_progress("filtering and reconstructing the states")
-    quiet = _noise_record(usable)
-    hover = _still(quiet, cutoff)
-    reconstructed = tuple(
-        _reconstruct(
-            run, _still(run, cutoff, QUIET) if run is quiet else hover, vehicle, noise, cutoff
-        )
-        for run in usable
-        if "h" in run.measured
-    )
+    reconstructed = _reconstruct_all(usable, vehicle, noise, cutoff)
     if not reconstructed:
         remarks.append("no height was logged: the states of step 1 are not reconstructed")
     report_progress("regressing the coefficients")
     moving = [run for run in usable if any(excites(run, axis) for axis in LEAST_MOVEMENT)]
     parts = {run.name: rows_of(run, vehicle, noise, cutoff, k) for k, run in enumerate(moving)}
     modes = [fit_mode(mode, moving, parts, vehicle) for mode in MODES]
-    idle: dict[str, list[str]] = {}
-    for mode, fit in zip(MODES, modes, strict=True):
-        if fit is None:
-            idle.setdefault(mode.axis, []).append(mode.name)
-    for axis, names in idle.items():
-        remarks.append(
-            f"no run moves {axis} enough (std {LEAST_MOVEMENT[axis]}): "
-            f"no regression of {', '.join(names)}"
-        )
+    remarks += _not_excited(modes)
     report_progress("fitting the vehicle's numbers")
     physical, after = _physical(moving, vehicle, noise, cutoff, flight)
     return TwoStep(
@@ -169,6 +149,19 @@ def two_step(
         physical,
         tuple(remarks),
     )
+
+
+def _not_excited(modes: Sequence[ModeFit | None]) -> list[str]:
+    """A remark for every axis that no run moves enough for its modes."""
+    idle: dict[str, list[str]] = {}
+    for mode, fit in zip(MODES, modes, strict=True):
+        if fit is None:
+            idle.setdefault(mode.axis, []).append(mode.name)
+    return [
+        f"no run moves {axis} enough (std {LEAST_MOVEMENT[axis]}): "
+        f"no regression of {', '.join(names)}"
+        for axis, names in idle.items()
+    ]
 
 
 def _noise_of(flight: Flight, channel: str) -> float:
@@ -191,6 +184,21 @@ def _still(run: Run, cutoff: float, seconds: float = math.inf) -> dict[str, np.n
     dt, t, raw = even_grid(run, IMU)
     kept = t - t[0] <= seconds + dt
     return {c: low_pass(values[kept], dt, cutoff) for c, values in raw.items()}
+
+
+def _reconstruct_all(
+    runs: Sequence[Run], vehicle: Vehicle, noise: Mapping[str, float], cutoff: float
+) -> tuple[Reconstructed, ...]:
+    """Of the runs that have a height; the noise record is the quietest run, of itself its start."""
+    quiet = _noise_record(runs)
+    hover = _still(quiet, cutoff)
+    return tuple(
+        _reconstruct(
+            run, _still(run, cutoff, QUIET) if run is quiet else hover, vehicle, noise, cutoff
+        )
+        for run in runs
+        if "h" in run.measured
+    )
 
 
 def _reconstruct(

@@ -91,7 +91,7 @@ PHYSICS = (
 LEAST_MOVEMENT = {"delta_lon": 0.015, "delta_lat": 0.015, "collective": 0.01, "differential": 0.005}
 """Std of a command above which a run excites its mode: swash tilt [rad], half the sum and half the
 difference of the rotor speeds over their means. Less is the pilot's own work, which follows the gusts
-and so makes a poor regressor (numerics.md)."""
+and so makes a poor regressor."""
 _THROTTLE = ("collective", "differential")
 
 

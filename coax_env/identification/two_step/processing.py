@@ -46,6 +46,9 @@ def _butterworth(cutoff: float, rate: float) -> np.ndarray:
 def low_pass(values: np.ndarray, dt: float, cutoff: float = CUTOFF) -> np.ndarray:
     """Butterworth low-pass run forwards and backwards, so without phase, along axis 0.
 
+    Args:
+        values: (n,) or (n, k). dt: seconds between rows. cutoff: of one pass [Hz].
+
     Raises:
         InputError: the record is too short or too coarse for it.
     """
@@ -114,6 +117,10 @@ def integrated(
     """Pitch, velocity and height by integrating the IMU from rest, (46)-(49): the paper's check.
 
     Returns theta [rad], u, w [m/s], h [m], each (n,).
+
+    Args:
+        q: [rad/s], ax, az: [m/s2], (n,) each. dt: seconds between rows.
+        gravity: [m/s2]. height: at the start [m].
     """
     theta = cumulative_trapezoid(q, dx=dt, initial=0.0)
     theta -= theta[0]

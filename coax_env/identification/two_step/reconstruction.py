@@ -16,6 +16,7 @@ from scipy.signal import lfilter
 from coax_env.kernel.compilation import compiled
 
 THETA, U, W, H, BIAS = range(5)
+GYRO, AX, AZ = range(3)
 START_STD = np.array([0.02, 0.05, 0.05, 0.05, 0.1])
 """Of the first state, from rest: 1 deg, 5 cm/s, the sonar's reading, 0.1 m/s2. Ours."""
 
@@ -90,8 +91,9 @@ def _filter(
         after = min(k + 1, n - 1)
         _rates(x, q[k], ax[k], az[k], g, slope)
         middle[:] = x + 0.5 * dt * slope
-        halfway = 0.5 * (q[k] + q[after]), 0.5 * (ax[k] + ax[after]), 0.5 * (az[k] + az[after])
-        _rates(middle, halfway[0], halfway[1], halfway[2], g, slope)
+        q_half, ax_half = 0.5 * (q[k] + q[after]), 0.5 * (ax[k] + ax[after])
+        az_half = 0.5 * (az[k] + az[after])
+        _rates(middle, q_half, ax_half, az_half, g, slope)
         x = x + dt * slope
         sin, cos = np.sin(middle[THETA]), np.cos(middle[THETA])
         A = np.zeros((5, 5))
@@ -101,8 +103,8 @@ def _filter(
         A[H, U], A[H, W] = sin, -cos
         F = np.eye(5) + dt * A + 0.5 * dt * dt * (A @ A)
         G = np.zeros((5, 3))
-        G[THETA, 0], G[U, 0], G[W, 0] = 1.0, -middle[W], middle[U]
-        G[U, 1] = G[W, 2] = 1.0
+        G[THETA, GYRO], G[U, GYRO], G[W, GYRO] = 1.0, -middle[W], middle[U]
+        G[U, AX] = G[W, AZ] = 1.0
         transition[k] = F
         P = F @ P @ F.T + dt * dt * ((G * process_noise) @ G.T)
     return predicted, P_predicted, filtered, P_filtered, transition
@@ -144,6 +146,10 @@ def flapping(
 
     a' = (gain tilt - a) / time_constant - rate: the tilt held from row to row, exactly; the rate by the
     trapezoidal rule. Columns of an (n, k) `rate` are followed each on its own.
+
+    Args:
+        rate: of the body, (n,) or (n, k) [rad/s]. tilt: of the swash plate, (n,) or one [rad].
+        dt: seconds between rows. time_constant: [s]. gain: flap per swash tilt [1].
     """
     half = 0.5 * dt / time_constant
     turning = lfilter([0.5 * dt, 0.5 * dt], [1.0 + half, half - 1.0], rate, axis=0)

@@ -34,7 +34,7 @@ GUST_SIZES = np.geomspace(0.02, 3.0, 24)
 """Variances of a gust that are tried, in those of the residual."""
 GUST_MEMORIES = 7
 """How many memories of a gust are tried."""
-ENOUGH = 3.0
+LEAST_DISTANCE = 3.0
 """Standard errors by which the weakest direction must stand out of its own errors for total least
 squares to be trusted: (r^2 - 1) sqrt(rows / 2), r = smin(X) / smin([X y])."""
 
@@ -44,8 +44,8 @@ class Regression:
     """Result of a regression.
 
     names, values: (k,) coefficients. covariance: (k, k), coloured residuals counted. residual: (n,).
-    rows: how many independent ones the residuals amount to. weakest: see ENOUGH; infinite for least
-    squares. method: "least squares" or "total least squares".
+    rows: how many independent ones the residuals amount to. weakest: see LEAST_DISTANCE;
+    infinite for least squares. method: "least squares" or "total least squares".
     """
 
     names: tuple[str, ...]
@@ -64,7 +64,7 @@ class Regression:
     @property
     def trusted(self) -> bool:
         """Whether the weakest direction stands out of the errors."""
-        return self.weakest > ENOUGH
+        return self.weakest > LEAST_DISTANCE
 
     def interval(self, level: float = 0.95) -> np.ndarray:
         """Two-sided intervals (k, 2), Student's with as many degrees as independent rows are left."""
@@ -308,7 +308,7 @@ class Direction:
 
 @dataclass(frozen=True)
 class Collinearity:
-    """What a set of regressors cannot tell apart, the intercept aside.
+    """What a set of regressors does not determine, the intercept aside.
 
     inflation: name -> how much larger its variance is than were it alone (VIF). singular: singular
     values of the columns about their means, each scaled to length 1. directions: the weak ones.
