@@ -48,7 +48,8 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/estimation/trajectories.py": ("tests/test_report.py",),
     "coax_env/estimation/*": (
         "tests/test_estimation.py", "tests/test_kalman.py", "tests/test_helicopter.py",
-        "tests/test_input_innovations.py", "tests/test_quadratic.py", "tests/test_prediction.py", "tests/test_diagnosis.py",
+        "tests/test_input_innovations.py", "tests/test_quadratic.py", "tests/test_prediction.py",
+        "tests/test_diagnosis.py",
     ),
     "coax_env/identification/two_step/*": ("tests/test_two_step.py",),
     "coax_env/identification/*": ("tests/test_identification.py", "tests/test_two_step.py"),
