@@ -104,16 +104,17 @@ def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) ->
 
 
 def fast_filter(
-    record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray
+    record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray, refresh: int = 1
 ) -> tuple[float, int, kalman.Trace, kalman.Covariances]:
-    """`filter_pass` with new Jacobians at every row, and all that it stores."""
+    """`filter_pass` with new Jacobians every `refresh` rows, and all that it stores."""
     model = Pendulum()
     model.state_scale = np.full(2, 1e-7)  # so that differences are as good as derivatives
     (n, m), readings = record.z.shape, int(np.isfinite(record.z).sum())
     trace = kalman.Trace(
         np.zeros((n, 2)), np.zeros((n, m)),
         kalman.Gains(
-            np.zeros((readings, 2), np.float32), np.zeros(readings), np.zeros((n, m, 2), np.float32)
+            np.zeros((readings, 2), np.float32), np.zeros(readings),
+            np.zeros((math.ceil(n / refresh), m, 2), np.float32),
         ),
         kalman.Path(np.zeros((n, 2, 2), np.float32), np.zeros(n, np.int64), np.zeros((n, 2))),
     )  # fmt: skip
@@ -121,7 +122,7 @@ def fast_filter(
     run = kalman.RunData(np.append(np.diff(record.t), 0.0), record.command, record.z)
     start = kalman.Variances(Pendulum.start_at, np.diag(Pendulum.start_std**2), R, q)
     log_likelihood, beyond = kalman.filter_pass(
-        kalman.CompiledModel.of(model), run, start, p, GATE, 1, trace, kept
+        kalman.CompiledModel.of(model), run, start, p, GATE, refresh, trace, kept
     )
     return log_likelihood, beyond, trace, kept
 
@@ -154,6 +155,24 @@ def test_the_pass_is_the_textbooks_filter(sine, clock):
         (trace.gains.H, np.broadcast_to(H, trace.gains.H.shape)),
     ):  # fmt: skip
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("factor", [0.4, 3.0])
+def test_a_step_that_changes_much_has_its_own_jacobian(factor):
+    """Between refreshes too: a linear pendulum's F is known at every step, each its own."""
+    values = {**TRUTH, "sine": 0.0}
+    record = swing(11, n=60, values=values)
+    steps = np.full(60, DT)
+    steps[2::5] *= factor  # never where the Jacobians are refreshed alone
+    record = replace(record, t=np.cumsum(steps))
+    model = Pendulum()
+    p, q = model.vector(values), model.process_noise(NOISE)
+    R = np.array([NOISE.reading[c] for c in CHANNELS]) ** 2
+    _, _, trace, _ = fast_filter(record, p, R, q, refresh=4)
+    for k, dt in enumerate(np.diff(record.t)):
+        F = step_of(np.zeros(2), 0.0, dt, p)[1]
+        found = trace.path.F[trace.path.F_of[k]]
+        np.testing.assert_allclose(found, F, rtol=0, atol=1e-6, err_msg=f"row {k}, {dt:.4f} s")
 
 
 # --- sparse matrices --------------------------------------------------------------------------------
