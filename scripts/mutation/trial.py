@@ -48,6 +48,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/estimation/trajectories.py": ("tests/test_report.py",),
     "coax_env/estimation/*": (
         "tests/test_estimation.py", "tests/test_kalman.py", "tests/test_helicopter.py",
+        "tests/test_fitted_vehicle.py",
         "tests/test_input_innovations.py", "tests/test_quadratic.py", "tests/test_prediction.py",
         "tests/test_diagnosis.py",
     ),
