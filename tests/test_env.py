@@ -148,6 +148,23 @@ def test_rows_without_a_seed_of_their_own_fly_apart():
         env.reset(seed=[1, 2])
 
 
+@pytest.mark.parametrize("n", [3, 16], ids=["one by one", "in a SIMD batch"])
+def test_the_order_of_actions_in_memory_changes_nothing(n):
+    """Row by row, column by column, or every second of a larger array."""
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (n, 4))
+    spread = np.zeros((2 * n, 8))
+    spread[::2, ::2] = actions
+    ends = []
+    for given in (actions, np.asfortranarray(actions), spread[::2, ::2], actions.astype(">f8")):
+        env = CoaxVectorEnv(n)
+        env.reset(seed=1)
+        for _ in range(5):
+            observations, *_ = env.step(given)
+        ends.append(observations)
+    for end in ends[1:]:
+        np.testing.assert_array_equal(end, ends[0])
+
+
 def test_threads_change_nothing():
     flown = []
     for threads in (1, 3):

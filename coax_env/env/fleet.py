@@ -201,10 +201,13 @@ class Fleet:
         """One control period; `x` is a new array then, and the one before stays as it was.
 
         Args:
-            actions: (count, 4) float64; whether they are clipped in place is left open.
+            actions: (count, 4); whether they are clipped in place is left open.
             active: which rows fly, (count,). anew: which of the others start a new flight, (count,).
         """
         n = self.count
+        # the loops are looked up once: from here on no type and no order in memory is checked
+        actions = np.ascontiguousarray(actions, dtype=np.float64)
+        active = np.ascontiguousarray(active, dtype=np.bool_)
         heli, world, mission = self.helicopters, self.world, self.mission
         outcome = Outcome(
             np.empty((n, self.n_observed), dtype=np.float32),

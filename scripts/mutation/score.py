@@ -5,7 +5,7 @@ from typing import Any
 
 from mutation.draw import PARTS, part_of
 
-ENOUGH = 0.9  # of the mutations
+ENOUGH = 0.95  # of the mutations
 
 
 def share(rows: Sequence[Mapping[str, Any]]) -> float:
