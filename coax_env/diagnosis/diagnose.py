@@ -38,6 +38,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import remarks, vibration_removed
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
+from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine, Progress
 from coax_env.estimation.fitted_vehicle import double_counting
@@ -135,7 +136,7 @@ def diagnose(
     fit, quadratic = search(problem, refitted)
     problem, fit, quadratic, terms = unlisted.explain(problem, fit, quadratic)
     report("weighing the causes against their confounded alternatives")
-    problem, fit = with_command_gains(problem, fit)
+    problem, fit = with_command_gains(beside_large_axes(problem, fit), fit)
     fit, quadratic, evidence = prune(problem, fit)
     passes_after = problem.engine.filter(fit.values, fit.noise)
     white = {
@@ -143,7 +144,9 @@ def diagnose(
         "after": whiteness(passes_after, CHANNELS),
     }
     found = confounding.alternatives(problem, fit, quadratic, evidence, white["after"])
-    causes = findings.causes(problem, fit, quadratic, evidence, found, new_line)
+    report("asking left-out runs, halves and other noise whether the names hold")
+    trust = trusts(problem, fit, quadratic, evidence, found, white["after"])
+    causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_line)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)
     unexplained = described + findings.unexplained(white["after"], speaking_for)
