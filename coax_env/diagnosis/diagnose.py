@@ -23,7 +23,7 @@ import numpy as np
 from coax_env.design import next_maneuver
 from coax_env.diagnosis import confounding, findings, unlisted, vibration
 from coax_env.diagnosis.black_box import black_box
-from coax_env.diagnosis.calibration import false_alarm_rate
+from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
 from coax_env.diagnosis.evidence import prune
 from coax_env.diagnosis.fits import fitted, noise_fitted, start
@@ -157,6 +157,7 @@ def diagnose(
     inflations = {e: weighed.inflation for e, weighed in evidence.items()}
     inflations |= unlisted.inflations(problem, fit, quadratic, terms)
     corrected = corrected_vehicle(problem, fit, quadratic, held, inflations, new_line, flight)
+    alarms = calibrated(settings.evidence, class_of(flight, vehicle, fit))
     by_evidence = [c["effect"] for c in causes if c["effect"] in found]
     design = confounding.separating_maneuver(problem, fit, quadratic, found, by_evidence, flight)
     return Diagnosis(
@@ -167,7 +168,8 @@ def diagnose(
             "unexplained": unexplained,
             "gain": gain,
             "next_maneuver": next_maneuver.advise(design, settings.evidence),
-            "false_alarm_rate": false_alarm_rate(settings.evidence),
+            "false_alarm_rate": alarms.rate,
+            "class": alarms.entry,
         },
         flight=flight,
         vehicle_before=vehicle,

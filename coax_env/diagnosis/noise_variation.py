@@ -119,8 +119,12 @@ class _Trial:
         noise = self.fit.noise
         changed = replace(
             noise,
-            process={n: v * (factor if n in level.names else 1.0) for n, v in noise.process.items()},
-            reading={n: v * (factor if n in level.names else 1.0) for n, v in noise.reading.items()},
+            process={
+                n: v * (factor if n in level.names else 1.0) for n, v in noise.process.items()
+            },
+            reading={
+                n: v * (factor if n in level.names else 1.0) for n, v in noise.reading.items()
+            },
         )
         there = replace(self.fit, noise=changed)
         return there.at({"gust_memory": changed.process["memory"]})

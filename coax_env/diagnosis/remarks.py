@@ -1,4 +1,4 @@
-"""What a reader should know beside the findings: white process noise, unusual sizes, unseen effects."""
+"""What a reader should know beside the findings: white process noise, moved numbers, unseen effects."""
 
 from collections.abc import Iterable
 
@@ -7,7 +7,7 @@ import numpy as np
 from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.vibration import Line
-from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM, WHITE_LEVELS
+from coax_env.estimation.helicopter import WHITE_LEVELS
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
 
@@ -22,7 +22,6 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
     """
     return [
         *_white_noise(problem, fit),
-        *_unusual_sizes(problem, fit),
         *_moved_base(problem, fit),
         *_resting_on_unseen(problem, fit, quadratic, found),
     ]
@@ -47,24 +46,6 @@ def _white_noise(problem: Problem, fit: Fit) -> list[str]:
         "white process noise beside the gusts, x and y, z:"
         f" force {xy:.2g}, {z:.2g} N s^1/2, moment {moment_xy:.2g}, {moment_z:.2g} N m s^1/2"
     ]
-
-
-def _unusual_sizes(problem: Problem, fit: Fit) -> list[str]:
-    texts = []
-    for f in (f for effect in fit.active for f in problem.own[effect]):
-        value = fit.values[f.name]
-        size = abs(value - f.value)
-        if size > 0.99 * MOST_USUAL_SIZES * f.std:
-            texts.append(
-                f"{f.name} stands at the limit of what is believed, {value:.3g}:"
-                " something else hides behind this name"
-            )
-        elif size > UNUSUAL_FROM * f.std:
-            texts.append(
-                f"{f.name} = {value:.3g} is outside its usual range"
-                f" ({f.value:g} +- {f.std:g}): take the name with care"
-            )
-    return texts
 
 
 def _moved_base(problem: Problem, fit: Fit) -> list[str]:

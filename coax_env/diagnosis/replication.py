@@ -17,7 +17,7 @@ every run.
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -97,7 +97,7 @@ def _halves(
     engine = problem.with_records([piece for own in pieces for piece in own]).engine
     _, lin = engine.linearise(fit.values, fit.noise, problem.parameters)
     ends = np.cumsum([0, *(len(own) for own in pieces)])
-    groups = [range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    groups = [range(a, b) for a, b in pairwise(ends)]
     whole = Quadratic.of(lin, problem.parameters, fit.values)
     return replace(whole, blocks=quadratic.blocks), list(halves_of(groups, chosen.splits))
 
@@ -263,10 +263,11 @@ def same_way(
     _, move = quadratic.best(problem.free_names(active))
     moved, off = quadratic.moved(move), problem.off_values(effect)
     usual = {f.name: f.std for f in problem.own[effect]}
-    return 0.0 < sum(
+    along = sum(
         (moved[n] - off[n]) * (fit.values[n] - off[n]) / usual[n] ** 2
         for n in problem.acting_names(effect)
     )
+    return along > 0.0
 
 
 def _exchange(
@@ -277,9 +278,7 @@ def _exchange(
     found = []
     gains = _most_gains(problem, quadratic, active)
     for old in names:
-        factor = quadratic.variance_inflation(
-            problem.acting_names(old), problem.free_names(active)
-        )
+        factor = quadratic.variance_inflation(problem.acting_names(old), problem.free_names(active))
         others = {e for e in active if e != old}
         rest = [n for n in problem.free_names(active) if not n.startswith(old + ".")]
         least = tie * factor - quadratic.occam(problem.acting_names(old), rest)
@@ -291,9 +290,7 @@ def _exchange(
     return min(found)[1:] if found else None
 
 
-def _most_gains(
-    problem: Problem, quadratic: Quadratic, active: Sequence[str]
-) -> dict[str, float]:
+def _most_gains(problem: Problem, quadratic: Quadratic, active: Sequence[str]) -> dict[str, float]:
     """The most [nats] that each effect which is not active could gain beside all that is.
 
     What it gains in the place of one of them is no more. All at once, bounds left out.

@@ -193,11 +193,10 @@ def _sizes(problem: Problem, fit: Fit, effect: str) -> Iterable[str]:
     for f in usual_sizes(problem, effect):
         size = abs(fit.values[f.name] - f.value)
         if size > AT_BOUND * MOST_USUAL_SIZES * f.std:
-            yield (
-                f"{f.name} stands at the limit of what is believed: something else hides behind the name"
-            )
+            limit = f"{plain(f.name)} stands at the limit of what is believed"
+            yield f"{limit}: something else hides behind the name"
         elif size > UNUSUAL_FROM * f.std:
-            yield f"{f.name} is {size / f.std:.1f} usual sizes"
+            yield f"{plain(f.name)} is {size / f.std:.1f} usual sizes"
 
 
 def usual_sizes(problem: Problem, effect: str) -> list[FreeParameter]:

@@ -3,7 +3,7 @@
 One page for someone who was not there: two minutes to read, the details folded away at its end.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from coax_env.estimation.trajectories import RESTART, trajectories
@@ -79,6 +79,9 @@ def headline(findings: Findings) -> str:
         named = and_list(names) if names else ""
     if findings["verdict"] == "consistent":
         return "The simulation agrees with these flights"
+    if names and all(c["trust"] != "sure" for c in findings["causes"]):
+        doubtful = "the name is doubtful" if len(names) == 1 else "the names are doubtful"
+        return f"The model predicts better with {named.rstrip(',')}; {doubtful}"
     if findings["verdict"] == "explained":
         return f"{capital(named)} {verb} what the simulation got wrong"
     if findings["verdict"] == "partly explained":
@@ -100,6 +103,8 @@ def lead(findings: Findings) -> list[str]:
         )
     elif not gain:
         sentences.append("No run was held out, so how well this predicts is not known.")
+    if findings["causes"]:
+        sentences.append(_trust_in_words(findings["causes"]))
     alternatives = sorted({name for c in findings["causes"] for name in c["confusable_with"]})
     if alternatives:
         sentences.append(
@@ -111,6 +116,18 @@ def lead(findings: Findings) -> list[str]:
         where = list(dict.fromkeys(channel_name(u["channel"]) for u in findings["unexplained"]))
         sentences.append(f"Unexplained structure is left in {and_list(where)}.")
     return sentences
+
+
+def _trust_in_words(causes: Sequence[Mapping[str, Any]]) -> str:
+    """Which names are sure, and which are doubtful."""
+    groups = {
+        trust: [plain(c["effect"]) for c in causes if c["trust"] == trust]
+        for trust in ("sure", "doubtful")
+    }
+    said = [f"{capital(trust)}: {and_list(names)}." for trust, names in groups.items() if names]
+    if groups["doubtful"]:
+        said.append("A doubtful name stands for something that improves the prediction.")
+    return " ".join(said)
 
 
 # --- the flights ----------------------------------------------------------------------------------
