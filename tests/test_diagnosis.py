@@ -333,10 +333,11 @@ def check_form(result: Diagnosis) -> None:
     assert json.loads(json.dumps(findings, allow_nan=False)) == findings
     assert set(findings) == {
         "verdict", "causes", "gusts", "unexplained", "gain", "next_maneuver", "false_alarm_rate",
+        "class", "model_check",
     }  # fmt: skip
     assert findings["verdict"] in ("consistent", "explained", "partly explained", "unexplained")
-    evidence = [cause["evidence"] for cause in findings["causes"]]
-    assert evidence == sorted(evidence, reverse=True)
+    strength = [(cause["trust"] == "sure", cause["evidence"]) for cause in findings["causes"]]
+    assert strength == sorted(strength, reverse=True), "sure ones first, each the strongest first"
     for cause in findings["causes"]:
         assert set(cause) >= {"effect", "parameters", "evidence", "confusable_with", "channels"}
         entry = effects.CATALOGUE[cause["effect"]]
@@ -345,6 +346,12 @@ def check_form(result: Diagnosis) -> None:
             said = cause["parameters"][full]
             assert said["unit"] == parameter.unit
             assert isinstance(said["value"], float) and said["std"] > 0.0
+            assert isinstance(said["determined"], bool)
+        robust = cause["robust"]
+        assert isinstance(robust["noise"], bool) and 0.0 <= robust["runs"] <= 1.0
+        assert robust["kept"] is None or 0.0 <= robust["kept"] <= 1.0
+        assert cause["trust"] == ("doubtful" if cause["doubts"] else "sure")
+        assert cause["since"] is None
         assert set(cause["confusable_with"]) <= set(effects.CATALOGUE) - {cause["effect"]}
         assert cause["channels"] and set(cause["channels"]) <= set(CHANNELS)
     gusts = findings["gusts"]
@@ -372,7 +379,8 @@ def check_gain(gain: Mapping[str, Any], flight: Flight) -> None:
         assert set(entry) >= {"before", "before_refitted", "after", "noise", "unit", "ci95"}
         low, high = entry["ci95"]
         assert 0.0 < low <= entry["after"] <= high
-    for key in ("error_removed_percent", "refitted_base_percent", "noise_floor_percent"):
+    percent = ("error_removed_percent", "refitted_base_percent", "noise_floor_percent")
+    for key in (*percent, "persistence_percent"):
         assert isinstance(gain[key], float)
     assert len(gain["ci95"]) == 2
 

@@ -34,8 +34,9 @@ from coax_env.diagnosis.input_innovations import (
     with_command_gains,
     with_input_innovations,
 )
+from coax_env.diagnosis.model_check import model_check
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.remarks import remarks, vibration_removed
+from coax_env.diagnosis.remarks import one_step_against_a_second, remarks, vibration_removed
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.trust import beside_large_axes, trusts
@@ -153,6 +154,8 @@ def diagnose(
 
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     replays, gain = _gain(problem, (bare, refitted, fit), held, sensors, ceiling)
+    report("asking whether the fitted model makes such flights")
+    check = model_check(problem, fit, passes_after)
     report("refitting the corrected model on everything")
     inflations = {e: weighed.inflation for e, weighed in evidence.items()}
     inflations |= unlisted.inflations(problem, fit, quadratic, terms)
@@ -170,6 +173,7 @@ def diagnose(
             "next_maneuver": next_maneuver.advise(design, settings.evidence),
             "false_alarm_rate": alarms.rate,
             "class": alarms.entry,
+            "model_check": check.entry,
         },
         flight=flight,
         vehicle_before=vehicle,
@@ -187,6 +191,8 @@ def diagnose(
             *double_counting(flight, vehicle),
             *([vibration_removed(line)] if line else []),
             *remarks(problem, fit, quadratic, found),
+            *one_step_against_a_second(gain, replays[1], replays[2], settings),
+            *check.remarks,
         ),
         noise=sensors,
         design=design,

@@ -1,15 +1,19 @@
 """What a reader should know beside the findings: white process noise, moved numbers, unseen effects."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import WHITE_LEVELS
+from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
+from coax_env.plain_words import and_list, channel_name
 
 
 def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternatives) -> list[str]:
@@ -33,6 +37,38 @@ def vibration_removed(line: Line) -> str:
         f"the accelerometers vibrate at the {line.rotor} rotor's speed by {line.amplitude:.2g} m/s2:"
         " that line was taken out of their readings before anything else was looked for"
     )
+
+
+def one_step_against_a_second(
+    gain: Mapping[str, Any] | None,
+    refitted: Sequence[RunReplay],
+    corrected: Sequence[RunReplay],
+    chosen: Settings,
+) -> list[str]:
+    """That the likelihood of one step prefers what predicts a second ahead worse, where it does.
+
+    Args:
+        gain: of the corrected model on the held-out runs.
+        refitted, corrected: those runs flown by the bare model, refitted, and by the corrected one.
+        chosen: what decides.
+    """
+    if not gain:
+        return []
+    nats = [sum(run.log_likelihood for run in runs) for runs in (refitted, corrected)]
+    worse = [
+        channel_name(c)
+        for c, e in gain["channels"].items()
+        if e["before_refitted"] is not None
+        and e["ci95"][0] is not None
+        and e["ci95"][0] > e["before_refitted"]
+    ]
+    if not worse or not nats[1] - nats[0] > chosen.tie:
+        return []
+    return [
+        f"on the held-out runs the likelihood of one step prefers the corrected model by"
+        f" {nats[1] - nats[0]:.0f} nats, but a second ahead it predicts {and_list(worse)} worse:"
+        " the noise model is wrong"
+    ]
 
 
 def _white_noise(problem: Problem, fit: Fit) -> list[str]:

@@ -278,14 +278,13 @@ def _exchange(
     found = []
     gains = _most_gains(problem, quadratic, active)
     for old in names:
-        factor = quadratic.variance_inflation(problem.acting_names(old), problem.free_names(active))
         others = {e for e in active if e != old}
         rest = [n for n in problem.free_names(active) if not n.startswith(old + ".")]
-        least = tie * factor - quadratic.occam(problem.acting_names(old), rest)
+        least = tie - quadratic.occam(problem.acting_names(old), rest)
         for new, gain in gains.items():
             if gain > least and not exclusive_with(new) & others:
                 change, _ = swap(problem, quadratic, active, old, new)
-                if change < -tie * factor:
+                if change < -tie:
                     found.append((change, old, new))
     return min(found)[1:] if found else None
 

@@ -6,6 +6,7 @@ set to zero; the version in which they decay is computed beside it. Where a chan
 the end itself, its last one within the final TAIL seconds is used, at its own time.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -67,6 +68,8 @@ class RunReplay:
     """Std by channel that the uncertainty of the start alone gives at the end; empty unless asked."""
     still: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Errors by channel, (s,), of the prediction that nothing changes from the start on."""
+    log_likelihood: float = math.nan
+    """Of the run's readings, each predicted from those before it [nats]."""
 
 
 def replay_runs(
@@ -116,6 +119,7 @@ def _replay_run(
         diverged,
         _floor(engine, run, inputs, dt, p, targets, used) if floor and not diverged else {},
         {CHANNELS[i]: _error(CHANNELS[i], unmoved[:, i] - measured[:, i]) for i in used},
+        run.log_likelihood,
     )
 
 
