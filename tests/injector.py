@@ -107,6 +107,11 @@ class Hidden(NamedTuple):
     sonar_delay: float = 0.0
     vibration: float = 0.0
     heading_moment: float = 0.0
+    patch_lift: float = 0.0
+    product_moment: float = 0.0
+    cable_moment: float = 0.0
+    stall_moment: float = 0.0
+    cross_moment: float = 0.0
 
 
 # effect -> parameter -> (field of Hidden, size where none is given)
@@ -152,13 +157,26 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
     "sonar_tilt": {"on": ("sonar_tilt", 1.0)},
     "sonar_delay": {"time": ("sonar_delay", 0.12)},
     "vibration": {"amplitude": ("vibration", 0.5)},
-    "outside": {"heading_moment": ("heading_moment", 0.02)},  # in no catalogue: M = a sin(3 psi)
+    # in no catalogue: M = a sin(3 psi)
+    "outside": {"heading_moment": ("heading_moment", 0.02)},
+    # lift over a place: half a meter wide, 0.4 m north of where flights begin
+    "outside_patch": {"lift": ("patch_lift", 0.5)},
+    # roll moment with the product of the rotor speeds, in which their sum and difference both are
+    "outside_product": {"moment": ("product_moment", 0.08)},
+    # yaw moment of a cable that twists and slips (Dahl): it depends on the way there
+    "outside_cable": {"moment": ("cable_moment", 0.006)},
+    # pitch moment that is all there from a slow walk on, and forwards only
+    "outside_stall": {"moment": ("stall_moment", 0.02)},
+    # pitch moment of the product of side speed and turn rate
+    "outside_cross": {"moment": ("cross_moment", 0.03)},
 }  # fmt: skip
 
 OTHER_FORM = frozenset({"ground_effect.gain", "airframe_drag.area_x", "airframe_drag.area_y",
                         "airframe_drag.area_z", "wake_interference.gain",
                         "rate_damping.coefficient", "vibration.amplitude", "battery_sag.rate",
-                        "outside.heading_moment"})  # fmt: skip
+                        "outside.heading_moment", "outside_patch.lift", "outside_product.moment",
+                        "outside_cable.moment", "outside_stall.moment",
+                        "outside_cross.moment"})  # fmt: skip
 """Parameters whose number means something else here than in the catalogue."""
 
 
@@ -238,8 +256,10 @@ def _suited(pilot: Pilot, craft: Craft) -> Pilot:
 
 # --- physics --------------------------------------------------------------------------------------
 # State: 0-2 position, 3-5 velocity (both inertial), 6-9 quaternion body to inertial, 10-12 p q r,
-# 13-16 alpha_l beta_l alpha_f beta_f, 17-18 rotor speeds, 19-20 swash, 21-22 swash rates.
-N_STATE = 23
+# 13-16 alpha_l beta_l alpha_f beta_f, 17-18 rotor speeds, 19-20 swash, 21-22 swash rates, 23 a cable's
+# twist in units of its greatest.
+N_STATE = 24
+CABLE = 0.3  # rad of turn after which a cable slips
 # Out: 0-2 specific force, 3-5 angular acceleration (body axes).
 
 
@@ -333,6 +353,8 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     moment += push[3:6]
     heading = math.atan2(R[1, 0], R[0, 0])
     moment[1] += hidden.heading_moment * math.sin(3.0 * heading)
+    _unlisted(s, air, wu * wl / (rotors.hover_upper * rotors.hover_lower), hidden, force, moment)
+    ds[23] = (omega[2] - abs(omega[2]) * s[23]) / CABLE
 
     # actuators
     _actuate(s, command, hidden, ds)
@@ -368,6 +390,17 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     ds[15] = -s[15] / bar - q
     ds[16] = -s[16] / bar - p
     return ds
+
+
+@njit(cache=True)
+def _unlisted(s, air, product, hidden, force, moment):
+    """Adds what is in no catalogue. ``product``: of the rotor speeds, against hover's."""
+    away = ((s[0] - 0.4) ** 2 + s[1] ** 2) / 0.5**2
+    force[2] -= hidden.patch_lift * math.exp(-0.5 * away)
+    moment[0] += hidden.product_moment * (product - 1.0)
+    moment[1] += hidden.stall_moment * (0.5 + 0.5 * math.tanh((air[0] - 0.3) / 0.1))
+    moment[1] += hidden.cross_moment * air[1] * s[12]
+    moment[2] -= hidden.cable_moment * s[23]
 
 
 @njit(cache=True)
