@@ -17,7 +17,7 @@ import numpy as np
 from coax_env.diagnosis.problem import Fit
 from coax_env.estimation.helicopter import GUST_LEVELS, WHITE_LEVELS
 from coax_env.files import write_json
-from coax_env.logs.flight import Flight
+from coax_env.logs.flight import Flight, Run
 from coax_env.model.vehicle import Vehicle
 
 PATH = Path(__file__).with_name("calibration.json")
@@ -27,7 +27,7 @@ SENSORS = {
     "speed": ("v",), "rotor speeds": ("rpm_upper", "rpm_lower"),
 }  # fmt: skip
 """Sensor -> its channels."""
-GAP = 0.1  # [s] between rows that is a gap
+GAP = 0.1  # [s] without any reading that is a gap
 FELT = 3.0
 """Times its floor from which a level of gusts is there; ours."""
 
@@ -117,6 +117,11 @@ def _classes() -> list[dict[str, Any]]:
     return classes
 
 
+def _read(run: Run) -> np.ndarray:
+    """Rows with a reading, (n,)."""
+    return np.any([np.isfinite(values) for values in run.measured.values()], axis=0)
+
+
 def class_of(flight: Flight, vehicle: Vehicle, fit: Fit) -> dict[str, Any]:
     """What kind of flight this is, as far as its log and its noise show.
 
@@ -126,6 +131,7 @@ def class_of(flight: Flight, vehicle: Vehicle, fit: Fit) -> dict[str, Any]:
         fit: whose noise levels were fitted.
     """
     steps = np.concatenate([np.diff(run.t) for run in flight.runs])
+    between = np.concatenate([np.diff(run.t[_read(run)]) for run in flight.runs])
     level, floor = fit.noise.process, fit.noise.floor
     weight = vehicle["mass"].value * vehicle["gravity"].value
     arm = vehicle["arm_upper"].value
@@ -134,7 +140,7 @@ def class_of(flight: Flight, vehicle: Vehicle, fit: Fit) -> dict[str, Any]:
     return {
         "sensors": ", ".join(sorted(aboard)),
         "rate_hz": round(1.0 / float(np.median(steps)), 1),
-        "gap_share": round(float(steps[steps > GAP].sum() / steps.sum()), 4),
+        "gap_share": round(float(between[between > GAP].sum() / steps.sum()), 4),
         "card_noise": all(c in flight.noise for c in flight.channels),
         "mass_kg": vehicle["mass"].value,
         "gust_force": round(max(level[n] for n in GUST_LEVELS if "force" in n) / weight, 4),
