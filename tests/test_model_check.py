@@ -38,7 +38,9 @@ def checked(problem: Problem, noise: Noise) -> ModelCheck:
 
 
 def test_nothing_is_said_of_a_right_model(gusty):
-    assert checked(*gusty).entry == {"prediction": [], "spectrum": [], "commands": []}
+    assert checked(*gusty).entry == {
+        "prediction": [], "spectrum": [], "commands": [], "words": [],
+    }  # fmt: skip
 
 
 def test_gusts_taken_for_too_weak_are_seen_a_second_ahead(gusty):

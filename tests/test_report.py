@@ -133,6 +133,7 @@ def diagnosis(**changes):
             "separates": ["axial_damping", "airframe_drag"],
         },
         "false_alarm_rate": 0.01,
+        "model_check": {"words": ["heading: its 1 s error is 2.3 times what it should be"]},
         "class": {"rate_hz": 100.0, "calibrated": "flights of the study", "why": ""},
     } | changes  # fmt: skip
     white = {c: Whiteness(0.2, 1e-9, 1.4, "hover", False) for c in CHANNELS}
@@ -194,6 +195,8 @@ def test_diagnosis_page_says_what_was_found(made):
         "Doubtful. With these the model predicts better",
         "98 % expected of a perfect model",
         "−30 % by saying that nothing moves",
+        "Heading: its 1 s error is 2.3 times what it should be.",
+        "Causes that are sure",
         "Sure: ground effect. Doubtful: axial damping",
         "Axial damping or airframe drag",
         "5 nats are odds of 150 to 1",

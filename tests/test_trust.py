@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
+from coax_env.diagnosis import moves
 from coax_env.diagnosis.hold_out import fair_part
+from coax_env.diagnosis.moves import Proposal, accepted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, replications
 from coax_env.diagnosis.scores import lost
@@ -276,3 +278,16 @@ def test_what_two_runs_alone_show_is_neither_lost_nor_unseen():
     shares[:, 1] = [0.5, 0.5, 0, 0, 0, 0, 0, 0]
     chosen = fair_part(shares, np.ones(2), np.full(8, 1 / 8))
     assert len({0, 1} & set(chosen)) == 1
+
+
+# --- the search ------------------------------------------------------------------------------------
+
+
+def test_a_trial_that_diverges_is_refused_and_says_so(monkeypatch):
+    said: list[str] = []
+    problem = replace(problem_of(1), progress=said.append)
+    fit = Fit((), dict.fromkeys(NAMES, 0.0), Noise({}), objective=10.0)
+    proposal = Proposal(f"+ {EFFECTS[0]}", EFFECTS[0], fit, 0.0, 14.0, "added")
+    monkeypatch.setattr(moves, "fitted", lambda problem, fit: replace(fit, objective=math.inf))
+    assert accepted(problem, fit, proposal) is None
+    assert said == [f"refused + {EFFECTS[0]}: with it the filter diverges"]

@@ -66,6 +66,7 @@ class ModelCheck:
             "prediction": self.prediction,
             "spectrum": self.spectrum,
             "commands": self.commands,
+            "words": self.remarks,
         }
 
     @property

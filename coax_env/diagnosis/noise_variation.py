@@ -140,7 +140,9 @@ class _Trial:
 
     def _fallen(self, there: Fit) -> list[str]:
         problem, fit = self.problem, self.fit
-        free = problem.free(fit.active)
+        replaced = {b for e in fit.active for b in problem.file_values(e)}
+        names = replaced.union(problem.free_names(fit.active))
+        free = [f for f in problem.parameters if f.name in names]
         passes, lin = self.engine.linearise(there.values, there.noise, free)
         if not all(np.isfinite(run.log_likelihood) for run in passes):
             return []  # the filter cannot fly with such noise

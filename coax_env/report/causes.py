@@ -18,6 +18,7 @@ from coax_env.plain_words import (
 from coax_env.report.consequences import NORMAL_95, described, sigmas
 from coax_env.report.page import (
     Markup,
+    Section,
     bullets,
     callout,
     card,
@@ -31,8 +32,8 @@ from coax_env.report.page import (
 Findings = Mapping[str, Any]
 
 
-def cause_blocks(findings: Findings, bare: Vehicle, corrected: Vehicle) -> list[str]:
-    """Every cause in words, strongest first, and all its numbers.
+def cause_sections(findings: Findings, bare: Vehicle, corrected: Vehicle) -> list[Section]:
+    """Every cause in words, sure and doubtful ones apart, strongest first, and all its numbers.
 
     Args:
         findings: as in findings.json.
@@ -43,36 +44,42 @@ def cause_blocks(findings: Findings, bare: Vehicle, corrected: Vehicle) -> list[
     alarms = prose(_false_alarms(findings["false_alarm_rate"], findings["class"]))
     if not causes:
         nothing = prose("No effect of the catalogue is named: these flights show none.")
-        return [nothing, alarms]
+        return [Section("The causes", [nothing, alarms])]
     rows = [row for k, cause in enumerate(causes) for row in _rows(k, cause)]
     header = ["parameter", "value", "std", "95 % interval", "unit", "usual size"]
-    blocks = [
+    numbers = [
         prose(
-            "In brackets: 95 % intervals. Evidence is the gain in log-likelihood over the best model "
-            "without the cause, in nats: 5 nats are odds of 150 to 1. In sigma it is that of one "
+            "In brackets: 95 % intervals. Evidence is the gain in log-likelihood over the best "
+            "model without the cause, in nats: 5 nats are odds of 150 to 1. In sigma it is that of one "
             "number so many standard deviations from zero."
-        )
-    ]
-    for trust, words in TRUST.items():
-        shown = [(k, cause) for k, cause in enumerate(causes) if cause["trust"] == trust]
-        if shown:
-            blocks.append(prose(words))
-            blocks.append(cards(_card(k, cause, bare, corrected) for k, cause in shown))
-    return [
-        *blocks,
+        ),
         folded_table("The parameters in numbers", header, rows),
         folded_table("Why a name is believed", _ROBUST_HEADER, map(_robust_row, causes)),
         alarms,
     ]
+    shown = {t: [(k, c) for k, c in enumerate(causes) if c["trust"] == t] for t in TRUST}
+    sections = [
+        Section(heading, [prose(words), cards(_card(k, c, bare, corrected) for k, c in shown[t])])
+        for t, (heading, words) in TRUST.items()
+        if shown[t]
+    ]
+    last = sections[-1]
+    return [*sections[:-1], Section(last.title, [*last.blocks, *numbers])]
 
 
 TRUST = {
-    "sure": "**Sure.** These names hold at half and twice every noise level, on parts of the flights, "
-    "and no other effect of the catalogue does as well.",
-    "doubtful": "**Doubtful.** With these the model predicts better, but the flights do not settle the "
-    "name: another cause may hide behind it.",
+    "sure": (
+        "Causes that are sure",
+        "**Sure.** These names hold at half and twice every noise level, on parts of the flights, "
+        "and no other effect of the catalogue does as well.",
+    ),
+    "doubtful": (
+        "Doubtful causes",
+        "**Doubtful.** With these the model predicts better, but the flights do not settle the "
+        "name: another cause may hide behind it.",
+    ),
 }
-"""How far a cause's name may be believed -> what that means."""
+"""How far a cause's name may be believed -> the heading of such causes, and what that means."""
 _ROBUST_HEADER = ["cause", "name is", "under other noise", "left-out runs", "halves"]
 
 

@@ -18,7 +18,7 @@ from coax_env.plain_words import (
     seconds,
     whole_percent,
 )
-from coax_env.report.causes import cause_blocks, confounding_blocks
+from coax_env.report.causes import cause_sections, confounding_blocks
 from coax_env.report.diagnosis_details import detail_blocks
 from coax_env.report.flight_data import data_blocks, ordered
 from coax_env.report.flight_view import flight_view
@@ -50,7 +50,7 @@ def diagnosis_page(
     sections = [
         Section("The flights", _flights(result)),
         Section("Where the bare model is wrong", error_blocks(result)),
-        Section("The causes", cause_blocks(findings, bare, corrected)),
+        *cause_sections(findings, bare, corrected),
         Section("Confounded alternatives", confounding_blocks(findings)),
         Section("What the corrected model gains", gain_blocks(findings)),
         Section("Still unexplained", _unexplained(findings, bare)),
@@ -185,7 +185,7 @@ LOADS = {
 
 
 def _unexplained(findings: Findings, vehicle: Vehicle) -> list[str]:
-    """Structure beyond the causes, and the gusts."""
+    """Structure beyond the causes, what the fitted model does not make, and the gusts."""
     with_form = [u for u in findings["unexplained"] if u["depends_on"]]
     without = [u for u in findings["unexplained"] if not u["depends_on"]]
     lines = [
@@ -206,6 +206,7 @@ def _unexplained(findings: Findings, vehicle: Vehicle) -> list[str]:
         bullets(lines)
         if lines
         else callout("The innovations are white: nothing but noise and gusts is left.", "good"),
+        bullets(f"{capital(words)}." for words in findings["model_check"]["words"]),
         prose(_gusts_in_words(findings["gusts"], vehicle)),
     ]
 
