@@ -305,7 +305,9 @@ LABELLED: dict[str, tuple[list[str], dict[str, float]]] = {
 @pytest.mark.parametrize("name", LABELLED)
 def test_labelled_flights(name):
     hidden, values = LABELLED[name]
-    check_causes(diagnose(shared_flight(name)).findings, hidden, values)
+    findings = diagnose(shared_flight(name)).findings
+    check_causes(findings, hidden, values)
+    check_all_sure(findings)
 
 
 @pytest.mark.slow
@@ -321,7 +323,15 @@ def test_the_bundled_flight():
         "motor_lag.upper": values["motor_tau"], "motor_lag.lower": values["motor_tau"],
         **{f"gyro_bias.{axis}": bias for axis, bias in gyro.items()},
     }  # fmt: skip
-    check_causes(diagnose(folder).findings, planted["hidden"], truth)
+    findings = diagnose(folder).findings
+    check_causes(findings, planted["hidden"], truth)
+    check_all_sure(findings)
+
+
+def check_all_sure(findings: Mapping[str, Any]) -> None:
+    """No true name is doubted, and the flight is of the calibrated class."""
+    assert {c["effect"]: c["doubts"] for c in findings["causes"] if c["trust"] != "sure"} == {}
+    assert findings["false_alarm_rate"] is not None and findings["class"]["why"] == ""
 
 
 # --- what is handed over -------------------------------------------------------------------------
