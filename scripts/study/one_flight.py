@@ -20,7 +20,8 @@ from coax_env.diagnosis.gain import gain_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import MEMORIES, starting_noise, still_air
 from coax_env.estimation.prediction import replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
@@ -32,7 +33,10 @@ from study.judge import OWN
 from study.plan import PlannedFlight
 from study.store import code_hash
 
-GUSTS = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003, "memory": 0.5}
+GUSTS = {
+    "force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003,
+    **dict.fromkeys(MEMORIES, 0.5),
+}  # fmt: skip
 """Std of the generator's gusts [N, N m] and their correlation time [s]."""
 
 SHOWN_FROM = 3.0
@@ -177,18 +181,18 @@ def expected_evidence(
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     model = HeliModel(vehicle)
     noise = starting_noise(flight, vehicle)
-    levels = {**noise.process, **noise.floor}
+    noise = still_air(noise)
     if planned.gusts:
-        levels |= GUSTS  # the model's are what shakes the vehicle as its file has it
+        levels = dict(GUSTS)  # the model's are what shakes the vehicle as its file has it
         heavier = 1.0 + values.get("added_mass.mass", 0.0) / vehicle["mass"].value
         levels["force_xy"] /= heavier
         levels["force_z"] /= heavier
         levels["moment_z"] /= 1.0 + values.get("yaw_inertia.scale", 0.0)
-    noise = replace(noise, process=levels)
+        noise = noise.with_levels(levels)
     problem = Problem.of(model, _records(flight, held, within=False), listed)
     for effect in listed:
         own = {name: 0.5 * values[name] for name in problem.acting_names(effect)}
-        at = {**model.bare_values, "gust_memory": levels["memory"], **values, **own}
+        at = {**model.bare_values, **values, **own}
         _, _, quadratic = linearise(problem, Fit(tuple(listed), at, noise))
         result[effect] = _worth(problem, quadratic, listed, effect, values)
     return result
