@@ -171,5 +171,5 @@ def with_latent_noise(problem: Problem, fit: Fit) -> Fit | None:
 
 def _score(problem: Problem, fit: Fit, score: NoiseScore, name: str) -> float:
     """Slope in a level over its scatter from block to block [std]."""
-    parts = level_slopes(problem.engine, fit.values, fit.noise, name, score)
+    parts, _ = level_slopes(problem.engine, fit.values, fit.noise, name, score)
     return float(parts.sum() / (np.sqrt(parts.size) * parts.std() + 1e-300))

@@ -110,7 +110,8 @@ class NoiseScore:
 
     in_noise: (blocks, e) in the intensity of each entry of the process noise, by blocks of BLOCK
     seconds, in_decay: (blocks, e) in its decay, in_start: (records, nx) in each variance of the first
-    state, in_reading: (blocks, m) in each channel's variance.
+    state, in_reading: (blocks, m) in each channel's variance. Expected: see noise_score.Slopes; of all
+    records, (e,), by record (records, nx), of all (m,).
     """
 
     log_likelihood: float
@@ -118,6 +119,9 @@ class NoiseScore:
     in_decay: np.ndarray
     in_start: np.ndarray
     in_reading: np.ndarray
+    noise_expected: np.ndarray
+    start_expected: np.ndarray
+    reading_expected: np.ndarray
 
 
 class _Buffers:
@@ -492,15 +496,16 @@ class Engine:
         p = self.model.vector(values, noise)
         q, decay = self.model.process_noise(noise, p)
         places = self.compiled.noise_places
-        decaying = np.flatnonzero(decay[: self.starts[0][0].size] > 0.0)
+        nx, m = self.starts[0][0].size, len(self.model.channels)
+        decaying = np.flatnonzero(decay[:nx] > 0.0)
 
         def one(i: int) -> tuple[float, noise_score.Slopes]:
             t = self.records[i].t
             block = ((t - t[0]) / BLOCK).astype(np.int64)
             shape = (int(block[-1]) + 1, q.size)
             slopes = noise_score.Slopes(
-                np.zeros(shape), np.zeros(shape), np.zeros(self.starts[i][0].size),
-                np.zeros((shape[0], self.records[i].z.shape[1])),
+                np.zeros(shape), np.zeros(shape), np.zeros(nx), np.zeros((shape[0], m)),
+                np.zeros(q.size), np.zeros(nx), np.zeros(m),
             )  # fmt: skip
             with self._borrowed_buffers() as buffers:
                 run, at = self._filter_run(i, p, noise, buffers, buffers, decaying=decaying)
@@ -518,6 +523,9 @@ class Engine:
             np.concatenate([s.in_decay for s in slopes]),
             np.array([s.in_start for s in slopes]),
             np.concatenate([s.in_reading for s in slopes]),
+            np.sum([s.noise_expected for s in slopes], axis=0),
+            np.array([s.start_expected for s in slopes]),
+            np.sum([s.reading_expected for s in slopes], axis=0),
         )
 
 

@@ -30,8 +30,8 @@ def _reading_back(b, e, per_sigma, gain, H, K, NK, r, N):
         r, N: slope and its variance, in place.
 
     Returns:
-        the slope in the reading's variance, (u^2 - D) / 2 with u the smoothing error e / s - K' r and
-        D its variance 1 / s^2 + K' N K.
+        u^2 / 2 and D / 2, whose difference is the slope in the reading's variance: u is the smoothing
+        error e / s - K' r and D its variance 1 / s^2 + K' N K.
     """
     nx, width = r.size, NK.size
     pull = e * per_sigma
@@ -56,7 +56,7 @@ def _reading_back(b, e, per_sigma, gain, H, K, NK, r, N):
             N[a, j] -= weight * NK[j]
         for i in range(nx):
             N[i, a] -= weight * NK[i]
-    return 0.5 * (pull * pull - curve)
+    return 0.5 * pull * pull, 0.5 * curve
 
 
 class Slopes(NamedTuple):
@@ -64,16 +64,21 @@ class Slopes(NamedTuple):
 
     in_noise: (blocks, e) in the intensity of each entry of the process noise, by blocks of time, and
     in_decay: (blocks, e) in its decay. in_start: (nx,) in each variance of the first state.
-    in_reading: (blocks, m) in the variance of each channel's readings.
+    in_reading: (blocks, m) in the variance of each channel's readings. Those in variances are what the
+    data show less what was expected; the latter, as shapes but for the blocks, is in
+    noise_expected: (e,), start_expected: (nx,), reading_expected: (m,).
     """
 
     in_noise: np.ndarray
     in_decay: np.ndarray
     in_start: np.ndarray
     in_reading: np.ndarray
+    noise_expected: np.ndarray
+    start_expected: np.ndarray
+    reading_expected: np.ndarray
 
 
-SLOPES = types.NamedTuple([_M, _M, _A, _M], Slopes)
+SLOPES = types.NamedTuple([_M, _M, _A, _M, _A, _A, _A], Slopes)
 
 
 class _Backward(NamedTuple):
@@ -130,13 +135,15 @@ def _decay_slope(g, x, P, dt, w):
 
 
 @compiled(**REORDER)
-def _noise_slopes(places, q, decay, dt, w, in_noise, in_decay):
+def _noise_slopes(places, q, decay, dt, w, in_noise, in_decay, expected):
     """Slopes through what a row's process noise adds to the covariance."""
     for e in range(q.size):
         i, j = places[e, 0], places[e, 1]
-        slope = 0.5 * (w.r[i] * w.r[j] - w.N[i, j]) * (1.0 if i == j else 2.0)
+        weight = 0.5 if i == j else 1.0
+        slope = weight * (w.r[i] * w.r[j] - w.N[i, j])
         grown = growth(dt, decay[e])
         in_noise[e] += slope * grown
+        expected[e] += weight * w.N[i, j] * grown
         if decay[e] > 0.0:
             left = dt * math.exp(-2.0 * decay[e] * dt)
             in_decay[e] += slope * q[e] * (left - grown) / decay[e]
@@ -177,8 +184,9 @@ def score_pass(dt, trace, places, q, decay, gate, refresh, block, out):
     for k in range(n - 1, -1, -1):
         if k < n - 1:
             _noise_slopes(
-                places, q, decay, dt[k], w, out.in_noise[block[k]], out.in_decay[block[k]]
-            )
+                places, q, decay, dt[k], w, out.in_noise[block[k]], out.in_decay[block[k]],
+                out.noise_expected,
+            )  # fmt: skip
             if path.F_of[k] != F_slot:
                 F_slot = path.F_of[k]
                 for i in range(nx):
@@ -196,11 +204,13 @@ def score_pass(dt, trace, places, q, decay, gate, refresh, block, out):
         for b in range(m - 1, -1, -1):
             if not math.isnan(e[k, b]):
                 reading -= 1
-                slope = _reading_back(
+                shown, expected = _reading_back(
                     b, e[k, b], gains.per_sigma[reading], gains.K[reading], H, K, NK, w.r, w.N
                 )  # fmt: skip
                 if path.beyond[reading] > 0.0:
-                    slope = beyond * path.beyond[reading]
-                out.in_reading[block[k], b] += slope
+                    shown, expected = beyond * path.beyond[reading], 0.0
+                out.in_reading[block[k], b] += shown - expected
+                out.reading_expected[b] += expected
     for i in range(nx):
         out.in_start[i] = 0.5 * (w.r[i] * w.r[i] - w.N[i, i])
+        out.start_expected[i] = 0.5 * w.N[i, i]
