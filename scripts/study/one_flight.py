@@ -221,7 +221,7 @@ def expected_evidence(
 
 @cache
 def gust_levels(air: Air, craft: Craft) -> dict[str, float]:
-    """Std [N, N m] of an air's gusts on a craft and their correlation times [s], by two minutes of it."""
+    """Std [N, N m] of an air's gusts on a craft, and correlation times [s], by two minutes of it."""
     step = 0.002
     history = disturbances(air, craft, 12_000, 5, step, np.random.default_rng(0))
     history[:, 0:3] += history[:, 10:13]
