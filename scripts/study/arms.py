@@ -7,6 +7,7 @@ added changes no other. Kinds: "clean", "one", "two", "three" effects, "outside"
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from injector_air import GUSTY, STILL, Air
@@ -14,8 +15,10 @@ from injector_sensors import SENSORS
 
 from study.plan import ALONE, OUTSIDE, RICH, PlannedFlight, several, sizes_of
 
+T = TypeVar("T")
+
 LONGEST = 14.0
-"""s at which a run ends: the eight runs are then 104 s, with a full turn, the ground and both speeds."""
+"""s at which a run ends: the eight runs are then 108 s, with a full turn, the ground and speed."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +81,12 @@ LEAST_SCALE = -0.6
 """Of a scale: three times the usual size could turn a time constant's sign."""
 
 
-def plan_arms(
-    arms: Sequence[str], clean: int, effects: int, seed: int = 0
-) -> list[PlannedFlight]:
+def plan_arms(arms: Sequence[str], clean: int, effects: int, seed: int = 0) -> list[PlannedFlight]:
     """The flights of some arms, evenly mixed so that a part of the study is a fair sample.
 
     Args:
         arms: keys of ARMS. clean: flights without an effect, per arm. effects: with some, per arm;
-            two thirds have one, one sixth two, one sixth three. An arm of unlisted effects has no others.
+            two thirds have one, one sixth two, one sixth three. An arm of unlisted ones has no others.
         seed: the study's.
     """
     flights = [
@@ -121,7 +122,8 @@ def planned(name: str, kind: str, number: int, seed: int) -> PlannedFlight:
     effects = _hidden(kind, number, of_arm, unseen, rng)
     air = arm.air
     if arm.memory is not None:
-        force, moment = np.exp(rng.uniform(*np.log(arm.memory), 2)).tolist()
+        low, high = (float(np.log(bound)) for bound in arm.memory)
+        force, moment = np.exp(rng.uniform(low, high, 2)).tolist()
         air = air._replace(memory=(force, moment))
     return PlannedFlight(
         kind=kind,
@@ -140,7 +142,7 @@ def planned(name: str, kind: str, number: int, seed: int) -> PlannedFlight:
     )
 
 
-def _turn[T](options: Sequence[T], number: int) -> T:
+def _turn(options: Sequence[T], number: int) -> T:
     return options[number % len(options)]
 
 

@@ -96,10 +96,10 @@ def _result(planned: PlannedFlight, folder: Path, only_own: bool) -> dict[str, A
         "flown_s": sum(run.duration for run in flight.runs),
     }
     catalogued = [e for e in truth["hidden"] if e in CATALOGUE]
-    whole_runs = bool(held) and set(held) <= set(flight.run_names)
+    whole_runs = bool(held) and set(held) <= set(flight.run_names) and not planned.arm
     if catalogued == truth["hidden"] and truth["hidden"] and whole_runs:
         row["true_structure"] = gain_of_the_truth(result, catalogued, truth["values"], held)
-    if not only_own:
+    if not only_own and not planned.arm:
         methods |= baselines.name_causes(flight)
     return json.loads(json.dumps(row, allow_nan=False))
 
@@ -221,7 +221,7 @@ def expected_evidence(
 
 @cache
 def gust_levels(air: Air, craft: Craft) -> dict[str, float]:
-    """Std [N, N m] of an air's gusts on a craft and their correlation time [s], by two minutes of it."""
+    """Std [N, N m] of an air's gusts on a craft and their correlation time [s], from two minutes."""
     step = 0.002
     history = disturbances(air, craft, 12_000, 5, step, np.random.default_rng(0))
     history[:, 0:3] += history[:, 10:13]
