@@ -55,7 +55,7 @@ def planned(options: Any) -> list[PlannedFlight]:
 
 def arm_names(text: str) -> list[str]:
     """Names of arms, by commas, or "all"."""
-    names = list(arms.ARMS) if text == "all" else text.split(",")
+    names = list(arms.ARMS) if text == "all" else [name for name in text.split(",") if name]
     unknown = sorted(set(names) - set(arms.ARMS))
     if unknown:
         raise InputError(f"no arm {unknown[0]!r}: there are {', '.join(arms.ARMS)}")
@@ -73,7 +73,7 @@ def parse() -> Any:
         help=f"gusty flights with up to {plan.MANY} effects each, for the intervals",
     )  # fmt: skip
     parser.add_argument(
-        "--arms", type=arm_names, default=[], metavar="ARM,ARM|all",
+        "--arms", default="", metavar="ARM,ARM|all",
         help="flights of these arms, --clean and --effects of each, instead, without baselines",
     )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="24 flights in all")
@@ -93,6 +93,7 @@ def parse() -> Any:
     parser.add_argument("--no-baselines", action="store_true", help="the package alone")
     command_line.add_workers(parser, "flights", -1)
     options = parser.parse_args()
+    options.arms = arm_names(options.arms)
     if options.quick:
         options.clean, options.effects = QUICK["clean"], QUICK["effects"]
     counts = (options.clean, options.effects, options.many)

@@ -13,7 +13,7 @@ import numpy as np
 from injector_air import GUSTY, STILL, Air
 from injector_sensors import SENSORS
 
-from study.plan import ALONE, OUTSIDE, RICH, PlannedFlight, several, sizes_of
+from study.plan import ALONE, FOREIGN, RICH, PlannedFlight, several, sizes_of
 
 T = TypeVar("T")
 
@@ -159,7 +159,7 @@ def _hidden(
     if kind == "clean":
         return []
     if kind == "outside":
-        return [_turn(tuple(OUTSIDE), number)]
+        return [_turn(FOREIGN, number)]
     if kind == "one":  # every effect in turn
         seen = [e for e in ALONE if e not in unseen]
         return [seen[np.random.default_rng(of_arm).permutation(len(seen))[number % len(seen)]]]
