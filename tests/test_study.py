@@ -19,7 +19,18 @@ import study_diagnosis
 from injector_air import GUSTS, GUSTY, Air
 from injector_craft import COAX, LAMA, draw
 from injector_sensors import SENSORS
-from study import arm_table, arms, baselines, judge, one_flight, plan, store, table, threshold
+from study import (
+    arm_table,
+    arms,
+    baselines,
+    classes,
+    judge,
+    one_flight,
+    plan,
+    store,
+    table,
+    threshold,
+)
 from study.baselines import Gram, by_bic, by_f, sparse, stepwise
 from study.one_flight import catalogue_values, expected_evidence, fly_and_diagnose, hide
 from study.plan import PlannedFlight
@@ -548,6 +559,48 @@ def test_a_study_of_arms_writes_its_table(study: Callable, tmp_path: Path) -> No
     assert counted["foreign_forms"]["blamed"] == [0, 24]
     text = (tmp_path / "table.md").read_text()
     assert "| gusty | 0/8 = 0 % (0-32) |" in text and "| all arms |" in text
+
+
+def test_a_class_is_what_its_flights_showed() -> None:
+    seen = [
+        {"sensors": "gyros", "rate_hz": 100.0, "gap_share": 0.0, "card_noise": True,
+         "gust_memory_s": None, "calibrated": None, "why": "nothing has been measured"},
+        {"sensors": "gyros, height", "rate_hz": 110.0, "gap_share": 0.0, "card_noise": True,
+         "gust_memory_s": 0.4, "calibrated": None, "why": "nothing has been measured"},
+    ]  # fmt: skip
+    said = classes.described("gusty", "gusts", seen)
+    assert said["name"] == "gusty" and "gusts" in said["data"]
+    assert said["sensors"] == ["gyros", "gyros, height"] and said["card_noise"] == [True]
+    low, high = said["rate_hz"]
+    assert 80.0 < low < 100.0 and 110.0 < high < 140.0
+    assert said["gap_share"][0] == 0.0 < said["gap_share"][1] < 0.01
+    assert 0.3 < said["gust_memory_s"][0] < 0.4 < said["gust_memory_s"][1] < 0.5
+    assert not set(said) & {"calibrated", "why"}
+
+
+def test_every_arm_has_its_own_rate() -> None:
+    """One arm's alarms are not another's; one with too few clean flights has no rate."""
+
+    def rows(arm: str, count: int, alarms: int) -> list[dict[str, Any]]:
+        flights = [
+            PlannedFlight("clean", i, {}, True, "full", 1, plan.RICH, arm=arm) for i in range(count)
+        ]
+        return [
+            row_of(
+                f, [{"effect": "wind"}] if f.number < alarms else [],
+                strongest={"evidence": 50.0 if f.number < alarms else 1.0, "effect": "wind"},
+                **{"class": {"rate_hz": 100.0}},
+            )
+            for f in flights
+        ]  # fmt: skip
+
+    measured = classes.calibrations(
+        [*rows("gusty", 40, 0), *rows("dryden", 40, 8), *rows("still", 10, 0)], "command"
+    )
+    rates = {m["class"]["name"]: m["false_alarm_rate"] for m in measured}
+    assert set(rates) == {"gusty", "dryden"}
+    assert rates["gusty"] == threshold.FALSE_ALARMS and rates["dryden"] >= 0.2
+    json.dumps(measured, allow_nan=False)
 
 
 def test_an_arm_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -90,6 +90,7 @@ def _result(planned: PlannedFlight, folder: Path, only_own: bool) -> dict[str, A
         "methods": methods,
         "gain": findings["gain"],
         "strongest": {"evidence": evidence if math.isfinite(evidence) else None, "effect": effect},
+        "class": findings.get("class"),
         "history": result.evidence_history,
         "remarks": list(result.remarks),
         "seconds": seconds,
