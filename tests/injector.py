@@ -248,12 +248,15 @@ def _reach(craft: Craft) -> Reach:
 
 
 def _suited(pilot: Pilot, craft: Craft) -> Pilot:
-    """The pilot with gains for what a craft's commands do."""
+    """The pilot with gains for what a craft's commands do.
+
+    Torques out of balance need the same share of speed on every craft: the trim goes with the root.
+    """
     tilt, yaw, _ = _reach(craft)
     return pilot._replace(
         tilt=tilt * pilot.tilt, rate=tilt * pilot.rate, side_trim=tilt * pilot.side_trim,
         most_tilt=tilt * pilot.most_tilt, turn=yaw * pilot.turn, yaw_rate=yaw * pilot.yaw_rate,
-        yaw_trim=yaw * pilot.yaw_trim, most_yaw=yaw * pilot.most_yaw,
+        yaw_trim=math.sqrt(yaw) * pilot.yaw_trim, most_yaw=max(yaw, 1.0) * pilot.most_yaw,
     )  # fmt: skip
 
 
