@@ -691,6 +691,7 @@ def fly(
     radio_gaps: bool = False,
     craft: Craft = LAMA,
     pilot: str = "usual",
+    known_as: Craft | None = None,
     card_noise: float | None = 1.0,
     longest: float = math.inf,
 ) -> Path:
@@ -701,7 +702,8 @@ def fly(
         gusts: True: force (0.2 N) and moment (6 mN m) with a memory of 0.5 s; or any air.
         sensors: a key of ``SENSORS``.
         runs: names in ``MANEUVERS``; all where None.
-        craft: what flies; one that is not shipped gets a vehicle file beside the card.
+        craft: what flies. known_as: what its vehicle file says; the same where None. One that is
+            not shipped gets a file beside the card.
         pilot: a key of ``PILOTS``.
         card_noise: factor by which the card's noise is wrong; None: the card has none.
         longest: s at which a run ends.
@@ -722,12 +724,13 @@ def fly(
             columns, kit, rng, lost_echoes=lost_echoes, radio_gaps=radio_gaps, first=i == 0
         )
         (folder / f"{name}.csv").write_text(csv_text(columns, kit))
-    vehicle = SHIPPED.get(craft)
+    known_as = known_as or craft
+    vehicle = SHIPPED.get(known_as)
     if vehicle is None:
-        write_vehicle(craft, folder / "vehicle.toml")
+        write_vehicle(known_as, folder / "vehicle.toml")
         vehicle = str(folder.resolve() / "vehicle.toml")
     said = {} if card_noise is None else {c: card_noise * std for c, std in kit.noise.items()}
-    card = card_text(names, vehicle, (craft.density, craft.gravity), said)
+    card = card_text(names, vehicle, (known_as.density, known_as.gravity), said)
     (folder / "card.toml").write_text(card)
     full = {f"{effect}.{parameter}": value for (effect, parameter), value in values.items()}
     truth = {

@@ -60,6 +60,7 @@ ARMS = {
         sensors=("telemetry",), card=(None,), craft="coax",
     ),
     "drawn_vehicles": Arm("vehicles drawn between 0.05 and 5 kg", craft="drawn"),
+    "spread_vehicles": Arm("a vehicle within its file's spread, not as it says", craft="spread"),
     "other_pilots": Arm("a stabiliser 30 ms late; a slow hand", pilots=("stabiliser", "slow_human")),
     "restless": Arm(
         "trims that drift, rotor speeds that jitter with their reaction on the body",

@@ -31,7 +31,9 @@ def calibrations(rows: Sequence[Row], command: str) -> list[dict[str, Any]]:
         return [measured] if measured else []
     result = []
     for arm in arms:
-        part = [r for r in judge.finished(rows) if r["plan"]["arm"] == arm and not r["plan"]["effects"]]
+        part = [
+            r for r in judge.finished(rows) if r["plan"]["arm"] == arm and not r["plan"]["effects"]
+        ]
         measured = threshold.calibration(part, command)
         if measured:
             seen = [row["class"] for row in part if row.get("class")]

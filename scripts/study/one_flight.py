@@ -15,7 +15,7 @@ from typing import Any
 import injector
 import numpy as np
 from injector_air import GUSTY, STILL, Air, disturbances
-from injector_craft import CRAFTS, Craft
+from injector_craft import CRAFTS, LAMA, Craft, spread
 from injector_sensors import SENSORS
 
 from coax_env.diagnosis.diagnose import Diagnosis, diagnose
@@ -121,6 +121,7 @@ def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
             injector.fly(
                 folder, sizes, gusts=air_of(planned), sensors=planned.sensors, seed=planned.seed,
                 runs=planned.runs, craft=craft, pilot=planned.pilot,
+                known_as=LAMA if planned.craft == "spread" else None,
                 card_noise=planned.card_noise, longest=planned.longest or math.inf,
             )  # fmt: skip
         except RuntimeError:
@@ -129,14 +130,29 @@ def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
         path = folder / "truth.json"
         truth = json.loads(path.read_text())
         path.unlink()
+        if planned.craft == "spread":
+            truth["comparable"] = _beside_the_file(truth["comparable"])
         return truth
     raise RuntimeError(f"the pilot cannot fly {planned.effects}")
 
 
+def _beside_the_file(values: Mapping[str, float]) -> dict[str, float]:
+    """Values of effects that no number of the vehicle's file is a part of."""
+    kept = {}
+    for name, value in values.items():
+        effect = CATALOGUE.get(name.partition(".")[0])
+        if effect is None or not effect.replaces:
+            kept[name] = value
+    return kept
+
+
 def craft_of(planned: PlannedFlight) -> Craft:
     """What flies."""
+    rng = np.random.default_rng(planned.seed)
     if planned.craft == "drawn":
-        return injector.drawn(np.random.default_rng(planned.seed))
+        return injector.drawn(rng)
+    if planned.craft == "spread":
+        return spread(LAMA, rng)
     return CRAFTS[planned.craft]
 
 

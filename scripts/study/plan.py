@@ -138,8 +138,9 @@ class PlannedFlight:
     """One flight of the study.
 
     effects: name -> parameter -> size. gusts: the generator's usual air; `air`: fields of another one.
-    arm: the class of tests that it belongs to, if any. size: factor on the effects' usual sizes.
-    craft: a name of the generator's, or "drawn" from the seed. pilot: a name of the generator's.
+    arm: the class of tests that it belongs to, if any.
+    craft: a name of the generator's; or from the seed, "drawn", or "spread": the paper's vehicle, not
+        quite as its file says. pilot: a name of the generator's.
     card_noise: factor by which the card's noise is wrong; None: the card has none. longest: s of a run.
     """
 
