@@ -284,7 +284,7 @@ def test_a_pose_looks_like_the_coax_log(tmp_path: Path) -> None:
     for channel in ("phi", "theta", "psi"):
         third = np.diff(run.measured[channel], 3)
         noise = 1.4826 * np.nanmedian(abs(third)) / math.sqrt(20.0)
-        assert noise == pytest.approx(POSE[channel], rel=0.25)
+        assert 0.9 < noise / POSE[channel] < 1.5, "and some of the motion itself"
 
 
 def test_telemetry_is_slow_and_has_gaps(tmp_path: Path) -> None:
