@@ -1,7 +1,6 @@
 """Does the fitted model make such flights? Gusty ones by other code, their noise known, then wrong."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import injector
@@ -13,7 +12,8 @@ from coax_env.diagnosis.model_check import LARGE, ModelCheck, model_check
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import one_step_against_a_second
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.state_space import Noise
 
@@ -27,13 +27,18 @@ def gusty(tmp_path_factory) -> tuple[Problem, Noise]:
     folder = tmp_path_factory.mktemp("gusty") / "flight"
     flight = read_flight(injector.fly(folder, {}, gusts=True, runs=RUNS, seed=5))
     noise = starting_noise(flight, LAMA)
-    noise = replace(noise, process={**noise.process, **noise.floor, **GUSTS})
+    noise = at_floor(noise).with_levels(GUSTS)
     return Problem.of(HeliModel(LAMA), [record_of(run) for run in flight.runs]), noise
+
+
+def at_floor(noise: Noise) -> Noise:
+    """Every gust, drift and white level at its floor, the memories as they are."""
+    levels = {n: v for n, v in noise.floor.items() if n in noise.process and "memory" not in n}
+    return noise.with_levels(levels)
 
 
 def checked(problem: Problem, noise: Noise) -> ModelCheck:
     fit = Fit((), problem.model.bare_values, noise)
-    fit = fit.at({"gust_memory": noise.process["memory"]})
     return model_check(problem, fit, problem.engine.filter(fit.values, fit.noise))
 
 
@@ -46,7 +51,7 @@ def test_nothing_is_said_of_a_right_model(gusty):
 def test_gusts_taken_for_too_weak_are_seen_a_second_ahead(gusty):
     """Yaw gusts a tenth of what they are: the heading's errors grow beyond what they should be."""
     problem, noise = gusty
-    check = checked(problem, replace(noise, process={**noise.process, "moment_z": 3e-4}))
+    check = checked(problem, noise.with_levels({"moment_z": 3e-4}))
     heading = {e["horizon_s"]: e["ratio"] for e in check.prediction if e["channel"] == "psi"}
     assert heading[1.0] > 1.5 and min(heading.values()) > LARGE
     assert not {e["channel"] for e in check.prediction} & {"p", "q", "h", "phi", "theta"}
@@ -55,8 +60,7 @@ def test_gusts_taken_for_too_weak_are_seen_a_second_ahead(gusty):
 
 def test_a_sensor_louder_than_the_model_has_it_is_seen_in_every_band(gusty):
     problem, noise = gusty
-    quiet = {**noise.reading, "r": 0.5 * noise.reading["r"]}
-    check = checked(problem, replace(noise, reading=quiet))
+    check = checked(problem, noise.with_levels({"r": 0.5 * noise.reading["r"]}))
     assert {tuple(e["band_hz"]) for e in check.spectrum if e["channel"] == "r"} >= {(8.0, 25.0)}
     loudest = max(check.spectrum, key=lambda e: e["ratio"])
     assert loudest["channel"] == "r" and {e["channel"] for e in check.spectrum} <= {"r", "psi"}
@@ -68,7 +72,7 @@ def test_innovations_that_follow_a_command_are_seen(tmp_path):
         injector.fly(tmp_path / "late", {"servo_delay": 0.08}, runs=RUNS[:2], seed=6)
     )
     noise = starting_noise(flight, LAMA)
-    noise = replace(noise, process={**noise.process, **noise.floor})
+    noise = at_floor(noise)
     problem = Problem.of(HeliModel(LAMA), [record_of(run) for run in flight.runs])
     check = checked(problem, noise)
     followed = {(e["channel"], e["command"]) for e in check.commands}

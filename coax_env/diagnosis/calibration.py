@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from coax_env.diagnosis.problem import Fit
-from coax_env.estimation.helicopter import GUST_LEVELS, WHITE_LEVELS
+from coax_env.estimation.helicopter_noise import GUST_LEVELS, WHITE_LEVELS
+from coax_env.estimation.prediction import gusts_of
 from coax_env.files import write_json
 from coax_env.logs.flight import Flight, Run
 from coax_env.model.vehicle import Vehicle
@@ -147,6 +148,6 @@ def class_of(flight: Flight, vehicle: Vehicle, fit: Fit) -> dict[str, Any]:
         "gust_moment": round(
             max(level[n] for n in GUST_LEVELS if "moment" in n) / (weight * arm), 4
         ),
-        "gust_memory_s": level["memory"] if felt else None,
+        "gust_memory_s": gusts_of(fit.noise)["memory_s"] if felt else None,
         "white_noise": any(level[n] > FELT * floor[n] for n in WHITE_LEVELS),
     }

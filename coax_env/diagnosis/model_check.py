@@ -180,7 +180,7 @@ def _scaled(
 ) -> np.ndarray:
     """Errors of one run's predictions over their std, (starts, horizons, 18)."""
     engine = problem.engine
-    p = engine.model.vector(fit.values)
+    p = engine.model.vector(fit.values, fit.noise)
     inputs = engine.model.inputs(replace(run.record, input_innovations=None), p)
     scale = engine.model.state_scale
     reading = _reading_std(fit.noise)

@@ -117,17 +117,8 @@ class _Trial:
 
     def _at(self, level: Level, factor: float) -> Fit:
         noise = self.fit.noise
-        changed = replace(
-            noise,
-            process={
-                n: v * (factor if n in level.names else 1.0) for n, v in noise.process.items()
-            },
-            reading={
-                n: v * (factor if n in level.names else 1.0) for n, v in noise.reading.items()
-            },
-        )
-        there = replace(self.fit, noise=changed)
-        return there.at({"gust_memory": changed.process["memory"]})
+        changed = {name: factor * noise.level(name) for name in level.names}
+        return replace(self.fit, noise=noise.with_levels(changed))
 
     def _felt(self, there: Fit) -> bool:
         """Whether the innovations change with the level so that a score could."""

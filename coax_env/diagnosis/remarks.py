@@ -9,7 +9,7 @@ from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.vibration import Line
-from coax_env.estimation.helicopter import WHITE_LEVELS
+from coax_env.estimation.helicopter_noise import WHITE_LEVELS
 from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter

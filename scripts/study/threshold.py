@@ -29,7 +29,7 @@ CLASS = {
     "mass_kg": [0.7, 0.9],
     "gust_force": [0.0, 0.05],  # of the weight
     "gust_moment": [0.0, 0.01],  # of the weight at the upper hub's arm
-    "gust_memory_s": [0.35, 0.7],
+    "gust_memory_s": [0.2, 1.2],
     "white_noise": [False],
 }
 """What the clean flights are like: what may be seen of a flight of theirs, or the ends of a range."""
@@ -37,7 +37,7 @@ CLASS = {
 
 def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
     """The threshold for 1 % false alarms and how it was found; None with too few clean flights."""
-    clean = [r for r in judge.finished(rows) if r["plan"]["kind"] in ("still", "gusty")]
+    clean = [r for r in judge.finished(rows) if not r["plan"]["effects"]]
     if len(clean) < FEWEST:
         return None
     evidence = np.array(
