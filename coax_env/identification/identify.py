@@ -36,6 +36,7 @@ from coax_env.identification.maximum_likelihood import (
 from coax_env.identification.two_step.method import TwoStep, two_step
 from coax_env.identification.undetermined import left_open
 from coax_env.logs.flight import Flight, read_flight
+from coax_env.logs.flown import flown_parts
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 
@@ -138,8 +139,8 @@ def identify(
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     if channels is not None:
         flight = with_channels(flight, channels)
-    flight, held = _split(flight, hold_out)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    flight, held = _split(flown_parts(flight, vehicle), hold_out)
     known = (*flight.notes, *double_counting(flight, vehicle))
     if method == "paper":
         result = two_step(flight, vehicle, progress=report)
@@ -214,7 +215,7 @@ def _split(flight: Flight, hold_out: Collection[str]) -> tuple[Flight, Flight]:
     if not hold_out:
         return flight, flight
     held = flight.select(hold_out)
-    used = [name for name in flight.run_names if name not in hold_out]
+    used = [run.name for run in flight.runs if not {run.name, run.whole} & set(hold_out)]
     if not used:
         raise InputError("all runs are held out: nothing is left to identify from")
     return flight.select(used), held

@@ -24,6 +24,7 @@ from coax_env.inspection.readings import (
 )
 from coax_env.inspection.units_and_signs import unit_and_sign_faults
 from coax_env.logs.flight import Flight, read_flight
+from coax_env.logs.flown import flown_parts
 from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
@@ -90,6 +91,7 @@ def check_flight(
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     label = str(flight.vehicle if vehicle is None else getattr(vehicle, "name", vehicle))
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    flight = flown_parts(flight, vehicle)
     channels = channel_checks(flight)
     suspicions = [*unit_and_sign_faults(flight, vehicle), *sensor_faults(channels)]
     if progress:
