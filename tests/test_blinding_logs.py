@@ -309,7 +309,7 @@ def test_parts_are_held_out_and_flown_again_as_one_run():
                     command=run.command[rows],
                     measured={c: v[rows] for c, v in run.measured.items()},
                     began=float(run.t[0]),
-                )  # fmt: skip
+                )
             )
     cut = replace(flight, runs=tuple(halves))
     model, records = HeliModel(vehicle), [record_of(run) for run in cut.runs]

@@ -1,4 +1,4 @@
-"""What of a flight was flown: runs cut where nothing is known, or where something else moves the machine.
+"""What of a flight was flown: runs cut where nothing is known, or something else moves the machine.
 
 - A gap: the last command is held for so long, and no longer; a new part begins behind it.
 - Commands that freeze, where they otherwise change all the time: the machine obeys others, or none.
@@ -42,7 +42,7 @@ MEAN_TIME = 0.5  # [s]; ours
 FLIES = 0.9
 """Share of the run's usual thrust from which on it flies again: between them it may stand; ours."""
 MOST_GROUNDED = 0.8
-"""Share of all time beyond which not the machine is on the ground, but the vehicle another one; ours."""
+"""Share of all rows beyond which the vehicle is another one, and nothing is cut; ours."""
 
 
 def flown_parts(flight: Flight, vehicle: Vehicle) -> Flight:

@@ -12,7 +12,7 @@ import numpy as np
 from coax_env.logs.units import ROTOR_COMMANDS, SWASH_COMMANDS
 
 MOST_SPEED = 2.5
-"""Times its usual value that a rotor speed may be: six times the thrust that carries the machine; ours."""
+"""Times its usual value that a rotor speed may be: six times the thrust that carries it; ours."""
 LEAST_SPEED = -0.5
 """The same downwards: a command somewhat below 0 is a controller's, and is clipped at 0; ours."""
 MOST_TILT = 0.35
