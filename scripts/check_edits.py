@@ -83,9 +83,9 @@ def check(
     """
     from coax_env import load_vehicle, read_flight
     from coax_env.diagnosis.changes import Before, changes, fitted_model
+    from coax_env.estimation.flown import flown_parts
     from coax_env.estimation.helicopter import record_of
     from coax_env.logs.edits import edited
-    from coax_env.logs.flown import flown_parts
 
     flight = read_flight(folder)
     machine = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)

@@ -34,6 +34,7 @@ from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.errors import InputError
 from coax_env.estimation.engine import BLOCK, Engine, Progress
 from coax_env.estimation.fitted_vehicle import median_step
+from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import (
     MOST_USUAL_SIZES,
     HeliModel,
@@ -43,7 +44,6 @@ from coax_env.estimation.helicopter import (
 from coax_env.estimation.quadratic import bounded_solve
 from coax_env.estimation.state_space import Record
 from coax_env.logs.flight import Flight
-from coax_env.logs.flown import flown_parts
 from coax_env.model import effects
 from coax_env.model.vehicle import Vehicle
 
@@ -66,6 +66,8 @@ FORM_ERROR = 0.03
 
 Measured: a delay of 30 ms, resampled on rows 7 ms apart, leaves 1 %; ours.
 """
+MANY_FORM_ERRORS = 3.0
+"""FORM_ERRORs that a change must be worth that is named by a flight's own noise only; ours."""
 LEAST_STD = 0.01
 """Std of a change as a share of it at least, for the same reason, and for what a run's start keeps of a
 bias until it has died out; ours.
@@ -296,14 +298,14 @@ def changes(before: Before, after: Sequence[Record], progress: Progress | None =
     different = float(0.5 * nothing @ nothing)
     while different > LEAST_DIFFERENT and len(best.effects) < chosen.most_causes:
         trials = _trials(logs, before.known, slopes, best, nothing)
-        if not trials or trials[0].nats - best.nats < chosen.evidence:
+        if not trials or not _holds(trials[0], best, nothing, chosen):
             break
         new = trials[0].effects[-1]
         alternatives[new] = tuple(
             t.effects[-1] for t in trials[1:] if trials[0].nats - t.nats < chosen.tie
         )
         report(f"{new} changed: {trials[0].nats - best.nats:.1f} nats")
-        best = trials[0]
+        best = _without_worthless(logs, before.known, trials[0], nothing, chosen)
     return _stated(problem, logs, before.known, best, alternatives, nothing)
 
 
@@ -312,6 +314,33 @@ def _of_readings(before: Before, there: Sequence[np.ndarray]) -> dict[str, np.nd
     own = np.concatenate([np.isfinite(e).ravel() for e in before.innovations])
     both = np.concatenate([mask.ravel() for mask in there])[own]
     return {effect: slopes[both] for effect, slopes in before.slopes.items()}
+
+
+def _holds(more: _Trial, fewer: _Trial, nothing: np.ndarray, settings: Settings) -> bool:
+    """Whether one more change is worth it: by the logs themselves, or by a flight's own noise.
+
+    The latter where two changes are there and one alone leaves much; never in what forms leave.
+    """
+    share = (_nats(fewer.residual) - _nats(more.residual)) / _nats(nothing)
+    by_flight = _nats(fewer.residual) - _nats(more.residual) > settings.evidence
+    by_logs = more.nats - fewer.nats > settings.evidence
+    return by_logs or (by_flight and share > MANY_FORM_ERRORS * FORM_ERROR)
+
+
+def _without_worthless(
+    logs: _Logs,
+    known: Mapping[str, Sequence[Coordinate]],
+    best: _Trial,
+    nothing: np.ndarray,
+    settings: Settings,
+) -> _Trial:
+    """Without the changes that stood for those that came after them."""
+    for effect in best.effects[:-1]:
+        rest = tuple(e for e in best.effects if e != effect)
+        fewer = _fitted(logs, known, rest, best.moves, nothing)
+        if not _holds(best, fewer, nothing, settings):
+            best = fewer
+    return best
 
 
 def _worth(nothing: np.ndarray, residual: np.ndarray, numbers: int, blocks: int) -> float:

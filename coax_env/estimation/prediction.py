@@ -16,6 +16,7 @@ import numpy as np
 from coax_env.errors import InputError
 from coax_env.estimation import kalman
 from coax_env.estimation.engine import Engine, Progress, RunPass
+from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import (
     GUST_LEVELS,
     HeliModel,
@@ -26,7 +27,6 @@ from coax_env.estimation.helicopter import (
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import Noise
 from coax_env.logs.flight import Flight, read_flight
-from coax_env.logs.flown import flown_parts
 from coax_env.model import state as S
 from coax_env.model.layout import CHANNEL_UNITS, CHANNELS, GUSTS, N_FULL
 from coax_env.model.vehicle import Vehicle

@@ -21,6 +21,7 @@ from coax_env.estimation.fitted_vehicle import (
     median_step,
     with_timing,
 )
+from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel, record_of, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import RunReplay, replay_runs
@@ -36,7 +37,6 @@ from coax_env.identification.maximum_likelihood import (
 from coax_env.identification.two_step.method import TwoStep, two_step
 from coax_env.identification.undetermined import left_open
 from coax_env.logs.flight import Flight, read_flight
-from coax_env.logs.flown import flown_parts
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from coax_env.estimation.flown import flown_parts
 from coax_env.inspection.learnable import EffectCheck, OwnNumber, learnable
 from coax_env.inspection.readings import (
     ChannelCheck,
@@ -24,7 +25,6 @@ from coax_env.inspection.readings import (
 )
 from coax_env.inspection.units_and_signs import unit_and_sign_faults
 from coax_env.logs.flight import Flight, read_flight
-from coax_env.logs.flown import flown_parts
 from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
