@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import command_line
 
-from coax_env.errors import InputError
 from coax_env.files import write_json
 
 if TYPE_CHECKING:
@@ -60,11 +59,13 @@ def arguments() -> argparse.Namespace:
 def _edit(text: str) -> tuple[str, float]:
     name, _, size = text.partition("=")
     if name not in PLANTED:
-        raise InputError(f"no edit {name!r} to check; there are {', '.join(PLANTED)}")
+        raise argparse.ArgumentTypeError(
+            f"no edit {name!r} to check; there are {', '.join(PLANTED)}"
+        )
     try:
         return name, float(size)
     except ValueError:
-        raise InputError(f"--edit should be NAME=SIZE, found {text!r}") from None
+        raise argparse.ArgumentTypeError(f"should be NAME=SIZE, found {text!r}") from None
 
 
 def check(

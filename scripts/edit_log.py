@@ -5,7 +5,6 @@ from pathlib import Path
 
 import command_line
 
-from coax_env.errors import InputError
 from coax_env.logs.edits import EDITS, edited
 from coax_env.logs.flight import read_flight, write_flight
 
@@ -40,7 +39,7 @@ def _edit(text: str) -> tuple[str, float]:
     try:
         return name, float(size)
     except ValueError:
-        raise InputError(f"--edit should be NAME=SIZE, found {text!r}") from None
+        raise argparse.ArgumentTypeError(f"should be NAME=SIZE, found {text!r}") from None
 
 
 def _moment(text: str) -> tuple[str, float]:
@@ -48,7 +47,7 @@ def _moment(text: str) -> tuple[str, float]:
     try:
         return run, float(t)
     except ValueError:
-        raise InputError(f"--since should be RUN:T, found {text!r}") from None
+        raise argparse.ArgumentTypeError(f"should be RUN:T, found {text!r}") from None
 
 
 if __name__ == "__main__":

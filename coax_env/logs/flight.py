@@ -35,7 +35,7 @@ class Run:
         t: (n,) time, strictly increasing [s].
         command: (n, 4) omega_u, omega_l [rad/s], delta_lon, delta_lat [rad], without holes.
         measured: channel -> (n,) readings in the contract's units, NaN where there is no new one.
-        part_of: the card's run of which this is a part (estimation/flown.py); empty where it is one itself.
+        part_of: the card's run of which it is a part (estimation/flown.py); empty where it is whole.
         began: time at which that one began [s]; None: with the first row.
     """
 

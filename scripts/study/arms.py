@@ -78,9 +78,7 @@ LEAST_SCALE = -0.6
 """Of a scale: three times the usual size could turn a time constant's sign."""
 
 
-def plan_arms(
-    arms: Sequence[str], clean: int, effects: int, seed: int = 0
-) -> list[PlannedFlight]:
+def plan_arms(arms: Sequence[str], clean: int, effects: int, seed: int = 0) -> list[PlannedFlight]:
     """The flights of some arms, evenly mixed so that a part of the study is a fair sample.
 
     Args:
