@@ -41,6 +41,7 @@ from coax_env.estimation.helicopter import (
     record_of,
     starting_noise,
 )
+from coax_env.estimation.prediction import WARM_UP
 from coax_env.estimation.quadratic import bounded_solve
 from coax_env.estimation.state_space import Record
 from coax_env.logs.flight import Flight
@@ -69,9 +70,7 @@ Measured: a delay of 30 ms, resampled on rows 7 ms apart, leaves 1 %; ours.
 MANY_FORM_ERRORS = 3.0
 """FORM_ERRORs that a change must be worth that is named by a flight's own noise only; ours."""
 LEAST_STD = 0.01
-"""Std of a change as a share of it at least, for the same reason, and for what a run's start keeps of a
-bias until it has died out; ours.
-"""
+"""Std of a change as a share of it at least, for the same reason; ours."""
 LEAST_DIFFERENT = 0.1
 """nats by which two logs differ at least: the digits of a CSV are worth 1e-6; ours."""
 RIDGE = 100.0  # usual sizes: prior of a change that is there, wide enough not to move it; ours
@@ -191,6 +190,8 @@ class Before:
     Attributes:
         problem, fit: of that log.
         innovations: per record, (n, m) whitened.
+        there: per record, (n, m), readings that count: from WARM_UP on, since a filter starts from the
+            first readings as they are, biased or not.
         known: effect -> its coordinates.
         slopes: effect -> derivatives of all innovations in them, (readings, coordinates).
     """
@@ -198,6 +199,7 @@ class Before:
     problem: Problem
     fit: Fit
     innovations: list[np.ndarray]
+    there: list[np.ndarray]
     known: Mapping[str, list[Coordinate]]
     slopes: Mapping[str, np.ndarray]
 
@@ -211,11 +213,16 @@ class Before:
         known: dict[str, list[Coordinate]] = {}
         for c in coordinates(problem, fit):
             known.setdefault(c.effect, []).append(c)
-        here = [run.innovations for run in problem.engine.filter(fit.values, fit.noise)]
-        own = _Logs(problem.engine, fit, here, [np.isfinite(e) for e in here])
+        passes = problem.engine.filter(fit.values, fit.noise)
+        here = [run.innovations for run in passes]
+        there = [
+            np.isfinite(run.innovations) & (run.record.t - run.record.t[0] >= WARM_UP)[:, None]
+            for run in passes
+        ]
+        own = _Logs(problem.engine, fit, here, there)
         problem.report(f"what {sum(map(len, known.values()))} numbers change of the innovations")
         slopes = {e: own.slopes(fit.values, coordinates) for e, coordinates in known.items()}
-        return cls(problem, fit, here, known, slopes)
+        return cls(problem, fit, here, there, known, slopes)
 
 
 # --- the search for what changed ------------------------------------------------------------------
@@ -284,10 +291,7 @@ def changes(before: Before, after: Sequence[Record], progress: Progress | None =
     problem, fit, chosen = before.problem, before.fit, before.problem.settings
     _check_same_rows(problem.engine.records, after)
     report = progress or (lambda text: None)
-    there = [
-        np.isfinite(innovations) & np.isfinite(record.z)
-        for innovations, record in zip(before.innovations, after, strict=True)
-    ]
+    there = [mask & np.isfinite(record.z) for mask, record in zip(before.there, after, strict=True)]
     logs = _Logs(
         Engine(problem.model, after, problem.engine.threads), fit, before.innovations, there
     )
@@ -311,7 +315,7 @@ def changes(before: Before, after: Sequence[Record], progress: Progress | None =
 
 def _of_readings(before: Before, there: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
     """Slopes of the log before, of those of its readings that are in both logs."""
-    own = np.concatenate([np.isfinite(e).ravel() for e in before.innovations])
+    own = np.concatenate([mask.ravel() for mask in before.there])
     both = np.concatenate([mask.ravel() for mask in there])[own]
     return {effect: slopes[both] for effect, slopes in before.slopes.items()}
 
