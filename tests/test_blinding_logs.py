@@ -16,7 +16,8 @@ from coax_env.diagnosis.hold_out import split
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.flown import flown_parts
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import replay_runs
 from coax_env.logs.flight import Flight, Run, read_flight
 from coax_env.logs.held import repeats

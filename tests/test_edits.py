@@ -13,7 +13,8 @@ from coax_env.diagnosis.changes import Before, changes, coordinates, effective, 
 from coax_env.diagnosis.fits import start
 from coax_env.diagnosis.problem import Problem
 from coax_env.errors import InputError
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.logs.edits import EDITS, LAT, LON, edited
 from coax_env.logs.flight import Flight, read_flight, write_flight
 from coax_env.model.vehicle_file import load_vehicle

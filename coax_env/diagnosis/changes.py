@@ -35,12 +35,8 @@ from coax_env.errors import InputError
 from coax_env.estimation.engine import BLOCK, Engine, Progress
 from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.flown import flown_parts
-from coax_env.estimation.helicopter import (
-    MOST_USUAL_SIZES,
-    HeliModel,
-    record_of,
-    starting_noise,
-)
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES, HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import WARM_UP
 from coax_env.estimation.quadratic import bounded_solve
 from coax_env.estimation.state_space import Record
