@@ -49,27 +49,30 @@ def split(
     """
     if hold_out is not None:
         return (
-            [r for r in records if r.name not in hold_out],
-            [r for r in records if r.name in hold_out],
+            [r for r in records if r.whole not in hold_out],
+            [r for r in records if r.whole in hold_out],
         )
-    if len(records) < settings.fewest_runs:
+    if len({r.whole for r in records}) < settings.fewest_runs:
         return [_third(r, False) for r in records], [_third(r, True) for r in records]
     chosen = _fair_share(model, records, noise, candidates)
     return (
-        [r for i, r in enumerate(records) if i not in chosen],
-        [r for i, r in enumerate(records) if i in chosen],
+        [r for r in records if r.whole not in chosen],
+        [r for r in records if r.whole in chosen],
     )
 
 
 def _third(record: Record, last: bool) -> Record:
     cut = record.t[0] + (record.t[-1] - record.t[0]) * 2.0 / 3.0
     rows = record.t >= cut if last else record.t < cut
-    return replace(part(record, rows), name=f"{record.name} (last third)" if last else record.name)
+    if not last:
+        return part(record, rows)
+    name, run = (f"{name} (last third)" for name in (record.name, record.whole))
+    return replace(part(record, rows), name=name, run=run)
 
 
 def _fair_share(
     model: HeliModel, records: Sequence[Record], noise: Noise, candidates: Sequence[str]
-) -> tuple[int, ...]:
+) -> tuple[str, ...]:
     """The quarter of the runs that holds out about a quarter of the information on each effect.
 
     Information is that of each effect's first parameter, and of a moment that follows the heading,
@@ -80,14 +83,16 @@ def _fair_share(
     free = [model.effect_parameters(e)[0] for e in candidates] + excitations()
     values = {**model.bare_values, **{f.name: f.value for f in free}}
     _, lin = Engine(model, records).linearise(values, noise, free)
-    information = np.einsum("rkk->rk", lin.information)
+    runs = tuple(dict.fromkeys(r.whole for r in records))
+    of_run = np.array([[float(r.whole == run) for r in records] for run in runs])
+    information = of_run @ np.einsum("rkk->rk", lin.information)
     total = information.sum(0)
     share = information[:, total > 0.0] / total[total > 0.0]
-    count = max(1, round(FAIR_SHARE * len(records)))
+    count = max(1, round(FAIR_SHARE * len(runs)))
 
     def unfairness(chosen: tuple[int, ...]) -> float:
         held = share[list(chosen)].sum(0)
         lost, unseen = np.maximum(held - MOST_LOST, 0.0), np.maximum(LEAST_SEEN - held, 0.0)
         return float(np.sum((held - FAIR_SHARE) ** 2) + UNFAIR * np.sum(lost + unseen))
 
-    return min(combinations(range(len(records)), count), key=unfairness)
+    return tuple(runs[i] for i in min(combinations(range(len(runs)), count), key=unfairness))
