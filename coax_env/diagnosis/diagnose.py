@@ -43,6 +43,7 @@ from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine, Progress
 from coax_env.estimation.fitted_vehicle import double_counting
+from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import sensor_std, starting_noise
 from coax_env.estimation.prediction import RunReplay, gusts_of, replay_runs
@@ -116,13 +117,14 @@ def diagnose(
     """
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    flight.select(hold_out or ())
+    check_hold_out(hold_out, flight.run_names)
+    flight = flown_parts(flight, vehicle)
     line, calm, calm_vehicle = _without_vibration(flight, vehicle, exclude)
     new_line = line if "vibration" not in vehicle.effects else None
     model = HeliModel(vehicle)
     noise = starting_noise(calm, calm_vehicle)
     candidates = namable(exclude, vehicle, flight)
-    flight.select(hold_out or ())
-    check_hold_out(hold_out, flight.run_names)
     report = progress or (lambda text: None)
     report("choosing the runs to hold out")
     records = [record_of(run) for run in calm.runs]
@@ -260,5 +262,5 @@ def _gain(
         box = black_box(problem, refitted)
         flexible = replay_runs(engine, box.values, box.noise, horizon)
     gain = gain_of(before, own_numbers, after, sensors, horizon, flexible)
-    gain["held_out"] = [r.name for r in held]
+    gain["held_out"] = list(dict.fromkeys(r.whole for r in held))
     return [before, own_numbers, after], gain

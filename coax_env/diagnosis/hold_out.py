@@ -51,27 +51,30 @@ def split(
     """
     if hold_out is not None:
         return (
-            [r for r in records if r.name not in hold_out],
-            [r for r in records if r.name in hold_out],
+            [r for r in records if r.whole not in hold_out],
+            [r for r in records if r.whole in hold_out],
         )
-    if len(records) < settings.fewest_runs:
+    if len({r.whole for r in records}) < settings.fewest_runs:
         return [_third(r, False) for r in records], [_third(r, True) for r in records]
     chosen = _fair_share(model, records, noise, candidates)
     return (
-        [r for i, r in enumerate(records) if i not in chosen],
-        [r for i, r in enumerate(records) if i in chosen],
+        [r for r in records if r.whole not in chosen],
+        [r for r in records if r.whole in chosen],
     )
 
 
 def _third(record: Record, last: bool) -> Record:
     cut = record.t[0] + (record.t[-1] - record.t[0]) * 2.0 / 3.0
     rows = record.t >= cut if last else record.t < cut
-    return replace(part(record, rows), name=f"{record.name} (last third)" if last else record.name)
+    if not last:
+        return part(record, rows)
+    name, run = (f"{name} (last third)" for name in (record.name, record.whole))
+    return replace(part(record, rows), name=name, run=run)
 
 
 def _fair_share(
     model: HeliModel, records: Sequence[Record], noise: Noise, candidates: Sequence[str]
-) -> list[int]:
+) -> list[str]:
     """Runs that hold out about a quarter of the information on each effect.
 
     Information is that of all an effect's parameters about the vehicle as given, with the starting
@@ -88,9 +91,11 @@ def _fair_share(
     ends = np.cumsum([0, *(len(group) for group in own.values())])
     groups = [information[:, a:b] for a, b in pairwise(ends)]
     groups += excitation(model, values, passes).values()
-    shares, weights = _shares(groups)
-    seconds = np.array([r.t[-1] - r.t[0] for r in records])
-    return fair_part(shares, weights, seconds / seconds.sum())
+    runs = list(dict.fromkeys(r.whole for r in records))
+    of_run = np.array([[float(r.whole == run) for r in records] for run in runs])
+    shares, weights = _shares([of_run @ group for group in groups])
+    seconds = of_run @ [r.t[-1] - r.t[0] for r in records]
+    return [runs[i] for i in fair_part(shares, weights, seconds / seconds.sum())]
 
 
 def _shares(groups: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

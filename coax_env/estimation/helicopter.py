@@ -242,4 +242,4 @@ def record_of(run: Run) -> Record:
     z = np.full((run.t.size, len(CHANNELS)), np.nan)
     for channel, values in run.measured.items():
         z[:, CHANNELS.index(channel)] = values
-    return Record(run.name, run.t, run.command, z, origin=float(run.t[0]))
+    return Record(run.name, run.t, run.command, z, origin=run.beginning, run=run.whole)

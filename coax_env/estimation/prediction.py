@@ -7,8 +7,8 @@ the end itself, its last one within the final TAIL seconds is used, at its own t
 """
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from coax_env.errors import InputError
 from coax_env.estimation import kalman
 from coax_env.estimation.engine import Engine, Progress, RunPass
+from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import AXES, fitted_levels, sensor_std, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
@@ -86,10 +87,31 @@ def replay_runs(
     starts = [_starts(r.t, horizon) for r in engine.records]
     passes = engine.filter(values, noise, start_rows=starts)
     p = engine.model.vector(values, noise)
-    return [
-        _replay_run(engine, run, dt, p, horizon, floor)
-        for run, dt in zip(passes, engine.intervals, strict=True)
-    ]
+    parts: dict[str, list[RunReplay]] = {}
+    for run, dt in zip(passes, engine.intervals, strict=True):
+        parts.setdefault(run.record.whole, []).append(
+            _replay_run(engine, run, dt, p, horizon, floor)
+        )
+    return [_joined(name, of_run) for name, of_run in parts.items()]
+
+
+def _joined(name: str, parts: Sequence[RunReplay]) -> RunReplay:
+    """The parts of a run as one."""
+    if len(parts) == 1:
+        return replace(parts[0], name=name)
+    columns = [f.name for f in fields(ChannelReplay)]
+    channels, floor, still = {}, {}, {}
+    for channel in dict.fromkeys(c for part in parts for c in part.channels):
+        there = [part for part in parts if channel in part.channels]
+        channels[channel] = ChannelReplay(
+            *(np.concatenate([getattr(p.channels[channel], c) for p in there]) for c in columns)
+        )
+        floors = [p.floor[channel] for p in there if channel in p.floor]
+        if floors:
+            floor[channel] = float(np.sqrt(np.mean(np.square(floors))))
+        still[channel] = np.concatenate([p.still[channel] for p in there])
+    nats = sum(part.log_likelihood for part in parts)
+    return RunReplay(name, channels, any(part.diverged for part in parts), floor, still, nats)
 
 
 def _replay_run(
@@ -205,7 +227,7 @@ def _targets(run: RunPass, horizon: float) -> np.ndarray:
     """Row of each channel's last reading within TAIL of each start's horizon, (s, 18); -1 for none."""
     t, present = run.record.t, np.isfinite(run.record.z)
     ends = np.searchsorted(t, t[run.start_rows] + horizon + 1e-6) - 1
-    begins = np.searchsorted(t, t[ends] - TAIL)
+    begins = np.searchsorted(t, t[run.start_rows] + horizon - TAIL - 1e-6)
     latest = np.maximum.accumulate(np.where(present, np.arange(t.size)[:, None], -1), axis=0)
     found = latest[ends]
     return np.ascontiguousarray(np.where(found >= begins[:, None], found, -1), dtype=np.int64)
@@ -286,6 +308,7 @@ def replay(
     """
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    flight = flown_parts(flight, vehicle)
     longest = max(run.duration for run in flight.runs)
     if longest < WARM_UP + horizon:
         raise InputError(

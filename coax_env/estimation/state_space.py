@@ -31,6 +31,7 @@ class Record:
     t: (n,) seconds, increasing. command: (n, k), held from each row to the next.
     z: (n, m) readings in the order of the model's channels, NaN where there is no new sample.
     origin: time at which the run began, also where the record is a part of it.
+    run: name of the run of which it is a part; empty where it is a run itself.
     input_innovations: (n, k) what each command shows beyond the readings before it, or None
     (input_innovations.py).
     """
@@ -41,6 +42,12 @@ class Record:
     z: np.ndarray
     origin: float = 0.0
     input_innovations: np.ndarray | None = None
+    run: str = ""
+
+    @property
+    def whole(self) -> str:
+        """Name of the run that it is, or is a part of."""
+        return self.run or self.name
 
 
 def part(record: Record, rows: np.ndarray) -> Record:
@@ -116,7 +123,9 @@ class Model(Protocol):
     drift_and_readings: Any  # compiled pointer: (x, u, dt, p, work, out), see above
     exact: np.ndarray  # (nx,) True where the drift is more than first order in dt
     work_size: int
-    noise_places: np.ndarray  # (e, 2) entries (i <= j) of the process noise: all (i, i), then others
+    noise_places: (
+        np.ndarray
+    )  # (e, 2) entries (i <= j) of the process noise: all (i, i), then others
 
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """The compiled functions' parameter vector for named values; others as in the model.
