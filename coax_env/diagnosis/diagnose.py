@@ -23,7 +23,7 @@ import numpy as np
 from coax_env.design import next_maneuver
 from coax_env.diagnosis import confounding, findings, unlisted, vibration
 from coax_env.diagnosis.black_box import black_box
-from coax_env.diagnosis.calibration import false_alarm_rate
+from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
 from coax_env.diagnosis.evidence import prune
 from coax_env.diagnosis.fits import fitted, noise_fitted, start
@@ -34,10 +34,12 @@ from coax_env.diagnosis.input_innovations import (
     with_command_gains,
     with_input_innovations,
 )
+from coax_env.diagnosis.model_check import model_check
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.remarks import remarks, vibration_removed
+from coax_env.diagnosis.remarks import one_step_against_a_second, remarks, vibration_removed
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
+from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine, Progress
 from coax_env.estimation.fitted_vehicle import double_counting
@@ -138,7 +140,7 @@ def diagnose(
     fit, quadratic = search(problem, refitted)
     problem, fit, quadratic, terms = unlisted.explain(problem, fit, quadratic)
     report("weighing the causes against their confounded alternatives")
-    problem, fit = with_command_gains(problem, fit)
+    problem, fit = with_command_gains(beside_large_axes(problem, fit), fit)
     fit, quadratic, evidence = prune(problem, fit)
     passes_after = problem.engine.filter(fit.values, fit.noise)
     white = {
@@ -146,17 +148,22 @@ def diagnose(
         "after": whiteness(passes_after, CHANNELS),
     }
     found = confounding.alternatives(problem, fit, quadratic, evidence, white["after"])
-    causes = findings.causes(problem, fit, quadratic, evidence, found, new_line)
+    report("asking left-out runs, halves and other noise whether the names hold")
+    trust = trusts(problem, fit, quadratic, evidence, found, white["after"])
+    causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_line)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)
     unexplained = described + findings.unexplained(white["after"], speaking_for)
 
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     replays, gain = _gain(problem, (bare, refitted, fit), held, sensors, ceiling)
+    report("asking whether the fitted model makes such flights")
+    check = model_check(problem, fit, passes_after)
     report("refitting the corrected model on everything")
     inflations = {e: weighed.inflation for e, weighed in evidence.items()}
     inflations |= unlisted.inflations(problem, fit, quadratic, terms)
     corrected = corrected_vehicle(problem, fit, quadratic, held, inflations, new_line, flight)
+    alarms = calibrated(settings.evidence, class_of(flight, vehicle, fit))
     by_evidence = [c["effect"] for c in causes if c["effect"] in found]
     design = confounding.separating_maneuver(problem, fit, quadratic, found, by_evidence, flight)
     return Diagnosis(
@@ -167,7 +174,9 @@ def diagnose(
             "unexplained": unexplained,
             "gain": gain,
             "next_maneuver": next_maneuver.advise(design, settings.evidence),
-            "false_alarm_rate": false_alarm_rate(settings.evidence),
+            "false_alarm_rate": alarms.rate,
+            "class": alarms.entry,
+            "model_check": check.entry,
         },
         flight=flight,
         vehicle_before=vehicle,
@@ -185,6 +194,8 @@ def diagnose(
             *double_counting(flight, vehicle),
             *([vibration_removed(line)] if line else []),
             *remarks(problem, fit, quadratic, found),
+            *one_step_against_a_second(gain, replays[1], replays[2], settings),
+            *check.remarks,
         ),
         noise=sensors,
         design=design,

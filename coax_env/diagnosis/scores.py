@@ -108,6 +108,23 @@ def is_large(problem: Problem, effect: str, values: Mapping[str, float]) -> bool
     return max(sizes) >= 1.0
 
 
+def lost(problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str) -> float:
+    """Nats lost when an active effect leaves and the rest is refitted.
+
+    Args:
+        problem: what may be free.
+        quadratic: linearised at the fit.
+        active: effects in the model.
+        effect: that leaves.
+    """
+    free = problem.free_names(active)
+    now, _ = quadratic.best(free)
+    rest = [n for n in free if not n.startswith(effect + ".")]
+    fixed = problem.off_values(effect) | problem.file_values(effect)
+    then, _ = quadratic.best(rest, fixed)
+    return then - now
+
+
 def loss(
     problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str, inflation: float
 ) -> float:
@@ -120,12 +137,9 @@ def loss(
         effect: that leaves.
         inflation: variance inflation by which the loss is divided; 1 for white innovations.
     """
-    free = problem.free_names(active)
-    now, _ = quadratic.best(free)
-    rest = [n for n in free if not n.startswith(effect + ".")]
-    fixed = problem.off_values(effect) | problem.file_values(effect)
-    then, _ = quadratic.best(rest, fixed)
-    return (then - now) / inflation - quadratic.occam(problem.acting_names(effect), rest)
+    rest = [n for n in problem.free_names(active) if not n.startswith(effect + ".")]
+    gone = lost(problem, quadratic, active, effect)
+    return gone / inflation - quadratic.occam(problem.acting_names(effect), rest)
 
 
 def inflation(problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str) -> float:

@@ -26,7 +26,7 @@ from coax_env.diagnosis.fits import fitted, linearise, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.estimation.engine import RunPass
-from coax_env.estimation.helicopter import MOST_USUAL_SIZES
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES, HeliModel
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import whiteness
@@ -251,10 +251,38 @@ def name(axis: str, term: Term) -> str:
     return f"{axis}.{term.key}"
 
 
-def excitations() -> list[FreeParameter]:
-    """Terms that stand for the rest when runs are chosen: no effect needs the heading to turn."""
-    turning = [term for term in TERMS if term.key in ("sin_psi", "sin_3psi")]
-    return parameters("unlisted_M", turning)
+def excitation(
+    model: HeliModel, values: Mapping[str, float], passes: Sequence[RunPass]
+) -> dict[str, np.ndarray]:
+    """How much each run moves every state and command, whatever may follow them.
+
+    Args:
+        model: with the vehicle.
+        values: of its parameters.
+        passes: of a filter over the runs.
+
+    Returns:
+        what generic terms follow -> (runs, terms) the time integral of each term squared about its
+        mean over all runs.
+    """
+    p = model.vector(values)
+    tables = []
+    for run in passes:
+        table = np.empty((run.record.t.size, len(TERMS)))
+        _evaluate(run.states, run.inputs, p, table)
+        tables.append(table)
+    mean = np.mean(np.concatenate(tables), axis=0)
+    moved = np.array(
+        [
+            np.gradient(run.record.t) @ (table - mean) ** 2
+            for run, table in zip(passes, tables, strict=True)
+        ]
+    )
+    alone = [(k, term.follows[0]) for k, term in enumerate(TERMS) if len(term.follows) == 1]
+    return {
+        followed: moved[:, [k for k, name in alone if name == followed]]
+        for followed in dict.fromkeys(name for _, name in alone)
+    }
 
 
 # --- the search -----------------------------------------------------------------------------------

@@ -6,8 +6,9 @@ set to zero; the version in which they decay is computed beside it. Where a chan
 the end itself, its last one within the final TAIL seconds is used, at its own time.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,10 @@ class RunReplay:
     diverged: bool
     floor: Mapping[str, float]
     """Std by channel that the uncertainty of the start alone gives at the end; empty unless asked."""
+    still: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Errors by channel, (s,), of the prediction that nothing changes from the start on."""
+    log_likelihood: float = math.nan
+    """Of the run's readings, each predicted from those before it [nats]."""
 
 
 def replay_runs(
@@ -116,6 +121,7 @@ def _replay_run(
     used = np.flatnonzero(np.isfinite(run.record.z).any(axis=0))
     t, measured = _readings_at(run, targets)
     predicted, decaying, finite = _fly_all(engine, run, inputs, dt, p, targets)
+    unmoved = _unmoved(engine, run, inputs, dt, p)
     diverged = not (finite and np.isfinite(run.log_likelihood))
     return RunReplay(
         run.record.name,
@@ -127,7 +133,21 @@ def _replay_run(
         },
         diverged,
         _floor(engine, run, inputs, dt, p, targets, used) if floor and not diverged else {},
+        {CHANNELS[i]: _error(CHANNELS[i], unmoved[:, i] - measured[:, i]) for i in used},
+        run.log_likelihood,
     )
+
+
+def _unmoved(
+    engine: Engine, run: RunPass, inputs: np.ndarray, dt: np.ndarray, p: np.ndarray
+) -> np.ndarray:
+    """Readings of the filtered state at every start itself, (s, 18)."""
+    readings = np.full((run.start_rows.size, len(CHANNELS)), np.nan)
+    for row, first in zip(readings, run.start_rows, strict=True):
+        here = np.full(len(CHANNELS), first)
+        x = run.states[first].copy()
+        kalman.fly_open_loop(engine.compiled, dt, inputs, x, p, first, here, row)
+    return readings
 
 
 def _fly_all(
@@ -214,12 +234,15 @@ def _targets(run: RunPass, horizon: float) -> np.ndarray:
 def _channel(
     name: str, t: np.ndarray, measured: np.ndarray, predicted: np.ndarray, decaying: np.ndarray
 ) -> ChannelReplay:
-    error, error_decaying = predicted - measured, decaying - measured
-    if name in ("phi", "theta"):
-        error, error_decaying = (
-            np.mod(e + np.pi, 2.0 * np.pi) - np.pi for e in (error, error_decaying)
-        )
+    error, error_decaying = (_error(name, flown - measured) for flown in (predicted, decaying))
     return ChannelReplay(t, measured, predicted, error, error_decaying)
+
+
+def _error(name: str, difference: np.ndarray) -> np.ndarray:
+    """Prediction less measurement, wrapped for roll and pitch."""
+    if name in ("phi", "theta"):
+        return np.asarray(np.mod(difference + np.pi, 2.0 * np.pi) - np.pi)
+    return difference
 
 
 def _spread(
