@@ -41,7 +41,7 @@ def causes(
     dt = median_step(problem.engine.records)
     entries: list[dict[str, Any]] = []
     for effect in fit.active:
-        own = zip(problem.own[effect], effects.CATALOGUE[effect].parameters, strict=True)
+        own = zip(problem.own[effect], effects.CATALOGUE[effect].fitted, strict=True)
         entries.append(
             {
                 "effect": effect,

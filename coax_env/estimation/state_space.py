@@ -12,7 +12,8 @@ class FreeParameter:
     """A number the engine may change.
 
     ``value`` is the prior's mean and ``std`` its width; ``probe`` the finite step used for its
-    signature (0: a small one, for the derivative). ``reading_only``: it never moves the state.
+    signature near that mean (0: a small one, for the derivative), ``jumps``: and anywhere, the way
+    that leaves the bounds alone. ``reading_only``: it never moves the state.
     """
 
     name: str
@@ -22,6 +23,7 @@ class FreeParameter:
     upper: float = np.inf
     probe: float = 0.0
     reading_only: bool = False
+    jumps: bool = False
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Record:
     z: (n, m) readings in the order of the model's channels, NaN where there is no new sample.
     origin: time at which the run began, also where the record is a part of it.
     input_innovations: (n, k) what each command shows beyond the readings before it, or None
-    (input_innovations.py).
+    (input_innovations.py). battery: (n,) its voltage [V], or None.
     """
 
     name: str
@@ -41,18 +43,22 @@ class Record:
     z: np.ndarray
     origin: float = 0.0
     input_innovations: np.ndarray | None = None
+    battery: np.ndarray | None = None
 
 
 def part(record: Record, rows: np.ndarray) -> Record:
     """Some rows of a record, its clock kept."""
+
+    def of(values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None else values[rows]
+
     return replace(
         record,
         t=record.t[rows],
         command=record.command[rows],
         z=record.z[rows],
-        input_innovations=None
-        if record.input_innovations is None
-        else record.input_innovations[rows],
+        input_innovations=of(record.input_innovations),
+        battery=of(record.battery),
     )
 
 

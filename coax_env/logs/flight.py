@@ -21,7 +21,7 @@ from coax_env.files import read_bytes, staged_folder, write_text
 from coax_env.logs.card import CARD, Card, read_card
 from coax_env.logs.csv_log import read_csv
 from coax_env.logs.repairs import repaired
-from coax_env.logs.units import ROTOR_COMMANDS, SWASH_COMMANDS
+from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
 
@@ -35,6 +35,7 @@ class Run:
         t: (n,) time, strictly increasing [s].
         command: (n, 4) omega_u, omega_l [rad/s], delta_lon, delta_lat [rad], without holes.
         measured: channel -> (n,) readings in the contract's units, NaN where there is no new one.
+        battery: (n,) voltage, the last sample held [V]; None where none was logged.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Run:
     measured: Mapping[str, np.ndarray]
     maneuver: str = ""
     note: str = ""
+    battery: np.ndarray | None = None
 
     @property
     def duration(self) -> float:
@@ -124,7 +126,15 @@ def read_flight(path: str | Path) -> Flight:
         unread |= dict.fromkeys(log.unknown)
         data = repaired(log, card.noise, counts)
         runs.append(
-            Run(entry.name, data.t, data.command, data.measured, entry.maneuver, entry.note)
+            Run(
+                entry.name,
+                data.t,
+                data.command,
+                data.measured,
+                entry.maneuver,
+                entry.note,
+                data.battery,
+            )
         )
     _check_columns(folder, card, renamed, unread)
     return Flight(
@@ -201,6 +211,9 @@ def _csv_text(run: Run) -> str:
     header = ["t", *ROTOR_COMMANDS, *SWASH_COMMANDS]
     to_log = (RPM_PER_RAD_S, RPM_PER_RAD_S, 1.0, 1.0)
     columns += [[f"{x:.12g}" for x in run.command[:, i] * to_log[i]] for i in range(4)]
+    if run.battery is not None:
+        header.append(BATTERY)
+        columns.append([f"{x:.9g}" for x in run.battery.tolist()])
     for channel in CHANNELS:
         if channel in run.measured:
             header.append(channel)

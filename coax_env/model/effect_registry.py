@@ -32,7 +32,8 @@ class EffectParameter:
     ``usual`` is the usual size and the std of the prior about ``off``; ``smallest`` the size under
     which it does not matter in prediction and is never named; a ``shape`` parameter (a decay, say)
     acts only once the effect itself does; ``timing``: a lag or delay of the command; ``probe``: finite
-    step for the signature where the effect has no slope at its off-value.
+    step for the signature where the effect has no slope at its off-value, ``jumps``: or anywhere;
+    ``held``: is stated, never fitted, and does not act alone.
     """
 
     name: str
@@ -45,6 +46,13 @@ class EffectParameter:
     shape: bool = False
     timing: bool = False
     probe: float = 0.0
+    jumps: bool = False
+    held: bool = False
+
+    def at(self, share: float) -> float:
+        """The value so many usual sizes from the off-value, on the side that the bounds leave."""
+        step = share * self.usual
+        return self.off + step if self.off + step <= self.upper else self.off - step
 
 
 @dataclass(frozen=True)
@@ -74,6 +82,11 @@ class Effect:
     def names(self) -> tuple[str, ...]:
         """Full names of the parameters, ``effect.parameter``."""
         return tuple(f"{self.name}.{p.name}" for p in self.parameters)
+
+    @property
+    def fitted(self) -> tuple[EffectParameter, ...]:
+        """The parameters that a fit may move: all that are not held."""
+        return tuple(p for p in self.parameters if not p.held)
 
 
 CATALOGUE: dict[str, Effect] = {}
@@ -113,7 +126,7 @@ def effect(
             raise InputError(f"effect {own!r}: @effect(stage, EffectParameter(...), ...) is wanted")
         if own in GROUPS:
             raise InputError(f"the catalogue of effects has {own!r} already")
-        if damps and sum(not p.shape for p in parameters) != 1:
+        if damps and sum(not (p.shape or p.held) for p in parameters) != 1:
             raise InputError(f"effect {own!r}: damps=True is for an effect of one parameter")
         for channel in channels.split():
             if channel not in CHANNELS:
@@ -162,7 +175,7 @@ def _offs() -> tuple[np.ndarray, np.ndarray]:
     """Off-values of all effects' parameters, (k,), and which switch each one throws, (k, stages)."""
     every = [(p, e.stage) for e in GROUPS.values() for p in e.parameters]
     throws = [
-        [not p.shape and stage == switch for switch in range(P.N_FIXED, _FIRST)]
+        [not (p.shape or p.held) and stage == switch for switch in range(P.N_FIXED, _FIRST)]
         for p, stage in every
     ]
     return np.array([p.off for p, _ in every]), np.array(throws, dtype=float)

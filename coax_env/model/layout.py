@@ -49,8 +49,10 @@ COMMANDS = (
     ("omega_u", "rad/s"), ("omega_l", "rad/s"), ("delta_lon", "rad"), ("delta_lat", "rad"),
 )  # fmt: skip
 N_COMMANDS = len(COMMANDS)
-TIME = 4  # the kernel's input is the four commands and the time since the run's start [s]
-N_INPUTS = N_COMMANDS + 1
+# the kernel's input is the four commands, and beside them
+TIME = 4  # since the run's start [s]
+BATTERY = 5  # voltage over the nominal one [V]; 0 where none is known
+N_INPUTS = N_COMMANDS + 2
 
 # --- measurement channels -----------------------------------------------------------------------
 CHANNEL_UNITS = {
