@@ -191,6 +191,8 @@ def diagnose(
 def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:
     """Effects that may be named: not excluded, not in the vehicle yet, and with their sensor aboard.
 
+    Of sag by time and by voltage the one, of what goes by another's name the other.
+
     Args:
         exclude: effects of the catalogue.
         vehicle: as given.
@@ -207,7 +209,11 @@ def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple
     absent.add("battery_sag" if _voltage_varies(flight) else "battery_voltage")
     if "pn" in flight.channels:  # height then comes with the position, not from a sonar
         absent |= {"sonar_tilt", "sonar_scale", "sonar_delay"}
-    return tuple(e for e, entry in effects.CATALOGUE.items() if e not in absent and not entry.line)
+    return tuple(
+        e
+        for e, entry in effects.CATALOGUE.items()
+        if e not in absent and not entry.line and not entry.named_as
+    )
 
 
 VARYING = 0.1

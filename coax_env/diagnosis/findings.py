@@ -54,7 +54,7 @@ def causes(
                     for f, p in own
                 },
                 "evidence": evidence[effect].nats,
-                "confusable_with": list(found[effect]),
+                "confusable_with": [*found[effect], *effects.found_by_the_name_of(effect)],
                 "channels": channels_of(problem, fit, quadratic, effect),
             }
         )

@@ -19,7 +19,6 @@ from coax_env.model import parameters as P
 
 EXCLUSIVE = (
     frozenset({"servo_lag", "servo_delay"}),  # a real servo is a mixture of both
-    frozenset({"servo_play", "servo_deadband"}),  # either holds the plate back when a command turns
     frozenset({"battery_sag", "battery_voltage"}),  # the same rotors slow down
 )
 """Effects of which one at most is named."""

@@ -253,7 +253,6 @@ class HeliModel:
                 min(p.upper, p.off + MOST_USUAL_SIZES * p.usual),
                 p.probe,
                 entry.stage == effects.SENSOR,
-                p.jumps,
             )
             for p in entry.fitted
         ]

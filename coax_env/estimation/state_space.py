@@ -12,8 +12,8 @@ class FreeParameter:
     """A number the engine may change.
 
     ``value`` is the prior's mean and ``std`` its width; ``probe`` the finite step used for its
-    signature near that mean (0: a small one, for the derivative), ``jumps``: and anywhere, the way
-    that leaves the bounds alone. ``reading_only``: it never moves the state.
+    signature near that mean (0: a small one, for the derivative). ``reading_only``: it never moves the
+    state.
     """
 
     name: str
@@ -23,7 +23,6 @@ class FreeParameter:
     upper: float = np.inf
     probe: float = 0.0
     reading_only: bool = False
-    jumps: bool = False
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ class EffectParameter:
     ``usual`` is the usual size and the std of the prior about ``off``; ``smallest`` the size under
     which it does not matter in prediction and is never named; a ``shape`` parameter (a decay, say)
     acts only once the effect itself does; ``timing``: a lag or delay of the command; ``probe``: finite
-    step for the signature where the effect has no slope at its off-value, ``jumps``: or anywhere;
-    ``held``: is stated, never fitted, and does not act alone.
+    step for the signature where the effect has no slope at its off-value; ``held``: is stated, never
+    fitted, and does not act alone.
     """
 
     name: str
@@ -46,7 +46,6 @@ class EffectParameter:
     shape: bool = False
     timing: bool = False
     probe: float = 0.0
-    jumps: bool = False
     held: bool = False
 
     def at(self, share: float) -> float:
@@ -62,7 +61,8 @@ class Effect:
     ``replaces`` names base parameters that are the same column. ``input_shift``: acts on the input,
     not in the kernel. ``line``: found by its line in the spectrum (vibration.py), not by a signature.
     ``generic``: unlisted terms, of which a vehicle file holds those that are not zero. ``damps``: its
-    one parameter damps the motion, and so changes what a filter makes of gusts.
+    one parameter damps the motion, and so changes what a filter makes of gusts. ``named_as``: the
+    effect by whose name it is found, where it acts in jumps that no filter can follow.
     """
 
     name: str
@@ -77,6 +77,7 @@ class Effect:
     line: bool = False
     generic: bool = False
     damps: bool = False
+    named_as: str = ""
     index: int = -1
 
     def names(self) -> tuple[str, ...]:
@@ -106,6 +107,7 @@ def effect(
     line: bool = False,
     generic: bool = False,
     damps: bool = False,
+    named_as: str = "",
     name: str = "",
 ) -> Callable[[Callable], Callable]:
     """Enter a function into the catalogue; its docstring is the effect's summary.
@@ -113,7 +115,7 @@ def effect(
     Args:
         stage: where in the kernel it runs. parameters: in the order of the parameter vector.
         channels: names, with spaces, of those that show it most. source: book or paper, and equation.
-        replaces, input_shift, line, generic, damps: see Effect.
+        replaces, input_shift, line, generic, damps, named_as: see Effect.
         name: in the catalogue; that of the function where empty.
 
     Raises:
@@ -146,6 +148,7 @@ def effect(
             line=line,
             generic=generic,
             damps=damps,
+            named_as=named_as,
             index=n_parameters(),
         )
         GROUPS[own] = entry
@@ -155,6 +158,11 @@ def effect(
         return function_compiled
 
     return enter
+
+
+def found_by_the_name_of(name: str) -> list[str]:
+    """Effects that are found by another one's name."""
+    return [own for own, entry in CATALOGUE.items() if entry.named_as == name]
 
 
 def forget(names: Collection[str]) -> None:
