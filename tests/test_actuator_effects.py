@@ -6,8 +6,10 @@ Each against a closed form first; then hidden in flights by other code in anothe
 import math
 from collections.abc import Callable, Collection
 
+import injector
 import numpy as np
 import pytest
+from causes import check_causes, truth_of
 
 import coax_env
 from coax_env.diagnosis.diagnose import diagnose, namable, stated
@@ -369,3 +371,19 @@ def test_a_hidden_actuator_effect_is_found_and_nothing_else(effect):
         reported = cause["parameters"][f"{effect}.{name}"]
         allowed = 3.0 * reported["std"] + 0.1 * value  # the form is another one
         assert abs(reported["value"] - value) < allowed, (name, reported)
+
+
+IN_THE_INJECTOR = {
+    "battery": {"battery_voltage": {}},
+    "phase": {"swash_phase": {"angle": -0.2, "per_rpm": 3e-4}},
+    "radio and servo": {"command_delay": {}, "servo_lag": {}},
+}
+"""Hidden by the independent simulator, whose forms are others too."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", IN_THE_INJECTOR)
+def test_what_the_injector_hides_is_found_and_nothing_else(tmp_path, case):
+    runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "climb_descend", "heading_turn")
+    folder = injector.fly(tmp_path / "flight", IN_THE_INJECTOR[case], runs=runs, seed=21)
+    check_causes(diagnose(folder, hold_out=[]).findings, *truth_of(folder))
