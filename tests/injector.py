@@ -48,6 +48,7 @@ from numba import njit
 RPM = 30.0 / math.pi
 STEP, SUBSTEPS = 0.01, 5
 SETTLE = 6.0  # s flown before the log starts
+BLADES = 1.2  # rise of thrust with rotor speed at held inflow, over the square law's
 GIVE = 0.005  # s in which a linkage's stop, or a servo near its command, gives way
 FULL = 12.3  # V of the battery as a log starts, in hover
 
@@ -84,6 +85,7 @@ class Hidden(NamedTuple):
     droop_upper: float = 0.0
     droop_lower: float = 0.0
     per_volt: float = 0.0
+    inflow_time: float = 0.0
     motor_upper: float = 0.0
     motor_lower: float = 0.0
     sag: float = 0.0
@@ -150,6 +152,7 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
     "command_delay": {"time": ("command_delay", 0.04)},
     "motor_droop": {"upper": ("droop_upper", 0.25), "lower": ("droop_lower", 0.2)},
     "battery_voltage": {"per_volt": ("per_volt", 0.06)},
+    "dynamic_inflow": {"time": ("inflow_time", 0.05)},
     "motor_lag": {"upper": ("motor_upper", 0.08), "lower": ("motor_lower", 0.08)},
     "battery_sag": {"rate": ("sag", 0.002)},
     "added_mass": {"mass": ("added_mass", 0.06)},
@@ -190,7 +193,8 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
 OTHER_FORM = frozenset({"ground_effect.gain", "airframe_drag.area_x", "airframe_drag.area_y",
                         "airframe_drag.area_z", "wake_interference.gain",
                         "rate_damping.coefficient", "vibration.amplitude", "battery_sag.rate",
-                        "battery_voltage.per_volt", "command_delay.time", "servo_rate.limit",
+                        "battery_voltage.per_volt", "dynamic_inflow.time", "command_delay.time",
+                        "servo_rate.limit",
                         "motor_droop.upper", "motor_droop.lower",
                         "servo_play.width", "servo_deadband.width",
                         "outside.heading_moment", "outside_patch.lift", "outside_product.moment",
@@ -276,8 +280,9 @@ def _suited(pilot: Pilot, craft: Craft) -> Pilot:
 # --- physics --------------------------------------------------------------------------------------
 # State: 0-2 position, 3-5 velocity (both inertial), 6-9 quaternion body to inertial, 10-12 p q r,
 # 13-16 alpha_l beta_l alpha_f beta_f, 17-18 rotor speeds, 19-20 swash, 21-22 swash rates, 23 a cable's
-# twist in units of its greatest, 24-25 the plate behind a linkage's play.
-N_STATE = 26
+# twist in units of its greatest, 24-25 the plate behind a linkage's play,
+# 26 induced velocity over that in hover.
+N_STATE = 27
 CABLE = 0.3  # rad of turn after which a cable slips
 # Out: 0-2 specific force, 3-5 angular acceleration (body axes).
 
@@ -328,6 +333,14 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     thrust_u *= (wu / rotors.hover_upper) ** hidden.thrust_excess
     thrust_l *= (wl / rotors.hover_lower) ** hidden.thrust_excess
     thrust_l -= hidden.wake * 0.5 * math.sqrt(thrust_u * thrust_l)
+    if (
+        hidden.inflow_time > 0.0
+    ):  # blades at an inflow of its own momentum, which air's mass holds up
+        faster = 0.5 * (wu / rotors.hover_upper + wl / rotors.hover_lower)
+        stronger = 1.0 + BLADES * (1.0 - s[26] / faster)
+        thrust_u *= stronger
+        thrust_l *= stronger
+        ds[26] = (faster**2 * stronger - s[26] ** 2) / ((2.0 + BLADES) * hidden.inflow_time)
     height = max(-s[2], 0.4 * craft.radius)
     rise = 1.0 / (1.0 - hidden.ge_gain * (craft.radius / (4.0 * height)) ** 2)  # Cheeseman-Bennett
     rise *= 1.0 + hidden.axial * air[2] / math.sqrt(1.0 + (air[2] / 4.2) ** 2)
@@ -542,6 +555,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden,
     s[0], s[1], s[2] = targets[0, 0], targets[0, 1], -targets[0, 2]
     s[6], s[9] = math.cos(targets[0, 3] / 2.0), math.sin(targets[0, 3] / 2.0)
     s[17], s[18] = rotors.hover_upper, rotors.hover_lower
+    s[26] = 1.0
     out = np.zeros(6)
     out2 = np.zeros(6)
     memory = np.zeros(4)

@@ -19,8 +19,9 @@ from coax_env.model import dynamics
 from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
+from coax_env.model.generic_terms import hover_speeds
 from coax_env.model.layout import N_CHANNELS
-from coax_env.model.linear import HARD_SERVOS, linearize, sampled
+from coax_env.model.linear import WITHOUT_SLOPE, linearize, sampled
 from coax_env.model.sensors import log_suite
 from coax_env.simulation.log import log_readings
 from coax_env.simulation.maneuvers import maneuver
@@ -111,8 +112,9 @@ def test_a_lagging_servo_of_limited_rate_is_exact_at_any_step(rows):
 def test_designs_do_not_see_what_has_no_slope():
     """Play, deadband and rate limit leave a linear design as it is; the sampled one too."""
     hard = LAMA
-    for name in HARD_SERVOS:
-        hard = hard.with_effect(name, **{"servo_rate": {"limit": 1.0}}.get(name, {"width": 0.02}))
+    for name in WITHOUT_SLOPE:
+        own = {"servo_rate": {"limit": 1.0}, "dynamic_inflow": {"time": 0.03}}
+        hard = hard.with_effect(name, **own.get(name, {"width": 0.02}))
     assert hard.vector.tolist() != LAMA.vector.tolist()
     for full in (False, True):
         ours, bare = linearize(hard, full), linearize(LAMA, full)
@@ -165,6 +167,65 @@ def test_a_common_delay_shifts_the_whole_flight():
             late = np.interp(track.t[:n] - delay, ahead.t[:n], ahead[state][:n])
             assert np.abs(ahead[state][:n]).max() > 0.05
             np.testing.assert_allclose(track[state][:n], late, atol=2e-3 * np.abs(late).max())
+
+
+# --- inflow ----------------------------------------------------------------------------------------
+
+GAIN = 1.2  # sigma a / (4 sqrt(2 C_T)), of a solidity of 0.1
+
+
+def thrust_after(vehicle: coax_env.Vehicle, share: float, rows: int, dt: float) -> float:
+    """Thrust over that in hover, this many rows after both rotors were told to speed up by a share."""
+    x, work, out = dynamics.full_state(*TRIM, vehicle), np.zeros(dynamics.WORK_SIZE), np.empty(18)
+    u = dynamics.kernel_input(TRIM[1] * [1.0 + share, 1.0 + share, 1.0, 1.0])
+    settled = dynamics.readings(x, TRIM[1], vehicle)["az"]
+    for _ in range(rows):
+        dynamics.step(x, u, dt, vehicle.vector, work, x)
+        x[:16] = TRIM[0]
+    dynamics.measure(x, u, vehicle.vector, work, out)
+    return out[7] / settled
+
+
+@pytest.mark.parametrize("share", [-0.05, 0.08])
+def test_thrust_overshoots_and_the_inflow_follows(share):
+    """(1 + s)^2 (1 + e s) at once, and e s less by half after ln 2 of its time."""
+    slow = LAMA.with_effect("dynamic_inflow", time=0.04)
+    at_once = thrust_after(slow, share, 0, 0.01) / (1.0 + share) ** 2 - 1.0
+    assert at_once == pytest.approx(GAIN * share, rel=0.01)
+    half = thrust_after(slow, share, 5, 0.04 * math.log(2.0) / 5) / (1.0 + share) ** 2 - 1.0
+    assert half == pytest.approx(0.5 * GAIN * share, rel=0.01)
+    assert thrust_after(slow, share, 100, 0.01) == pytest.approx((1.0 + share) ** 2, rel=1e-6)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.02, 0.05, 0.08])
+@pytest.mark.parametrize("rows", [1, 6])
+def test_the_inflow_behind_lagging_rotors_is_exact_at_any_step(lag, rows):
+    """w' = (c - w)/lag, v' = (w/w_h - v)/time, in steps of 10 us; equal lags are no exception."""
+    time, seconds = 0.05, 0.06
+    slow = LAMA.with_effect("dynamic_inflow", time=time)
+    slow = slow.with_effect("motor_lag", upper=lag, lower=0.03)
+    x, work = dynamics.full_state(*TRIM, slow), np.zeros(dynamics.WORK_SIZE)
+    u = dynamics.kernel_input(TRIM[1] * [1.1, 0.95, 1.0, 1.0])
+    hover = hover_speeds(LAMA.vector)
+    speed, inflow, h = TRIM[1][:2].copy(), x[S.INFLOW], 1e-5
+    for _ in range(round(seconds / h)):
+        speed[0] = u[0] if lag == 0.0 else speed[0] + h * (u[0] - speed[0]) / lag
+        speed[1] += h * (u[1] - speed[1]) / 0.03
+        inflow += h * (np.mean(speed / hover) - 1.0 - inflow) / time
+    for _ in range(rows):
+        dynamics.step(x, u, seconds / rows, slow.vector, work, x)
+        x[:16] = TRIM[0]
+    assert abs(x[S.INFLOW] - inflow) < 2e-5
+
+
+def test_a_settled_inflow_changes_no_rate():
+    state, command = TRIM[0] + 0.1, TRIM[1] * [1.1, 0.97, 1.0, 1.0]
+    slow = LAMA.with_effect("dynamic_inflow", time=0.04)
+    np.testing.assert_allclose(
+        dynamics.derivative(state, command, slow),
+        dynamics.derivative(state, command, LAMA),
+        rtol=1e-12,
+    )
 
 
 # --- the battery in a flight -------------------------------------------------------------------------
@@ -327,7 +388,7 @@ def flight_with(
         x, work = dynamics.full_state(state, trim, LAMA), np.zeros(dynamics.WORK_SIZE)
         commands, readings = np.empty((t.size, 4)), np.empty((t.size, N_CHANNELS))
         level = gusts * np.array([0.05, 0.05, 0.08, 1e-3, 1e-3, 3e-4])
-        growth = math.sqrt(1.0 - math.exp(-2.0 * ROW / LAMA.vector[P.GUST_MEMORY]))
+        growth = math.sqrt(1.0 - math.exp(-2.0 * ROW / LAMA.vector[P.MEMORY_FORCE_XY]))
         for k in range(t.size):
             x[S.GUST_X : S.GUST_N + 1] += growth * level * rng.standard_normal(6)
             command = trim + added[k]
@@ -375,6 +436,7 @@ def test_a_hidden_actuator_effect_is_found_and_nothing_else(effect):
 
 IN_THE_INJECTOR = {
     "battery": {"battery_voltage": {}},
+    "inflow": {"dynamic_inflow": {}},
     "phase": {"swash_phase": {"angle": -0.2, "per_rpm": 3e-4}},
     "radio and servo": {"command_delay": {}, "servo_lag": {}},
 }

@@ -26,7 +26,8 @@ from coax_env.diagnosis import calibration
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.model.effects import CATALOGUE
 
 # --- the plan ---------------------------------------------------------------------------------------
@@ -467,7 +468,7 @@ def test_the_wrench_is_what_the_model_says(damped: tuple) -> None:
     vehicle = load_vehicle("lama400d").in_air(flight.air)
     model = HeliModel(vehicle)
     noise = starting_noise(flight, vehicle)
-    bare = {**model.bare_values, "gust_memory": 0.5}
+    bare = dict(model.bare_values)
     run = Engine(model, [record_of(flight.runs[0])]).filter(bare, noise)[0]
     change = baselines.wrench(model, run, {**bare, "yaw_damping.coefficient": 0.004})
     change -= baselines.wrench(model, run, bare)

@@ -32,6 +32,7 @@ from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model import workspace as F
+from coax_env.model.generic_terms import hover_speeds
 from coax_env.model.layout import (
     CHANNELS,
     LOWER_FLAP,
@@ -47,6 +48,7 @@ from coax_env.model.vehicle_file import load_vehicle
 READING_DELAY = 1e-4  # [s] after the command of the same row
 LONGEST_STEP = 0.02  # [s] a longer row is split
 NEWTON_STEPS = 12
+_INFLOW_TIME = effects.parameter_index("dynamic_inflow.time")
 BALANCED = 1e-11  # [m/s2, rad/s2] left over at a hover
 SHORTEST_LAG = 1e-9  # [s] below it exp(-READING_DELAY/lag) is zero: the command itself
 
@@ -107,6 +109,9 @@ def _properties(x, u, p, f):
         f[F.SPEED_SHARE_U] = f[F.SPEED_SHARE_L] = f[F.SPEED_SCALE] = 1.0
         f[F.SPEED_REST_U] = f[F.SPEED_REST_L] = 0.0
         f[F.SERVO_PLAY] = f[F.SERVO_DEADBAND] = f[F.SERVO_RATE] = 0.0
+        f[F.INFLOW_TIME] = p[_INFLOW_TIME]
+        if p[_INFLOW_TIME] > 0.0:
+            f[F.HOVER_U], f[F.HOVER_L] = hover_speeds(p)
         if p[effects.PROPERTY] != 0.0:
             _property_effects(x, f, p)
 
@@ -155,6 +160,32 @@ def _servo(start, command, time, f):
     return reached
 
 
+@compiled()
+def _lag_of_lag(time, lag, inflow_time):
+    """What is left, through a lag of `inflow_time`, of one that decays with another `lag`."""
+    if lag <= SHORTEST_LAG:
+        return 0.0
+    if abs(lag - inflow_time) < 1e-6 * inflow_time:
+        return time / inflow_time * math.exp(-time / inflow_time)
+    left = math.exp(-time / lag) - math.exp(-time / inflow_time)
+    return lag / (lag - inflow_time) * left
+
+
+@compiled()
+def _inflow(x, u, time, f):
+    """Exact inflow `time` after the row's command: it follows the rotors, which follow theirs."""
+    lag = f[F.INFLOW_TIME]
+    upper, lower = _speeds_asked_for(u, f)
+    settled = 0.5 * (upper / f[F.HOVER_U] + lower / f[F.HOVER_L]) - 1.0
+    rest_u = 0.5 * (x[S.OMEGA_U] - upper) / f[F.HOVER_U]
+    rest_l = 0.5 * (x[S.OMEGA_L] - lower) / f[F.HOVER_L]
+    return (
+        _follow(x[S.INFLOW], settled, time, lag)
+        + rest_u * _lag_of_lag(time, f[F.MOTOR_LAG_U], lag)
+        + rest_l * _lag_of_lag(time, f[F.MOTOR_LAG_L], lag)
+    )
+
+
 @bare_and_with_effects()
 def _actuate(x, u, time, f, out):
     """Rotor speeds and swash tilt at `time` after the row's command, into the state `out`.
@@ -162,6 +193,8 @@ def _actuate(x, u, time, f, out):
     Only effects part an actuator from its command.
     """
     if WITH_EFFECTS:
+        if f[F.INFLOW_TIME] > 0.0:
+            out[S.INFLOW] = _inflow(x, u, time, f)
         upper, lower = _speeds_asked_for(u, f)
         out[S.OMEGA_U] = _follow(x[S.OMEGA_U], upper, time, f[F.MOTOR_LAG_U])
         out[S.OMEGA_L] = _follow(x[S.OMEGA_L], lower, time, f[F.MOTOR_LAG_L])
@@ -255,7 +288,7 @@ def _rates_in_flight(x, p, f, dx):
     gust = f[F.MASS] / p[P.GUST_MASS]
     f[F.FORCE_X] = x_u + x_l + gust * x[S.GUST_X]
     f[F.FORCE_Y] = y_u + y_l + gust * x[S.GUST_Y]
-    f[F.FORCE_Z] = z_u + z_l + download + gust * x[S.GUST_Z]
+    f[F.FORCE_Z] = z_u + z_l + download + gust * (x[S.GUST_Z] + x[S.TRIM_Z])
 
     # (35)-(37): hubs at (0, 0, -d); gyroscopic moment -omega x (0, 0, H), (23)-(25)
     momentum = (
@@ -266,7 +299,7 @@ def _rates_in_flight(x, p, f, dx):
     f[F.MOMENT_Z] = f[F.TORQUE_U] - f[F.TORQUE_L]
     f[F.MOMENT_X] += x[S.GUST_L] * f[F.INERTIA_XX] / p[P.GUST_INERTIA_XX]
     f[F.MOMENT_Y] += x[S.GUST_M] * f[F.INERTIA_YY] / p[P.GUST_INERTIA_YY]
-    f[F.MOMENT_Z] += x[S.GUST_N] * f[F.INERTIA_ZZ] / p[P.GUST_INERTIA_ZZ]
+    f[F.MOMENT_Z] += (x[S.GUST_N] + x[S.TRIM_N]) * f[F.INERTIA_ZZ] / p[P.GUST_INERTIA_ZZ]
     if WITH_EFFECTS and p[effects.LOAD] != 0.0:
         _load_effects(x, f, p)
     if WITH_EFFECTS and p[effects.UNLISTED] != 0.0:
@@ -322,6 +355,34 @@ def _rates_where_on(x, p, f, dx):
 _rates: Any = Variants(_rates_bare, _rates_where_on)
 
 
+_GUST_MEMORY = (
+    P.MEMORY_FORCE_XY, P.MEMORY_FORCE_XY, P.MEMORY_FORCE_Z,
+    P.MEMORY_MOMENT_XY, P.MEMORY_MOMENT_XY, P.MEMORY_MOMENT_Z,
+)  # fmt: skip
+
+
+@compiled(forceinline=True)
+def _fade(time, p):
+    """What is left of the gusts after `time` seconds, by group of axes: force xy, z, moment xy, z."""
+    return (
+        math.exp(-time / p[P.MEMORY_FORCE_XY]),
+        math.exp(-time / p[P.MEMORY_FORCE_Z]),
+        math.exp(-time / p[P.MEMORY_MOMENT_XY]),
+        math.exp(-time / p[P.MEMORY_MOMENT_Z]),
+    )
+
+
+@compiled(forceinline=True)
+def _fade_gusts(fade, x):
+    """Let the gusts of a full state fade, in place."""
+    x[S.GUST_X] *= fade[0]
+    x[S.GUST_Y] *= fade[0]
+    x[S.GUST_Z] *= fade[1]
+    x[S.GUST_L] *= fade[2]
+    x[S.GUST_M] *= fade[2]
+    x[S.GUST_N] *= fade[3]
+
+
 @compiled(forceinline=True)
 def _copy(state, out):
     """A full state into another."""
@@ -341,14 +402,15 @@ def _step(x, u, dt, p, work, out):
     for _ in range(parts):
         if WITH_EFFECTS:
             _mean_rotor_accelerations(out, u, h, f)
-        half_gust = math.exp(-0.5 * h / p[P.GUST_MEMORY])
+        half_fade = _fade(0.5 * h, p)
+        for i in range(S.GUST_X, N_FULL):
+            stage[i] = out[i]
         for k in range(4):
             time = 0.0 if k == 0 else (h if k == 3 else 0.5 * h)
-            fade = 1.0 if k == 0 else (half_gust * half_gust if k == 3 else half_gust)
             for i in range(N_STATES):
                 stage[i] = out[i] if k == 0 else out[i] + time * slope[i]
-            for i in range(S.GUST_X, N_FULL):
-                stage[i] = fade * out[i]
+            if k == 1 or k == 3:
+                _fade_gusts(half_fade, stage)
             _actuate(out, u, time + READING_DELAY, f, stage)
             _rates(stage, p, f, slope)
             weight = 1.0 if k == 0 or k == 3 else 2.0
@@ -357,8 +419,8 @@ def _step(x, u, dt, p, work, out):
         for i in range(N_STATES):
             out[i] += h / 6.0 * total[i]
         _actuate(out, u, h, f, out)
-        for i in range(S.GUST_X, N_FULL):
-            out[i] *= half_gust * half_gust
+        for i in range(S.GUST_X, S.TRIM_Z):
+            out[i] = stage[i]
 
 
 step_bare, _step_with_effects = _step
@@ -371,10 +433,10 @@ def step(x, u, dt, p, work, out):
     """Fly one row of held input, with the effects that are on.
 
     Args:
-        x: full state (26,), see state.py. u: commands, time and battery (6,), see inputs.py.
+        x: full state (29,), see state.py. u: commands, time and battery (6,), see inputs.py.
         dt: length of the row [s]; rows longer than LONGEST_STEP are split.
         p: parameter vector, see parameters.py. work: scratch (WORK_SIZE,).
-        out: full state (26,) at the row's end; may be `x` itself.
+        out: full state (29,) at the row's end; may be `x` itself.
     """
     if _switched_on(p) + p[effects.PROPERTY] != 0.0:
         _step_with_effects(x, u, dt, p, work, out)
@@ -413,12 +475,13 @@ def drift_and_readings(x, u, dt, p, work, out):
 
     Args:
         x, u, dt, p, work: as in `step`.
-        out: drift (26,) and readings (18,), one after the other (44,).
+        out: drift (29,) and readings (18,), one after the other (44,).
     """
     f, now, slope = work[:_STATE], work[_STATE:_SLOPE], work[_SLOPE:_TOTAL]
     _properties(x, u, p, f)
     _copy(x, now)
     _actuate(x, u, dt, f, now)
+    inflow = now[S.INFLOW] - x[S.INFLOW]
     for i in range(N_STATES, S.GUST_X):
         out[i] = now[i] - x[i]
     if dt > 0.0:
@@ -428,9 +491,12 @@ def drift_and_readings(x, u, dt, p, work, out):
     _rates(now, p, f, slope)
     for i in range(N_STATES):
         out[i] = dt * slope[i]
-    fade = math.exp(-dt / p[P.GUST_MEMORY]) - 1.0
     for i in range(S.GUST_X, N_FULL):
-        out[i] = fade * x[i]
+        out[i] = x[i]
+    _fade_gusts(_fade(dt, p), out)
+    for i in range(S.GUST_X, N_FULL):
+        out[i] -= x[i]
+    out[S.INFLOW] = inflow
     _read(x, now, slope, p, f, out[N_FULL:])
 
 
@@ -485,13 +551,17 @@ def _full_derivative(x, u, p, work, dx):
             dx[actuator] = 0.0
     f[F.OMEGA_U_DOT] = dx[S.OMEGA_U]
     f[F.OMEGA_L_DOT] = dx[S.OMEGA_L]
-    for i in range(S.GUST_X, N_FULL):
-        dx[i] = -x[i] / p[P.GUST_MEMORY]
+    dx[S.TRIM_Z :] = 0.0
+    if f[F.INFLOW_TIME] > 0.0:
+        speed = 0.5 * (now[S.OMEGA_U] / f[F.HOVER_U] + now[S.OMEGA_L] / f[F.HOVER_L])
+        dx[S.INFLOW] = (speed - 1.0 - x[S.INFLOW]) / f[F.INFLOW_TIME]
+    for i, memory in enumerate(_GUST_MEMORY):
+        dx[S.GUST_X + i] = -x[S.GUST_X + i] / p[memory]
     _rates(now, p, f, dx)
 
 
 def full_state(state: np.ndarray, command: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """The full state (26,): the paper's sixteen, actuators settled on the command, no gust.
+    """The full state (29,): the paper's sixteen, actuators and inflow settled on the command, no gust.
 
     Args:
         state: the paper's states (16,). command: commands (4,). vehicle: whose state it is.
@@ -499,6 +569,8 @@ def full_state(state: np.ndarray, command: np.ndarray, vehicle: Vehicle) -> np.n
     x = np.zeros(N_FULL)
     x[:N_STATES] = state
     x[S.OMEGA_U : S.GUST_X] = command
+    if "dynamic_inflow" in vehicle.effects:
+        x[S.INFLOW] = np.mean(np.asarray(command)[:2] / hover_speeds(vehicle.vector)) - 1.0
     return x
 
 
@@ -511,11 +583,11 @@ def kernel_input(command: np.ndarray, time: float = 0.0) -> np.ndarray:
 
 
 def full_derivative(x: np.ndarray, u: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """Rates of the full state (26,); actuators as first-order states, the servos' play, deadband and
+    """Rates of the full state (29,); actuators as first-order states, the servos' play, deadband and
     rate limit left out.
 
     Args:
-        x: full state (26,). u: commands, time and battery (6,). vehicle: its numbers and effects.
+        x: full state (29,). u: commands, time and battery (6,). vehicle: its numbers and effects.
     """
     dx = np.zeros(N_FULL)
     _full_derivative(
@@ -558,7 +630,7 @@ def readings(state: Any, command: Any, vehicle: Vehicle) -> dict[str, float]:
     """Noise-free readings of every canonical channel, in its unit (layout.CHANNEL_UNITS).
 
     Args:
-        state: full state (26,), or the paper's (16,) with actuators settled on the command.
+        state: full state (29,), or the paper's (16,) with actuators settled on the command.
         command: commands (4,). vehicle: its numbers and effects.
     """
     state = np.asarray(state, float)

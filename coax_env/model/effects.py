@@ -87,6 +87,14 @@ __all__ = [
 ]
 
 DEGREE = math.pi / 180.0
+INFLOW_GAIN = 1.2
+"""Relative rise of thrust over that of its square law, per relative rise of rotor speed at held inflow.
+
+By blade elements C_T = sigma a / 2 (theta / 3 - lambda / 2), lambda = v / (Omega R) = sqrt(C_T / 2) in
+hover. With v held, d ln T / d ln Omega = 2 + e, e = (lambda / 2) / (theta / 3 - lambda / 2) = sigma a /
+(4 sqrt(2 C_T)): 1.2 at solidity 0.1, lift slope 5.3, C_T 0.006. Vehicle files have no solidity; thrust
+shows e times the time constant, so that 10 % here are 10 % there.
+"""
 NO_RATE_LIMIT = 10.0
 """Rate of the swash plate [rad/s] that counts as none; ours."""
 
@@ -450,6 +458,26 @@ def thrust_exponent(x, f, p, e):
     if f[F.OMEGA_U] > 0.0 and f[F.OMEGA_L] > 0.0:
         f[F.THRUST_U] *= (f[F.OMEGA_U] / hover_u) ** p[e]
         f[F.THRUST_L] *= (f[F.OMEGA_L] / hover_l) ** p[e]
+
+
+@effect(
+    ROTOR,
+    EffectParameter("time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3, probe=0.02),
+    channels="az",
+    source="Leishman 2006, sec. 3.3 and 10.7; Pitt and Peters, Vertica 5, 1981",
+)
+def dynamic_inflow(x, f, p, e):
+    """Thrust times 1 + INFLOW_GAIN (s - v): it overshoots until the inflow v has followed the rotors.
+
+    s: mean rotor speed over that of hover, v: induced velocity over that of hover (state `inflow`), which
+    follows s with the time constant; both less one. Small changes (|s - v| below 0.2), slow climbs.
+    """
+    if p[e] > 0.0:
+        speed = 0.5 * (f[F.OMEGA_U] / f[F.HOVER_U] + f[F.OMEGA_L] / f[F.HOVER_L])
+        ahead = speed - 1.0 - x[S.INFLOW]
+        rise = max(1.0 + INFLOW_GAIN * ahead, 0.0)
+        f[F.THRUST_U] *= rise
+        f[F.THRUST_L] *= rise
 
 
 # --- forces, moments, flap rates ------------------------------------------------------------------

@@ -21,6 +21,7 @@ from coax_env.model.layout import N_CHANNELS
     SERVO_RATE,  # most that the plate's tilt changes [rad/s]; 0: no limit
     OMEGA_U, OMEGA_L, OMEGA_U_DOT, OMEGA_L_DOT,
     DELTA_LON, DELTA_LAT,  # swash plate tilt as the rotor feels it
+    INFLOW_TIME, HOVER_U, HOVER_L,  # [s], [rad/s]; where an effect needs them
     # attitude and air
     SIN_PHI, COS_PHI, SIN_THETA, COS_THETA, SIN_PSI, COS_PSI,
     HEIGHT,
@@ -34,5 +35,5 @@ from coax_env.model.layout import N_CHANNELS
     ALPHA_L_DOT, BETA_L_DOT,
     P_DOT, Q_DOT, R_DOT,
     READING,  # first of the N_CHANNELS sensor readings
-) = range(60)  # fmt: skip
+) = range(63)  # fmt: skip
 N_FLOW = READING + N_CHANNELS

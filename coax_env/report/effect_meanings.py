@@ -192,6 +192,9 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
         _share("{} thrust of the lower rotor, in the wake of the upper",
                lambda e, v: -e["gain"] * _upper_thrust_share(v)),
     ],
+    "dynamic_inflow": [
+        _own("the inflow follows a change of rotor speed in {}", "ms", "time", 1000.0),
+    ],
     "thrust_exponent": [
         Consequence("thrust goes as rotor speed to the power {}", "",
                     lambda e, v: 2.0 + e["excess"]),

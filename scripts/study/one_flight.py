@@ -24,7 +24,8 @@ from coax_env.diagnosis.gain import gain_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise, still_air
 from coax_env.estimation.prediction import replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
@@ -200,20 +201,19 @@ def expected_evidence(
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     model = HeliModel(vehicle)
     true_noise = SENSORS[planned.sensors].noise
-    noise = starting_noise(replace(flight, noise=dict(true_noise)), vehicle)
-    levels = {**noise.process, **noise.floor}
+    noise = still_air(starting_noise(replace(flight, noise=dict(true_noise)), vehicle))
     if planned.gusts:
         # the model's are what shakes the vehicle as its file has it
-        levels |= gust_levels(air_of(planned), craft_of(planned))
+        levels = dict(gust_levels(air_of(planned), craft_of(planned)))
         heavier = 1.0 + values.get("added_mass.mass", 0.0) / vehicle["mass"].value
         levels["force_xy"] /= heavier
         levels["force_z"] /= heavier
         levels["moment_z"] /= 1.0 + values.get("yaw_inertia.scale", 0.0)
-    noise = replace(noise, process=levels)
+        noise = noise.with_levels(levels)
     problem = Problem.of(model, _records(flight, held, within=False), listed)
     for effect in listed:
         own = {name: 0.5 * values[name] for name in problem.acting_names(effect)}
-        at = {**model.bare_values, "gust_memory": levels["memory"], **values, **own}
+        at = {**model.bare_values, **values, **own}
         _, _, quadratic = linearise(problem, Fit(tuple(listed), at, noise))
         result[effect] = _worth(problem, quadratic, listed, effect, values)
     return result
@@ -221,13 +221,16 @@ def expected_evidence(
 
 @cache
 def gust_levels(air: Air, craft: Craft) -> dict[str, float]:
-    """Std [N, N m] of an air's gusts on a craft and their correlation time [s], by two minutes of it."""
+    """Std [N, N m] of an air's gusts on a craft and their correlation times [s], by two minutes of it."""
     step = 0.002
     history = disturbances(air, craft, 12_000, 5, step, np.random.default_rng(0))
     history[:, 0:3] += history[:, 10:13]
     levels = {group: float(history[:, axes].std()) for group, axes in GROUPS.items()}
-    lasting = [_correlation_time(history[:, i], step) for i in range(6)]
-    return levels | {"memory": float(np.exp(np.mean(np.log(lasting))))}
+    memories = {
+        f"memory_{group}": float(np.mean([_correlation_time(history[:, i], step) for i in axes]))
+        for group, axes in GROUPS.items()
+    }
+    return levels | memories
 
 
 def _correlation_time(x: np.ndarray, step: float) -> float:

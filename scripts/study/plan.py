@@ -61,6 +61,7 @@ SIZES: dict[str, dict[str, tuple[float, float, bool]]] = {
     "command_delay": {"time": (0.015, 0.06, False)},
     "motor_droop": dict.fromkeys(("upper", "lower"), (0.1, 0.3, False)),
     "battery_voltage": {"per_volt": (0.03, 0.09, False)},
+    "dynamic_inflow": {"time": (0.02, 0.08, False)},
     "motor_lag": dict.fromkeys(("upper", "lower"), (0.05, 0.2, False)),
     "battery_sag": {"rate": (0.001, 0.003, False)},
     "added_mass": {"mass": (0.02, 0.1, False)},
