@@ -469,8 +469,9 @@ def thrust_exponent(x, f, p, e):
 def dynamic_inflow(x, f, p, e):
     """Thrust times 1 + INFLOW_GAIN (s - v): it overshoots until the inflow v has followed the rotors.
 
-    s: mean rotor speed over that of hover, v: induced velocity over that of hover (state `inflow`), which
-    follows s with the time constant; both less one. Small changes (|s - v| below 0.2), slow climbs.
+    s: mean rotor speed over that of hover, v: induced velocity over that of hover (state `inflow`),
+    which follows s with the time constant; both less one. Small changes (|s - v| below 0.2), slow
+    climbs, and one inflow for both rotors.
     """
     if p[e] > 0.0:
         speed = 0.5 * (f[F.OMEGA_U] / f[F.HOVER_U] + f[F.OMEGA_L] / f[F.HOVER_L])
