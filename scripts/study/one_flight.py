@@ -15,7 +15,7 @@ from typing import Any
 import injector
 import numpy as np
 from injector_air import GUSTY, STILL, Air, disturbances
-from injector_craft import CRAFTS, Craft
+from injector_craft import CRAFTS, LAMA, Craft, spread
 from injector_sensors import SENSORS
 
 from coax_env.diagnosis.diagnose import Diagnosis, diagnose
@@ -91,16 +91,17 @@ def _result(planned: PlannedFlight, folder: Path, only_own: bool) -> dict[str, A
         "methods": methods,
         "gain": findings["gain"],
         "strongest": {"evidence": evidence if math.isfinite(evidence) else None, "effect": effect},
+        "class": findings.get("class"),
         "history": result.evidence_history,
         "remarks": list(result.remarks),
         "seconds": seconds,
         "flown_s": sum(run.duration for run in flight.runs),
     }
     catalogued = [e for e in truth["hidden"] if e in CATALOGUE]
-    whole_runs = bool(held) and set(held) <= set(flight.run_names)
+    whole_runs = bool(held) and set(held) <= set(flight.run_names) and not planned.arm
     if catalogued == truth["hidden"] and truth["hidden"] and whole_runs:
         row["true_structure"] = gain_of_the_truth(result, catalogued, truth["values"], held)
-    if not only_own:
+    if not only_own and not planned.arm:
         methods |= baselines.name_causes(flight)
     return json.loads(json.dumps(row, allow_nan=False))
 
@@ -121,6 +122,7 @@ def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
             injector.fly(
                 folder, sizes, gusts=air_of(planned), sensors=planned.sensors, seed=planned.seed,
                 runs=planned.runs, craft=craft, pilot=planned.pilot,
+                known_as=LAMA if planned.craft == "spread" else None,
                 card_noise=planned.card_noise, longest=planned.longest or math.inf,
             )  # fmt: skip
         except RuntimeError:
@@ -129,14 +131,29 @@ def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
         path = folder / "truth.json"
         truth = json.loads(path.read_text())
         path.unlink()
+        if planned.craft == "spread":
+            truth["comparable"] = _beside_the_file(truth["comparable"])
         return truth
     raise RuntimeError(f"the pilot cannot fly {planned.effects}")
 
 
+def _beside_the_file(values: Mapping[str, float]) -> dict[str, float]:
+    """Values of effects that no number of the vehicle's file is a part of."""
+    kept = {}
+    for name, value in values.items():
+        effect = CATALOGUE.get(name.partition(".")[0])
+        if effect is None or not effect.replaces:
+            kept[name] = value
+    return kept
+
+
 def craft_of(planned: PlannedFlight) -> Craft:
     """What flies."""
+    rng = np.random.default_rng(planned.seed)
     if planned.craft == "drawn":
-        return injector.drawn(np.random.default_rng(planned.seed))
+        return injector.drawn(rng)
+    if planned.craft == "spread":
+        return spread(LAMA, rng)
     return CRAFTS[planned.craft]
 
 
@@ -221,7 +238,7 @@ def expected_evidence(
 
 @cache
 def gust_levels(air: Air, craft: Craft) -> dict[str, float]:
-    """Std [N, N m] of an air's gusts on a craft and their correlation times [s], by two minutes of it."""
+    """Std [N, N m] of an air's gusts on a craft, and correlation times [s], by two minutes of it."""
     step = 0.002
     history = disturbances(air, craft, 12_000, 5, step, np.random.default_rng(0))
     history[:, 0:3] += history[:, 10:13]
