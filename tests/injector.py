@@ -48,6 +48,9 @@ from numba import njit
 RPM = 30.0 / math.pi
 STEP, SUBSTEPS = 0.01, 5
 SETTLE = 6.0  # s flown before the log starts
+BLADES = 1.2  # rise of thrust with rotor speed at held inflow, over the square law's
+GIVE = 0.005  # s in which a linkage's stop, or a servo near its command, gives way
+FULL = 12.3  # V of the battery as a log starts, in hover
 
 
 class Hidden(NamedTuple):
@@ -74,6 +77,15 @@ class Hidden(NamedTuple):
     swash_gain: float = 0.0
     servo_lag: float = 0.0
     servo_delay: float = 0.0
+    servo_play: float = 0.0
+    servo_deadband: float = 0.0
+    servo_rate: float = 0.0
+    command_delay: float = 0.0
+    phase_slope: float = 0.0
+    droop_upper: float = 0.0
+    droop_lower: float = 0.0
+    per_volt: float = 0.0
+    inflow_time: float = 0.0
     motor_upper: float = 0.0
     motor_lower: float = 0.0
     sag: float = 0.0
@@ -131,10 +143,17 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
     "wind": {"north": ("wind_north", 1.2), "east": ("wind_east", -1.0)},
     "swash_offset": {"lon": ("swash_lon", 0.015), "lat": ("swash_lat", -0.010)},
     "cg_offset": {"x": ("cg_x", 1.5e-3), "y": ("cg_y", -1.0e-3)},
-    "swash_phase": {"angle": ("swash_phase", 0.15)},
+    "swash_phase": {"angle": ("swash_phase", 0.15), "per_rpm": ("phase_slope", 0.0)},
     "swash_gain": {"scale": ("swash_gain", -0.15)},
     "servo_lag": {"time": ("servo_lag", 0.04)},
     "servo_delay": {"time": ("servo_delay", 0.03)},
+    "servo_play": {"width": ("servo_play", 0.02)},
+    "servo_deadband": {"width": ("servo_deadband", 0.012)},
+    "servo_rate": {"limit": ("servo_rate", 0.8)},
+    "command_delay": {"time": ("command_delay", 0.04)},
+    "motor_droop": {"upper": ("droop_upper", 0.25), "lower": ("droop_lower", 0.2)},
+    "battery_voltage": {"per_volt": ("per_volt", 0.06)},
+    "dynamic_inflow": {"time": ("inflow_time", 0.05)},
     "motor_lag": {"upper": ("motor_upper", 0.08), "lower": ("motor_lower", 0.08)},
     "battery_sag": {"rate": ("sag", 0.002)},
     "added_mass": {"mass": ("added_mass", 0.06)},
@@ -177,6 +196,10 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
 OTHER_FORM = frozenset({"ground_effect.gain", "airframe_drag.area_x", "airframe_drag.area_y",
                         "airframe_drag.area_z", "wake_interference.gain",
                         "rate_damping.coefficient", "vibration.amplitude", "battery_sag.rate",
+                        "battery_voltage.per_volt", "dynamic_inflow.time", "command_delay.time",
+                        "servo_rate.limit",
+                        "motor_droop.upper", "motor_droop.lower",
+                        "servo_play.width", "servo_deadband.width",
                         "outside.heading_moment", "outside_patch.lift", "outside_sector.moment",
                         "outside_resonance.moment", "outside_cable.moment",
                         "outside_stall.moment", "outside_wake.moment"})  # fmt: skip
@@ -263,8 +286,9 @@ def _suited(pilot: Pilot, craft: Craft) -> Pilot:
 # --- physics --------------------------------------------------------------------------------------
 # State: 0-2 position, 3-5 velocity (both inertial), 6-9 quaternion body to inertial, 10-12 p q r,
 # 13-16 alpha_l beta_l alpha_f beta_f, 17-18 rotor speeds, 19-20 swash, 21-22 swash rates, 23 a cable's
-# twist in units of its greatest, 24 side speed as the wake remembers it.
-N_STATE = 25
+# twist in units of its greatest, 24 side speed as the wake remembers it, 25-26 the plate behind a
+# linkage's play, 27 induced velocity over that in hover.
+N_STATE = 28
 CABLE = 0.3  # rad of turn after which a cable slips
 WAKE = 0.8  # s that a wake lasts
 # Out: 0-2 specific force, 3-5 angular acceleration (body axes).
@@ -316,6 +340,14 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     thrust_u *= (wu / rotors.hover_upper) ** hidden.thrust_excess
     thrust_l *= (wl / rotors.hover_lower) ** hidden.thrust_excess
     thrust_l -= hidden.wake * 0.5 * math.sqrt(thrust_u * thrust_l)
+    if (
+        hidden.inflow_time > 0.0
+    ):  # blades at an inflow of its own momentum, which air's mass holds up
+        faster = 0.5 * (wu / rotors.hover_upper + wl / rotors.hover_lower)
+        stronger = 1.0 + BLADES * (1.0 - s[27] / faster)
+        thrust_u *= stronger
+        thrust_l *= stronger
+        ds[27] = (faster**2 * stronger - s[27] ** 2) / ((2.0 + BLADES) * hidden.inflow_time)
     height = max(-s[2], 0.4 * craft.radius)
     rise = 1.0 / (1.0 - hidden.ge_gain * (craft.radius / (4.0 * height)) ** 2)  # Cheeseman-Bennett
     rise *= 1.0 + hidden.axial * air[2] / math.sqrt(1.0 + (air[2] / 4.2) ** 2)
@@ -386,9 +418,11 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     ds[10:13] = out[3:6]
 
     # flaps
-    cos, sin = math.cos(hidden.swash_phase), math.sin(hidden.swash_phase)
-    lon = cos * s[19] - sin * s[20] + hidden.swash_lon
-    lat = sin * s[19] + cos * s[20] + hidden.swash_lat
+    phase = hidden.swash_phase + hidden.phase_slope * RPM * (wl - rotors.hover_lower)
+    cos, sin = math.cos(phase), math.sin(phase)
+    plate = s[25:27] if hidden.servo_play > 0.0 else s[19:21]
+    lon = cos * plate[0] - sin * plate[1] + hidden.swash_lon
+    lat = sin * plate[0] + cos * plate[1] + hidden.swash_lat
     gain = craft.swash_gain * (1.0 + hidden.swash_gain)
     back = hidden.blowback / math.sqrt(1.0 + (air[0] ** 2 + air[1] ** 2) / 64.0)
     ds[13] = (gain * lon - alpha_l + back * air[0]) / craft.flap_time - q
@@ -414,16 +448,28 @@ def _unlisted(s, air, heading, speed, hidden, force, moment):
 
 @njit(cache=True)
 def _actuate(s, command, hidden, ds):
-    """Motors pull towards the commanded speed by torque; servos are critically damped."""
+    """Motors pull towards the commanded speed by torque; servos are critically damped.
+
+    A plate with play is pushed by stops that give way; a servo runs at full speed or in proportion.
+    """
     if hidden.motor_upper > 0.0:
         ds[17] = (command[0] ** 2 - s[17] ** 2) / (2.0 * s[17] * hidden.motor_upper)
     if hidden.motor_lower > 0.0:
         ds[18] = (command[1] ** 2 - s[18] ** 2) / (2.0 * s[18] * hidden.motor_lower)
-    if hidden.servo_lag > 0.0:
-        n = 2.0 / hidden.servo_lag
-        for i in range(2):
+    for i in range(2):
+        wanted = command[2 + i]
+        if abs(wanted - s[19 + i]) < hidden.servo_deadband:
+            wanted = s[19 + i]
+        if hidden.servo_lag > 0.0:
+            n = 2.0 / hidden.servo_lag
             ds[19 + i] = s[21 + i]
-            ds[21 + i] = n * n * (command[2 + i] - s[19 + i]) - 2.0 * n * s[21 + i]
+            ds[21 + i] = n * n * (wanted - s[19 + i]) - 2.0 * n * s[21 + i]
+        elif hidden.servo_rate > 0.0:
+            ds[19 + i] = (wanted - s[19 + i]) / GIVE
+        if hidden.servo_rate > 0.0:
+            ds[19 + i] = min(max(ds[19 + i], -hidden.servo_rate), hidden.servo_rate)
+        error = s[19 + i] - s[25 + i]
+        ds[25 + i] = math.copysign(max(abs(error) - 0.5 * hidden.servo_play, 0.0), error) / GIVE
 
 
 @njit(cache=True)
@@ -439,8 +485,10 @@ def _follow_at_once(s, command, hidden, craft):
         lower = craft.rotor_lower
         s[12] -= hidden.spin_up * lower * jump / (craft.inertia_z * (1.0 + hidden.yaw_inertia))
         s[18] = command[1]
-    if hidden.servo_lag == 0.0:
-        s[19:21] = command[2:4]
+    if hidden.servo_lag == 0.0 and hidden.servo_rate == 0.0:
+        for i in range(2):
+            if abs(command[2 + i] - s[19 + i]) >= hidden.servo_deadband:
+                s[19 + i] = command[2 + i]
 
 
 @njit(cache=True)
@@ -516,6 +564,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden,
     s[0], s[1], s[2] = targets[0, 0], targets[0, 1], -targets[0, 2]
     s[6], s[9] = math.cos(targets[0, 3] / 2.0), math.sin(targets[0, 3] / 2.0)
     s[17], s[18] = rotors.hover_upper, rotors.hover_lower
+    s[27] = 1.0
     out = np.zeros(6)
     out2 = np.zeros(6)
     memory = np.zeros(4)
@@ -560,7 +609,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden,
         commands[k] = command
         rates = s[10:13].copy()  # a gyro does not see the jump of this very instant
         push = pushes[k * SUBSTEPS]
-        actual = _acting(commands, clock, dt, k, 0, hidden)
+        actual = _acting(commands, clock, dt, k, 0, hidden, rotors)
         _follow_at_once(s, actual, hidden, craft)
         ds = _derivative(s, actual, push, hidden, craft, rotors, out)
         readings[k, 0:2] = s[17:19] + push[8:10]
@@ -575,7 +624,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden,
         for j in range(SUBSTEPS):
             push, later = pushes[k * SUBSTEPS + j], pushes[k * SUBSTEPS + j + 1]
             if j > 0 and _is_late(hidden):
-                actual = _acting(commands, clock, dt, k, j, hidden)
+                actual = _acting(commands, clock, dt, k, j, hidden, rotors)
                 _follow_at_once(s, actual, hidden, craft)
             ds = _derivative(s, actual, push, hidden, craft, rotors, out2)
             middle = s + h * ds
@@ -591,18 +640,43 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden,
 @njit(cache=True)
 def _is_late(hidden):
     """Whether a command may begin to act between two rows."""
-    return hidden.servo_delay > 0.0
+    return hidden.servo_delay > 0.0 or hidden.command_delay > 0.0
 
 
 @njit(cache=True)
-def _acting(commands, clock, dt, k, j, hidden):
+def _acting(commands, clock, dt, k, j, hidden, rotors):
     """The command that acts in substep j of row k: delays and supply, before motors and servos."""
-    actual = commands[k].copy()
-    actual[2:4] = commands[_late_row(clock, dt, k, j, hidden.servo_delay), 2:4]
+    common = 0.0
+    if hidden.command_delay > 0.0:  # packets come sooner or later by 3 ms
+        common = hidden.command_delay + 0.003 * math.sin(2.4 * k)
+    actual = commands[_late_row(clock, dt, k, j, common)].copy()
+    actual[2:4] = commands[_late_row(clock, dt, k, j, common + hidden.servo_delay), 2:4]
+    actual[0] = _drooped(actual[0], hidden.droop_upper, rotors.hover_upper)
+    actual[1] = _drooped(actual[1], hidden.droop_lower, rotors.hover_lower)
+    if hidden.per_volt > 0.0:
+        weaker = volts(commands[k, 0] * commands[k, 1], clock[k], rotors) / FULL
+        actual[:2] *= weaker ** (FULL * hidden.per_volt)
     sag = math.exp(-hidden.sag * max(clock[k], 0.0))
     actual[0] *= sag
     actual[1] *= sag
     return actual
+
+
+@njit(cache=True)
+def _drooped(command, droop, hover):
+    """Speed at which a proportional speed control balances a torque that grows as its square."""
+    if droop == 0.0:
+        return command
+    stiff = 2.0 / hover * (1.0 - droop) / droop  # torque of hover, per rad/s of error
+    load = 4.0 * (1.0 + stiff * command) / hover**2
+    return 0.5 * hover**2 * (math.sqrt(stiff**2 + load) - stiff)
+
+
+@njit(cache=True)
+def volts(product, time, rotors):
+    """Battery voltage [V] at a product of commanded rotor speeds, by charge drawn and by load."""
+    load = product / (rotors.hover_upper * rotors.hover_lower) - 1.0
+    return FULL - 0.015 * max(time, 0.0) - 0.8 * load
 
 
 @njit(cache=True)
@@ -821,6 +895,12 @@ def _fly_run(
     columns["h"] = -readings[past, 13] * (1.0 + hidden.sonar_tilt * (1.0 / logged[:, 17] - 1.0))
     columns["vn"], columns["ve"], columns["vd"] = logged[:, 14:17].T
     columns["pn"], columns["pe"] = logged[:, 11:13].T
+    if hidden.per_volt > 0.0:
+        product = commands[first:, 0] * commands[first:, 1]
+        rotors = rotors_of(craft)
+        columns["battery_v"] = np.array(
+            [volts(p, t, rotors) for p, t in zip(product, times[first:-1], strict=True)]
+        )
     return columns
 
 
@@ -850,7 +930,7 @@ def _wander(white: np.ndarray, std: float, memory: float, step: float) -> np.nda
     return out
 
 
-COMMANDED = ("t", "rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat")
+COMMANDED = ("t", "rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat", "battery_v")
 
 
 def _read(

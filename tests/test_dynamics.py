@@ -514,21 +514,25 @@ def _drag(s, e):
 
 
 def _swash_phase(s, e):
-    s.swash = Rotation.from_euler("z", e["angle"]).as_matrix()[:2, :2] @ s.swash
+    angle = e["angle"] + e["per_rpm"] * 30.0 / math.pi * (s.u[1] - _hover(s.v)[1])
+    s.swash = Rotation.from_euler("z", angle).as_matrix()[:2, :2] @ s.swash
 
 
 def _wake(s, e):
     s.thrust = s.thrust * [1, 1 - e["gain"] * s.thrust[0] / s.thrust.sum()]
 
 
-def _exponent(s, e):
-    """T = k w_h^2 (w/w_h)^(2+e) with w_h the speeds at which the bare rotors balance."""
-    v = s.v
+def _hover(v):
+    """Speeds at which the bare rotors balance."""
     k = v["air_density"] * math.pi * v["rotor_radius"] ** 4
     ratio2 = v["torque_coefficient_upper"] / v["torque_coefficient_lower"]
     lift = v["thrust_coefficient_upper"] + v["thrust_coefficient_lower"] * ratio2
-    hover = np.sqrt(v["mass"] * v["gravity"] / (k * lift) * np.array([1, ratio2]))
-    s.thrust = s.thrust * (s.u[:2] / hover) ** e["excess"]
+    return np.sqrt(v["mass"] * v["gravity"] / (k * lift) * np.array([1, ratio2]))
+
+
+def _exponent(s, e):
+    """T = k w_h^2 (w/w_h)^(2+e) with w_h the hover speeds."""
+    s.thrust = s.thrust * (s.u[:2] / _hover(s.v)) ** e["excess"]
 
 
 def _hub(s, e):
@@ -561,7 +565,7 @@ ON_RATES = {
         dict(scale=0.3),
         lambda s, e: setattr(s, "flybar_time", s.flybar_time * 1.3),
     ),
-    "swash_phase": (dict(angle=0.15), _swash_phase),
+    "swash_phase": (dict(angle=0.15, per_rpm=3e-4), _swash_phase),
     "swash_offset": (
         dict(lon=0.02, lat=-0.01),
         lambda s, e: setattr(s, "swash", s.swash + [e["lon"], e["lat"]]),
@@ -813,6 +817,9 @@ def test_sonar_effects(seed):
 
 TESTED_APART = {
     "wind", "motor_lag", "servo_lag", "servo_delay", "battery_sag", "spin_up_reaction",
+    # in test_actuator_effects.py
+    "command_delay", "motor_droop", "battery_voltage", "dynamic_inflow", "servo_play",
+    "servo_deadband", "servo_rate",
     "imu_lever_arm", "imu_tilt", "accel_scale", "accel_bias", "gyro_bias", "attitude_bias",
     "sonar_tilt", "sonar_scale", "sonar_delay", "vibration",
 }  # fmt: skip
@@ -955,7 +962,7 @@ def test_paper_states_are_the_first_sixteen():
 def test_places_have_the_names_of_the_layout():
     for places, names in (
         (S, [name for name, _ in FULL_STATES]),
-        (U, [name for name, _ in COMMANDS] + ["time"]),
+        (U, [name for name, _ in COMMANDS] + ["time", "battery"]),
         (Z, CHANNELS),
     ):
         assert [getattr(places, name.upper()) for name in names] == list(range(len(names)))

@@ -122,7 +122,7 @@ def diagnose(
     flight = flown_parts(flight, vehicle)
     line, calm, calm_vehicle = _without_vibration(flight, vehicle, exclude)
     new_line = line if "vibration" not in vehicle.effects else None
-    model = HeliModel(vehicle)
+    model = HeliModel(vehicle, stated(flight))
     noise = starting_noise(calm, calm_vehicle)
     candidates = namable(exclude, vehicle, flight)
     report = progress or (lambda text: None)
@@ -205,6 +205,8 @@ def diagnose(
 def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:
     """Effects that may be named: not excluded, not in the vehicle yet, and with their sensor aboard.
 
+    Of sag by time and by voltage the one, of what goes by another's name the other.
+
     Args:
         exclude: effects of the catalogue.
         vehicle: as given.
@@ -218,9 +220,36 @@ def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple
             known = ", ".join(effects.CATALOGUE)
             raise InputError(f"no effect {name!r} to exclude; the catalogue has {known}")
     absent = set(exclude) | set(vehicle.effects)
+    absent.add("battery_sag" if _voltage_varies(flight) else "battery_voltage")
     if "pn" in flight.channels:  # height then comes with the position, not from a sonar
         absent |= {"sonar_tilt", "sonar_scale", "sonar_delay"}
-    return tuple(e for e, entry in effects.CATALOGUE.items() if e not in absent and not entry.line)
+    return tuple(
+        e
+        for e, entry in effects.CATALOGUE.items()
+        if e not in absent and not entry.line and not entry.named_as
+    )
+
+
+VARYING = 0.1
+"""Volts from the lowest to the highest battery voltage, more than a reading's noise; ours."""
+
+
+def _voltage_varies(flight: Flight) -> bool:
+    """Whether the flight's battery is logged and its voltage shows more than noise."""
+    logged = [run.battery for run in flight.runs if run.battery is not None]
+    return bool(logged) and float(np.ptp(np.concatenate(logged))) > VARYING
+
+
+def stated(flight: Flight) -> dict[str, float]:
+    """Values that effects take from a flight as stated: the nominal voltage is the mean, to 0.1 V.
+
+    Whatever the nominal, the thrust coefficients take it up: only its distance from the flight's own
+    voltages matters, for how well the two can be told apart.
+    """
+    logged = [run.battery for run in flight.runs if run.battery is not None]
+    if not logged:
+        return {}
+    return {"battery_voltage.nominal": round(float(np.mean(np.concatenate(logged))), 1)}
 
 
 def _without_vibration(

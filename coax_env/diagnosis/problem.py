@@ -18,8 +18,11 @@ from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.model import effects
 from coax_env.model import parameters as P
 
-EXCLUSIVE = (frozenset({"servo_lag", "servo_delay"}),)
-"""Effects of which one at most is named: a real servo is a mixture of both."""
+EXCLUSIVE = (
+    frozenset({"servo_lag", "servo_delay"}),  # a real servo is a mixture of both
+    frozenset({"battery_sag", "battery_voltage"}),  # the same rotors slow down
+)
+"""Effects of which one at most is named."""
 
 T = TypeVar("T")
 

@@ -16,9 +16,9 @@ in place. It runs at its *stage* of the kernel (dynamics.py):
 - ``UNLISTED``: the generic terms of what no effect here explains (generic_terms.py);
 - ``SENSOR``: readings.
 
-An effect with a memory of its own uses one: first-order lags of rotors and servos are states of the
-kernel (MOTOR_LAG_*, SERVO_LAG, discretised exactly, so that zero is a limit and not a branch); a
-pure delay of the command is a shift of the input (helicopter.py), of a reading its rate of change.
+An effect with a memory of its own uses one: rotor speeds and the plate's tilt are states of the
+kernel (MOTOR_LAG_*, SERVO_*, discretised exactly, so that zero is a limit and not a branch); a
+pure delay of the commands is a shift of the input (helicopter.py), of a reading its rate of change.
 
 A stage whose effects are all off is skipped by one test, so that the bare model pays nothing.
 Signs and usual sizes are stated with each effect; "usual" is also the width of the prior.
@@ -50,6 +50,7 @@ from coax_env.model.effect_registry import (
     completed,
     effect,
     forget,
+    found_by_the_name_of,
     n_parameters,
     off_vector,
     pack,
@@ -57,6 +58,7 @@ from coax_env.model.effect_registry import (
     set_switches,
     stage_function,
 )
+from coax_env.model.layout import RPM_PER_RAD_S
 
 __all__ = [
     "AIR",
@@ -75,6 +77,7 @@ __all__ = [
     "completed",
     "effect",
     "forget",
+    "found_by_the_name_of",
     "n_parameters",
     "off_vector",
     "pack",
@@ -84,6 +87,16 @@ __all__ = [
 ]
 
 DEGREE = math.pi / 180.0
+INFLOW_GAIN = 1.2
+"""Relative rise of thrust over that of its square law, per relative rise of rotor speed at held inflow.
+
+By blade elements C_T = sigma a / 2 (theta / 3 - lambda / 2), lambda = v / (Omega R) = sqrt(C_T / 2) in
+hover. With v held, d ln T / d ln Omega = 2 + e, e = (lambda / 2) / (theta / 3 - lambda / 2) = sigma a /
+(4 sqrt(2 C_T)): 1.2 at solidity 0.1, lift slope 5.3, C_T 0.006. Vehicle files have no solidity; thrust
+shows e times the time constant, so that 10 % here are 10 % there.
+"""
+NO_RATE_LIMIT = 10.0
+"""Rate of the swash plate [rad/s] that counts as none; ours."""
 
 
 # --- properties -----------------------------------------------------------------------------------
@@ -216,6 +229,108 @@ def battery_sag(x, f, p, e):
     f[F.SPEED_SCALE] *= 1.0 - p[e] * f[F.TIME]
 
 
+@effect(
+    PROPERTY,
+    EffectParameter("per_volt", "1/V", usual=0.05, smallest=0.01, lower=0.0, upper=0.5),
+    EffectParameter("nominal", "V", usual=3.0, smallest=0.0, off=11.1, lower=1.0, held=True),
+    channels="rpm_upper rpm_lower az r",
+    source="open-loop drive: speed follows the battery's voltage, to first order about the nominal one",
+)
+def battery_voltage(x, f, p, e):
+    """Rotor speed per command times 1 + k (V - nominal), with the battery's logged voltage V.
+
+    Off the usual 3 cells of 3.7 V. The nominal voltage is one column with the thrust coefficients: it
+    is stated, not fitted (on a flight the mean voltage). No more than speed proportional to voltage is
+    to be expected: k = 1/nominal.
+    """
+    f[F.SPEED_SCALE] *= 1.0 + p[e] * f[F.BATTERY]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter(
+        "time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3, timing=True, probe=0.02
+    ),
+    channels="p q az r",
+    source="transport delay of radio, motion capture and firmware, as servo_delay",
+    input_shift=True,
+)
+def command_delay(x, f, p, e):
+    """All four commands arrive after a pure delay; the swash plate's after servo_delay's too."""
+
+
+@effect(
+    PROPERTY,
+    EffectParameter("upper", "1", usual=0.2, smallest=0.04, lower=0.0, upper=0.9),
+    EffectParameter("lower", "1", usual=0.2, smallest=0.04, lower=0.0, upper=0.9),
+    channels="rpm_upper rpm_lower az r",
+    source="proportional speed control of a loaded motor; Mohan, Undeland and Robbins 2003, ch. 13",
+)
+def motor_droop(x, f, p, e):
+    """Rotors follow a share of a speed command: hover + (1 - d) (command - hover), per rotor.
+
+    Hover is the bare model's: what a rotor with droop needs to hover is in the bench line or trim.
+    """
+    hover_u, hover_l = generic_terms.hover_speeds(p)
+    f[F.SPEED_SHARE_U] = 1.0 - p[e]
+    f[F.SPEED_REST_U] = p[e] * hover_u
+    f[F.SPEED_SHARE_L] = 1.0 - p[e + 1]
+    f[F.SPEED_REST_L] = p[e + 1] * hover_l
+
+
+@effect(
+    PROPERTY,
+    EffectParameter("width", "rad", usual=0.015, smallest=0.004, lower=0.0, upper=0.1, probe=0.01),
+    channels="p q",
+    source="backlash (play operator); Nordin and Gutman, Automatica 38, 2002",
+)
+def servo_play(x, f, p, e):
+    """Play between servo and swash plate: the plate trails its command within +- width / 2."""
+    f[F.SERVO_PLAY] = p[e]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter("width", "rad", usual=0.01, smallest=0.003, lower=0.0, upper=0.1),
+    channels="p q",
+    source="servo electronics: errors under the deadband are not driven",
+    named_as="servo_play",
+)
+def servo_deadband(x, f, p, e):
+    """A servo does not move while its command is within the width of where it stands.
+
+    Without a lag or a limited rate it then goes all the way; else it stops where the deadband begins.
+    When it goes depends on the last digit of the command: its likelihood over the width is as rough as
+    noise (0.012 rad hidden: 1 mrad up or down is worth +-50 nats), where play of the same width, which
+    trails as far on average, is smooth and worth 40. So the one name stands for both.
+    """
+    f[F.SERVO_DEADBAND] = p[e]
+
+
+@effect(
+    PROPERTY,
+    EffectParameter(
+        "limit",
+        "rad/s",
+        usual=4.0,
+        smallest=3.0,
+        off=NO_RATE_LIMIT,
+        lower=0.2,
+        upper=NO_RATE_LIMIT,
+        probe=-9.0,
+    ),
+    channels="p q",
+    source="no-load speed of a servo, about 0.1 s for 60 degrees, times its linkage",
+)
+def servo_rate(x, f, p, e):
+    """The swash plate's tilt changes no faster than the limit; NO_RATE_LIMIT and above: at once.
+
+    There is no slope at the off-value: a tenth of a radian takes 10 ms at it, a row of a log, and what
+    is faster no flight shows. Its signature is that of 1 rad/s, two and a quarter usual sizes off.
+    """
+    f[F.SERVO_RATE] = p[e] if p[e] < NO_RATE_LIMIT else 0.0
+
+
 # --- air ------------------------------------------------------------------------------------------
 
 
@@ -251,12 +366,21 @@ def wind(x, f, p, e):
 @effect(
     SWASH,
     EffectParameter("angle", "rad", usual=0.2, smallest=0.03),
+    EffectParameter("per_rpm", "rad per rev/min", usual=2e-4, smallest=5e-5),
     channels="p q",
-    source="control phase angle, Bramwell 2001, ch. 5",
+    source="control phase angle, Bramwell 2001, ch. 5; a lag of T seconds adds T per rad/s of rotor",
 )
 def swash_phase(x, f, p, e):
-    """Swash plate turned about the mast: lon and lat commands mix by an angle."""
-    cosine, sine = math.cos(p[e]), math.sin(p[e])
+    """Swash plate turned about the mast: lon and lat commands mix by an angle.
+
+    angle + per_rpm (lower rotor's speed less the bare model's hover). A teetering rotor on a delay of T
+    seconds between plate and blade turns by T Omega: 2 ms are 2e-4 rad per rev/min.
+    """
+    angle = p[e]
+    if p[e + 1] != 0.0:
+        _, hover = generic_terms.hover_speeds(p)
+        angle += p[e + 1] * RPM_PER_RAD_S * (x[S.OMEGA_L] - hover)
+    cosine, sine = math.cos(angle), math.sin(angle)
     lon, lat = f[F.DELTA_LON], f[F.DELTA_LAT]
     f[F.DELTA_LON] = cosine * lon - sine * lat
     f[F.DELTA_LAT] = sine * lon + cosine * lat
@@ -334,6 +458,27 @@ def thrust_exponent(x, f, p, e):
     if f[F.OMEGA_U] > 0.0 and f[F.OMEGA_L] > 0.0:
         f[F.THRUST_U] *= (f[F.OMEGA_U] / hover_u) ** p[e]
         f[F.THRUST_L] *= (f[F.OMEGA_L] / hover_l) ** p[e]
+
+
+@effect(
+    ROTOR,
+    EffectParameter("time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3, probe=0.02),
+    channels="az",
+    source="Leishman 2006, sec. 3.3 and 10.7; Pitt and Peters, Vertica 5, 1981",
+)
+def dynamic_inflow(x, f, p, e):
+    """Thrust times 1 + INFLOW_GAIN (s - v): it overshoots until the inflow v has followed the rotors.
+
+    s: mean rotor speed over that of hover, v: induced velocity over that of hover (state `inflow`),
+    which follows s with the time constant; both less one. Small changes (|s - v| below 0.2), slow
+    climbs, and one inflow for both rotors.
+    """
+    if p[e] > 0.0:
+        speed = 0.5 * (f[F.OMEGA_U] / f[F.HOVER_U] + f[F.OMEGA_L] / f[F.HOVER_L])
+        ahead = speed - 1.0 - x[S.INFLOW]
+        rise = max(1.0 + INFLOW_GAIN * ahead, 0.0)
+        f[F.THRUST_U] *= rise
+        f[F.THRUST_L] *= rise
 
 
 # --- forces, moments, flap rates ------------------------------------------------------------------

@@ -141,6 +141,28 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
         _own("the rotors turn {} slower after a minute", "%", "rate", 6000.0),
         _share("{} thrust by then", lambda e, v: (1.0 - 60.0 * e["rate"]) ** 2 - 1.0),
     ],
+    "battery_voltage": [
+        _own("the rotors turn {} slower per volt below the nominal", "%", "per_volt", 100.0),
+        _share("{} thrust one volt below it", lambda e, v: (1.0 - e["per_volt"]) ** 2 - 1.0),
+    ],
+    "command_delay": [
+        _own("rotors and swash plate answer {} after their command", "ms", "time", 1000.0),
+    ],
+    "motor_droop": [
+        _own("the upper rotor leaves out {} of a change of its speed command", "%", "upper", 100.0),
+        _own("the lower {}", "%", "lower", 100.0),
+    ],
+    "servo_play": [
+        _own("the swash plate has {} of play about its command", "°", "width", math.degrees(1.0)),
+    ],
+    "servo_deadband": [
+        _own("the swash plate does not answer a change below {}", "°", "width", math.degrees(1.0)),
+    ],
+    "servo_rate": [
+        _own("the swash plate tilts no faster than {}", "°/s", "limit", math.degrees(1.0)),
+        Consequence("it takes {} for a step of 5°", "ms",
+                    lambda e, v: 1000.0 * math.radians(5.0) / e["limit"]),
+    ],
     "wind": [
         Consequence("the air moves at {}", "m/s", lambda e, v: math.hypot(e["north"], e["east"])),
         Consequence("towards {} clockwise from north", "°", _wind_course, direction=True),
@@ -150,6 +172,8 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
              "the swash plate is turned back by {} about the mast"),
         Consequence("{} of a tilt back goes to the right", "%",
                     lambda e, v: 100.0 * math.sin(e["angle"]), "{} of a tilt back goes to the left"),
+        _own("by {} more at 100 rpm more of the lower rotor", "°", "per_rpm", 100.0 * math.degrees(1.0),
+             "by {} less at 100 rpm more of the lower rotor"),
     ],
     "swash_offset": [
         _own("the swash plate stands {} back at zero command", "°", "lon", math.degrees(1.0),
@@ -167,6 +191,9 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
     "wake_interference": [
         _share("{} thrust of the lower rotor, in the wake of the upper",
                lambda e, v: -e["gain"] * _upper_thrust_share(v)),
+    ],
+    "dynamic_inflow": [
+        _own("the inflow follows a change of rotor speed in {}", "ms", "time", 1000.0),
     ],
     "thrust_exponent": [
         Consequence("thrust goes as rotor speed to the power {}", "",
