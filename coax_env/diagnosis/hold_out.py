@@ -77,7 +77,7 @@ def _fair_share(
     that would lose most of its excitation counts heavily; one that the held-out runs do not show at
     all counts too, since its gain could not be measured on them.
     """
-    free = [model.effect_parameters(e)[0] for e in candidates] + excitations()
+    free = [model.effect_parameters(e)[0] for e in candidates] + excitations(model)
     values = {**model.bare_values, **{f.name: f.value for f in free}}
     _, lin = Engine(model, records).linearise(values, noise, free)
     information = np.einsum("rkk->rk", lin.information)

@@ -13,7 +13,7 @@ from numba import float64, types
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.kernel.compilation import compiled, pointer
 from coax_env.logs.flight import Flight, Run
-from coax_env.model import dynamics, effects
+from coax_env.model import dynamics, effects, usual_sizes
 from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
@@ -146,6 +146,7 @@ class HeliModel:
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self.bare_values = vehicle.values()
+        self.size_ratios = usual_sizes.ratios(vehicle)
 
     def vector(self, values: Mapping[str, float]) -> np.ndarray:
         """Parameter vector of the vehicle with some values changed, effects included."""
@@ -232,8 +233,11 @@ class HeliModel:
             if p.std > 0.0 and name not in HELD
         ]
 
-    @staticmethod
-    def effect_parameters(effect: str) -> list[FreeParameter]:
+    def sized(self, effect: str) -> tuple[effects.EffectParameter, ...]:
+        """An effect's parameters with their sizes on this vehicle, generic groups' too."""
+        return usual_sizes.scaled(effects.GROUPS[effect].parameters, self.size_ratios)
+
+    def effect_parameters(self, effect: str) -> list[FreeParameter]:
         """An effect's parameters; the prior is centred on its off-value.
 
         Nothing is taken to be more than MOST_USUAL_SIZES usual sizes: beyond that it is another effect.
@@ -249,7 +253,7 @@ class HeliModel:
                 p.probe,
                 entry.stage == effects.SENSOR,
             )
-            for full, p in zip(entry.names(), entry.parameters, strict=True)
+            for full, p in zip(entry.names(), self.sized(effect), strict=True)
         ]
 
 

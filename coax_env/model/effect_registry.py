@@ -33,6 +33,9 @@ class EffectParameter:
     which it does not matter in prediction and is never named; a ``shape`` parameter (a decay, say)
     acts only once the effect itself does; ``timing``: a lag or delay of the command; ``probe``: finite
     step for the signature where the effect has no slope at its off-value.
+
+    Sizes, bounds and probe are lama400d's. ``scale`` says with what of the vehicle they grow on
+    another machine, ``"weight * arm / rotor_speed"`` say (usual_sizes.py); empty: they do not.
     """
 
     name: str
@@ -45,6 +48,7 @@ class EffectParameter:
     shape: bool = False
     timing: bool = False
     probe: float = 0.0
+    scale: str = ""
 
 
 @dataclass(frozen=True)

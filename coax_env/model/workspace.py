@@ -15,6 +15,7 @@ from coax_env.model.layout import N_CHANNELS
     # actuators
     MOTOR_LAG_U, MOTOR_LAG_L, SERVO_LAG,  # [s]
     SPEED_SCALE,  # rotor speed reached per speed commanded [1]
+    LON_STEP, LAT_STEP,  # by how much this row moves the swash plate's command on [rad]
     OMEGA_U, OMEGA_L, OMEGA_U_DOT, OMEGA_L_DOT,
     DELTA_LON, DELTA_LAT,  # swash plate tilt as the rotor feels it
     # attitude and air
@@ -24,11 +25,12 @@ from coax_env.model.layout import N_CHANNELS
     # loads
     ALPHA_U, BETA_U, ALPHA_L, BETA_L,  # tilt of the two discs
     THRUST_U, THRUST_L, TORQUE_U, TORQUE_L,
+    ROTOR_X, ROTOR_Y, ROTOR_Z,  # force of both rotors
     FORCE_X, FORCE_Y, FORCE_Z,  # all but gravity
     MOMENT_X, MOMENT_Y, MOMENT_Z,
     # rates of change
     ALPHA_L_DOT, BETA_L_DOT,
     P_DOT, Q_DOT, R_DOT,
     READING,  # first of the N_CHANNELS sensor readings
-) = range(52)  # fmt: skip
+) = range(57)  # fmt: skip
 N_FLOW = READING + N_CHANNELS

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from coax_env.model import effects
+from coax_env.model.usual_sizes import sized_for
 from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import (
     and_list,
@@ -43,7 +44,7 @@ def cause_blocks(findings: Findings, bare: Vehicle, corrected: Vehicle) -> list[
     if not causes:
         nothing = prose("No effect of the catalogue is named: these flights show none.")
         return [nothing, alarms]
-    rows = [row for k, cause in enumerate(causes) for row in _rows(k, cause)]
+    rows = [row for k, cause in enumerate(causes) for row in _rows(k, cause, bare)]
     header = ["parameter", "value", "std", "95 % interval", "unit", "usual size"]
     return [
         prose(
@@ -59,7 +60,7 @@ def cause_blocks(findings: Findings, bare: Vehicle, corrected: Vehicle) -> list[
 
 def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicle) -> str:
     effect, alternatives = cause["effect"], cause["confusable_with"]
-    unusual = effect in effects.CATALOGUE and outside_usual(effect, _values(cause))
+    unusual = effect in effects.CATALOGUE and outside_usual(effect, _values(cause), bare)
     lines = [
         f"**These flights cannot distinguish it from {_plain_list(alternatives)}.**"
         if alternatives
@@ -91,10 +92,11 @@ def _values(cause: Mapping[str, Any]) -> dict[str, float]:
     return {name.rpartition(".")[2]: p["value"] for name, p in cause["parameters"].items()}
 
 
-def _rows(index: int, cause: Mapping[str, Any]) -> list[list[str]]:
+def _rows(index: int, cause: Mapping[str, Any], vehicle: Vehicle) -> list[list[str]]:
     """A cause's parameters in a table."""
-    entry = effects.CATALOGUE.get(cause["effect"])
-    usual = {f"{entry.name}.{p.name}": p.usual for p in entry.parameters} if entry else {}
+    effect = cause["effect"]
+    sized = sized_for(vehicle, effect) if effect in effects.CATALOGUE else ()
+    usual = {f"{effect}.{p.name}": p.usual for p in sized}
     result = []
     for name, p in cause["parameters"].items():
         place, value, std = f"causes/{index}/parameters/{name}", p["value"], p["std"]

@@ -13,6 +13,7 @@ import numpy as np
 
 from coax_env.estimation.helicopter import UNUSUAL_FROM
 from coax_env.model import effects
+from coax_env.model.usual_sizes import sized_for
 from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import bounds
 from coax_env.report.effect_meanings import CONSEQUENCES, Consequence, Values
@@ -121,9 +122,15 @@ def described(cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicle) -> st
     return ", ".join(c.text for c in significant)
 
 
-def outside_usual(effect: str, values: Values) -> bool:
-    """Whether a value is beyond UNUSUAL_FROM times its usual size, or has no meaning."""
-    known = {p.name: p for p in effects.CATALOGUE[effect].parameters}
+def outside_usual(effect: str, values: Values, vehicle: Vehicle) -> bool:
+    """Whether a value is beyond UNUSUAL_FROM times its usual size, or has no meaning.
+
+    Args:
+        effect: its name in the catalogue.
+        values: parameter's own name -> value.
+        vehicle: on which the sizes are usual.
+    """
+    known = {p.name: p for p in sized_for(vehicle, effect)}
     return any(
         name in known
         and not known[name].shape
