@@ -13,7 +13,7 @@ from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.model import effects
-from coax_env.model.layout import CHANNEL_UNITS, CHANNELS
+from coax_env.model.layout import CHANNEL_UNITS, CHANNELS, FULL_STATES, N_FULL
 from coax_env.model.usual_sizes import QUANTITIES, factor, sized_for
 from coax_env.model.vehicle import Vehicle
 
@@ -23,7 +23,7 @@ LENGTH, MASS = 0.6, 0.35
 TIME = math.sqrt(LENGTH)
 DIMENSIONS = {
     "kg": MASS, "m/s2": 1.0, "kg/m3": MASS / LENGTH**3, "m": LENGTH, "kg m2": MASS * LENGTH**2,
-    "1": 1.0, "s": TIME, "rad": 1.0, "m/s": LENGTH / TIME, "rad/s": 1.0 / TIME,
+    "1": 1.0, "s": TIME, "rad": 1.0, "m/s": LENGTH / TIME, "rad/s": 1.0 / TIME, "rad/s2": 1.0 / TIME**2,
     "rev/min": 1.0 / TIME, "m2": LENGTH**2, "s/m": TIME / LENGTH, "rad per m/s": TIME / LENGTH,
     "N s/m per rad/s": MASS, "N m s": MASS * LENGTH**2 / TIME, "N/m": MASS / LENGTH,
     "N": MASS, "N m": MASS * LENGTH,
@@ -46,6 +46,16 @@ def test_sizes_on_lama400d_are_the_catalogues():
         assert sized_for(LAMA, name) == entry.parameters
 
 
+def dimension(unit: str) -> float:
+    """What a number in a unit is multiplied with: also ``N m per (m/s)(rad/s)`` and ``N per (m/s)2``."""
+    if unit in DIMENSIONS:
+        return DIMENSIONS[unit]
+    of, _, per = unit.partition(" per ")
+    squared = per.endswith(")2")
+    parts = per.removesuffix("2" if squared else "").strip("()").split(")(")
+    return DIMENSIONS[of] / math.prod(DIMENSIONS[part] for part in parts) ** (2 if squared else 1)
+
+
 @pytest.mark.parametrize(
     ("name", "parameter"),
     [(name, p.name) for name, e in effects.GROUPS.items() for p in e.parameters if p.scale],
@@ -54,17 +64,7 @@ def test_sizes_have_their_dimension(name, parameter):
     """A size times the scale's dimensions: that of the parameter's own unit."""
     (own,) = (p for p in effects.GROUPS[name].parameters if p.name == parameter)
     (other,) = (p for p in sized_for(scaled_lama(), name) if p.name == parameter)
-    unit, _, per = own.unit.partition(" per ")
-    if own.unit in DIMENSIONS:
-        wanted = DIMENSIONS[own.unit]
-    else:  # a generic term's coefficient: "N m per (m/s)(rad/s)", "N per (m/s)2"
-        wanted = DIMENSIONS[unit]
-        for part in per.replace("(", " ").split(")"):
-            if part.strip() == "2":
-                wanted /= last
-            elif part.strip():
-                last = DIMENSIONS[{"rad/s2": "rad/s"}.get(part.strip(), part.strip())]
-                wanted /= last * (1.0 / TIME if part.strip() == "rad/s2" else 1.0)
+    wanted = dimension(own.unit)
     for kind in ("usual", "smallest", "probe", "lower", "upper"):
         size = getattr(own, kind)
         assert getattr(other, kind) == pytest.approx(size * wanted if size else 0.0, rel=1e-9)
@@ -104,11 +104,19 @@ def scaled_noise(noise: Noise) -> Noise:
     )
 
 
-def evidence(vehicle: Vehicle, records: list[Record], noise: Noise) -> dict[str, float]:
-    """Nats expected of every effect that scales, at its usual size."""
+def evidence(
+    vehicle: Vehicle, records: list[Record], noise: Noise, starts: np.ndarray
+) -> dict[str, float]:
+    """Nats expected of every effect that scales, at its usual size.
+
+    starts: what the spreads of the filter's first states are multiplied with, (n,).
+    """
     names = [e for e, x in effects.CATALOGUE.items() if any(p.scale for p in x.parameters)]
     problem = Problem.of(HeliModel(vehicle), records, names)
+    engine = problem.engine  # whose first states are as wide on every machine
+    engine.starts = [(x, P * np.outer(starts, starts)) for x, P in engine.starts]
     values = {**problem.model.bare_values, **{f.name: f.value for f in problem.parameters}}
+    values["gust_memory"] = noise.process["memory"]
     _, lin = problem.engine.linearise(values, noise, problem.parameters)
     quadratic = Quadratic.of(lin, problem.parameters, values)
     found = {}
@@ -126,8 +134,11 @@ def test_a_scaled_machine_gives_the_same_evidence(tmp_path):
     flight = read_flight(folder)
     records = [record_of(run) for run in flight.runs]
     noise = starting_noise(flight, LAMA)
-    here = evidence(LAMA, records, noise)
-    there = evidence(scaled_lama(), [scaled_record(r) for r in records], scaled_noise(noise))
+    here = evidence(LAMA, records, noise, np.ones(N_FULL))
+    starts = np.array([DIMENSIONS[unit] for _, unit in FULL_STATES])
+    there = evidence(
+        scaled_lama(), [scaled_record(r) for r in records], scaled_noise(noise), starts
+    )
     assert sum(nats > 1.0 for nats in here.values()) > 5
     for name, nats in here.items():
         assert there[name] == pytest.approx(nats, rel=0.05, abs=0.1), name
