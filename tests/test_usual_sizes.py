@@ -41,13 +41,16 @@ def scaled_lama() -> Vehicle:
     )
 
 
+SMALL = scaled_lama()
+
+
 def test_sizes_on_lama400d_are_the_catalogues():
     for name, entry in effects.GROUPS.items():
         assert sized_for(LAMA, name) == entry.parameters
 
 
 def dimension(unit: str) -> float:
-    """What a number in a unit is multiplied with: also ``N m per (m/s)(rad/s)`` and ``N per (m/s)2``."""
+    """What a number in a unit is multiplied with, also ``N m per (m/s)(rad/s)``, ``N per (m/s)2``."""
     if unit in DIMENSIONS:
         return DIMENSIONS[unit]
     of, _, per = unit.partition(" per ")
@@ -57,23 +60,21 @@ def dimension(unit: str) -> float:
 
 
 @pytest.mark.parametrize(
-    ("name", "parameter"),
-    [(name, p.name) for name, e in effects.GROUPS.items() for p in e.parameters if p.scale],
+    "name", [name for name, e in effects.GROUPS.items() if any(p.scale for p in e.parameters)]
 )
-def test_sizes_have_their_dimension(name, parameter):
-    """A size times the scale's dimensions: that of the parameter's own unit."""
-    (own,) = (p for p in effects.GROUPS[name].parameters if p.name == parameter)
-    (other,) = (p for p in sized_for(scaled_lama(), name) if p.name == parameter)
-    wanted = dimension(own.unit)
-    for kind in ("usual", "smallest", "probe", "lower", "upper"):
-        size = getattr(own, kind)
-        assert getattr(other, kind) == pytest.approx(size * wanted if size else 0.0, rel=1e-9)
-    assert other.off == own.off
+def test_sizes_that_scale_have_their_dimension(name):
+    """Whatever the scale is made of: it grows as the parameter's own unit does."""
+    for own, other in zip(effects.GROUPS[name].parameters, sized_for(SMALL, name), strict=True):
+        wanted = dimension(own.unit) if own.scale else 1.0
+        for kind in ("usual", "smallest", "probe", "lower", "upper"):
+            size = getattr(own, kind)
+            assert getattr(other, kind) == pytest.approx(size * wanted if size else 0.0, rel=1e-9)
+        assert other.off == own.off
 
 
 def test_what_is_bought_does_not_scale():
     for name in ("servo_delay", "gyro_bias", "wind", "swash_offset"):
-        assert sized_for(scaled_lama(), name) == effects.GROUPS[name].parameters
+        assert sized_for(SMALL, name) == effects.GROUPS[name].parameters
 
 
 def test_a_scale_is_read_from_left_to_right():
@@ -136,9 +137,7 @@ def test_a_scaled_machine_gives_the_same_evidence(tmp_path):
     noise = starting_noise(flight, LAMA)
     here = evidence(LAMA, records, noise, np.ones(N_FULL))
     starts = np.array([DIMENSIONS[unit] for _, unit in FULL_STATES])
-    there = evidence(
-        scaled_lama(), [scaled_record(r) for r in records], scaled_noise(noise), starts
-    )
+    there = evidence(SMALL, [scaled_record(r) for r in records], scaled_noise(noise), starts)
     assert sum(nats > 1.0 for nats in here.values()) > 5
     for name, nats in here.items():
         assert there[name] == pytest.approx(nats, rel=0.05, abs=0.1), name
