@@ -8,11 +8,15 @@ import time
 import traceback
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import injector
 import numpy as np
+from injector_air import GUSTY, STILL, Air, disturbances
+from injector_craft import CRAFTS, Craft
+from injector_sensors import SENSORS
 
 from coax_env.diagnosis.diagnose import Diagnosis, diagnose
 from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, start
@@ -29,11 +33,11 @@ from coax_env.model.effects import CATALOGUE
 from coax_env.model.vehicle_file import load_vehicle
 from study import baselines
 from study.judge import OWN
-from study.plan import PlannedFlight
+from study.plan import PlannedFlight, size_on
 from study.store import code_hash
 
-GUSTS = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003, "memory": 0.5}
-"""Std of the generator's gusts [N, N m] and their correlation time [s]."""
+GROUPS = {"force_xy": [0, 1], "force_z": [2], "moment_xy": [3, 4], "moment_z": [5]}
+"""Axes of the generator's gusts."""
 
 SHOWN_FROM = 3.0
 """Thresholds that an effect of a flight of kind "many" must be expected to be worth on all its runs; a
@@ -106,12 +110,17 @@ def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
     Where the pilot loses the helicopter, the effects are flown at four fifths of their size.
     """
     factor = 1.0
-    for _ in range(5):
-        sizes = {e: {p: factor * v for p, v in t.items()} for e, t in planned.effects.items()}
+    craft = craft_of(planned)
+    for _ in range(8):
+        sizes = {
+            e: {p: factor * v * size_on(craft, f"{e}.{p}") for p, v in t.items()}
+            for e, t in planned.effects.items()
+        }
         try:
             injector.fly(
-                folder, sizes, gusts=planned.gusts, sensors=planned.sensors, seed=planned.seed,
-                runs=planned.runs,
+                folder, sizes, gusts=air_of(planned), sensors=planned.sensors, seed=planned.seed,
+                runs=planned.runs, craft=craft, pilot=planned.pilot,
+                card_noise=planned.card_noise, longest=planned.longest or math.inf,
             )  # fmt: skip
         except RuntimeError:
             factor *= 0.8
@@ -121,6 +130,20 @@ def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
         path.unlink()
         return truth
     raise RuntimeError(f"the pilot cannot fly {planned.effects}")
+
+
+def craft_of(planned: PlannedFlight) -> Craft:
+    """What flies."""
+    if planned.craft == "drawn":
+        return injector.drawn(np.random.default_rng(planned.seed))
+    return CRAFTS[planned.craft]
+
+
+def air_of(planned: PlannedFlight) -> Air:
+    """What it flies in."""
+    if planned.air is not None:
+        return Air(**planned.air)
+    return GUSTY if planned.gusts else STILL
 
 
 def showing(planned: PlannedFlight, place: Path) -> tuple[PlannedFlight, Path, dict[str, Any]]:
@@ -176,10 +199,12 @@ def expected_evidence(
         return result
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     model = HeliModel(vehicle)
-    noise = starting_noise(flight, vehicle)
+    true_noise = SENSORS[planned.sensors].noise
+    noise = starting_noise(replace(flight, noise=dict(true_noise)), vehicle)
     levels = {**noise.process, **noise.floor}
     if planned.gusts:
-        levels |= GUSTS  # the model's are what shakes the vehicle as its file has it
+        # the model's are what shakes the vehicle as its file has it
+        levels |= gust_levels(air_of(planned), craft_of(planned))
         heavier = 1.0 + values.get("added_mass.mass", 0.0) / vehicle["mass"].value
         levels["force_xy"] /= heavier
         levels["force_z"] /= heavier
@@ -192,6 +217,25 @@ def expected_evidence(
         _, _, quadratic = linearise(problem, Fit(tuple(listed), at, noise))
         result[effect] = _worth(problem, quadratic, listed, effect, values)
     return result
+
+
+@cache
+def gust_levels(air: Air, craft: Craft) -> dict[str, float]:
+    """Std [N, N m] of an air's gusts on a craft and their correlation time [s], by two minutes of it."""
+    step = 0.002
+    history = disturbances(air, craft, 12_000, 5, step, np.random.default_rng(0))
+    history[:, 0:3] += history[:, 10:13]
+    levels = {group: float(history[:, axes].std()) for group, axes in GROUPS.items()}
+    lasting = [_correlation_time(history[:, i], step) for i in range(6)]
+    return levels | {"memory": float(np.exp(np.mean(np.log(lasting))))}
+
+
+def _correlation_time(x: np.ndarray, step: float) -> float:
+    """s after which a history is alike to 1/e."""
+    x = x - x.mean()
+    spectrum = np.abs(np.fft.rfft(x, 2 * len(x))) ** 2
+    alike = np.fft.irfft(spectrum)[: len(x)]
+    return step * max(int(np.argmax(alike < alike[0] / math.e)), 1)
 
 
 def _worth(
