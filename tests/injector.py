@@ -386,7 +386,7 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     moment[2] -= hidden.yaw_damping * omega[2] * (0.85 + 0.15 * abs(omega[2]))
     moment[2] += torque_u - torque_l
     cable = np.array([hidden.tether_north - s[0], hidden.tether_east - s[1], 0.0])
-    stretch = math.sqrt(1.0 + (cable[0] ** 2 + cable[1] ** 2) / 100.0)
+    stretch = math.sqrt(1.0 + (cable[0] ** 2 + cable[1] ** 2) / 900.0)
     force += hidden.tether / stretch * (R.T @ cable)
     force += push[:3]
     force += R.T @ push[10:13]
