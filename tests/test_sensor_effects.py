@@ -65,7 +65,6 @@ HIDDEN = {
     "markers beside the centre of gravity": ("marker_offset", "pose", ON_AXES),
     "tether": ("position_spring", "tracked", FAST),
     "upper blow-back": ("upper_blowback", "full", FAST),
-    "the body's own gyroscopic moment": ("gyroscopic_coupling", "full", FAST),
 }
 
 
@@ -78,6 +77,14 @@ def test_a_sensor_or_body_effect_is_named_alone(tmp_path, monkeypatch, case):
     truth = truth_of(folder)
     (folder / "truth.json").unlink()
     check_causes(diagnose(folder, hold_out=[]).findings, *truth)
+
+
+@pytest.mark.slow
+def test_the_bodys_own_gyroscopic_moment_misleads_nobody(tmp_path):
+    """Every real body has it; flown gently it does not show, and no other effect is blamed."""
+    folder = injector.fly(tmp_path / "f", {"gyroscopic_coupling": {}}, runs=FAST, seed=21)
+    (folder / "truth.json").unlink()
+    assert diagnose(folder, hold_out=[]).findings["verdict"] == "consistent"
 
 
 SAME = {"pose_delay": {"command_delay"}, "frame_yaw": {"swash_phase"}}
