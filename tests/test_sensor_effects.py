@@ -57,7 +57,6 @@ FAST = ("lon_3211", "lat_3211", "forward_run", "side_run", "heading_turn", "yaw_
 
 HIDDEN = {
     "late attitude": ({"attitude_delay": {}}, "full", ON_AXES),
-    "late pose": ({"pose_delay": {"time": 0.02}}, "tracked", ON_AXES),
     "gyro scale": ({"gyro_scale": {}}, "full", ON_AXES),
     "compass": ({"magnetic_field": {}}, "full", ON_AXES),
     "markers' axes, gyros aboard": ({"frame_yaw": {}}, "tracked", ON_AXES),
