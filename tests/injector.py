@@ -125,10 +125,11 @@ class Hidden(NamedTuple):
     gyro_scale_z: float = 0.0
     heading_moment: float = 0.0
     patch_lift: float = 0.0
-    product_moment: float = 0.0
+    sector_moment: float = 0.0
+    resonance_moment: float = 0.0
     cable_moment: float = 0.0
     stall_moment: float = 0.0
-    cross_moment: float = 0.0
+    wake_moment: float = 0.0
 
 
 # effect -> parameter -> (field of Hidden, size where none is given)
@@ -189,18 +190,20 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
     "gyro_scale": {
         "x": ("gyro_scale_x", 0.06), "y": ("gyro_scale_y", -0.05), "z": ("gyro_scale_z", 0.08)
     },
-    # in no catalogue: M = a sin(3 psi)
+    # in no catalogue: M = a sin(3 psi), which a generic term is
     "outside": {"heading_moment": ("heading_moment", 0.02)},
+    # and what no generic term is: pitch moment in one sector of the heading
+    "outside_sector": {"moment": ("sector_moment", 0.03)},
     # lift over a place: half a meter wide, 0.4 m north of where flights begin
     "outside_patch": {"lift": ("patch_lift", 0.5)},
-    # roll moment with the product of the rotor speeds, in which their sum and difference both are
-    "outside_product": {"moment": ("product_moment", 0.08)},
+    # roll moment near one speed of the upper rotor, which meets a natural frequency there
+    "outside_resonance": {"moment": ("resonance_moment", 0.02)},
     # yaw moment of a cable that twists and slips (Dahl): it depends on the way there
     "outside_cable": {"moment": ("cable_moment", 0.006)},
     # pitch moment that is all there from a slow walk on, and forwards only
     "outside_stall": {"moment": ("stall_moment", 0.02)},
-    # pitch moment of the product of side speed and turn rate
-    "outside_cross": {"moment": ("cross_moment", 0.03)},
+    # roll moment of the side speed of a while ago
+    "outside_wake": {"moment": ("wake_moment", 0.015)},
 }  # fmt: skip
 
 OTHER_FORM = frozenset({"ground_effect.gain", "airframe_drag.area_x", "airframe_drag.area_y",
@@ -208,9 +211,9 @@ OTHER_FORM = frozenset({"ground_effect.gain", "airframe_drag.area_x", "airframe_
                         "rate_damping.coefficient", "vibration.amplitude", "battery_sag.rate",
                         "position_spring.stiffness", "position_spring.north",
                         "position_spring.east", "upper_blowback.gain",
-                        "outside.heading_moment", "outside_patch.lift", "outside_product.moment",
-                        "outside_cable.moment", "outside_stall.moment",
-                        "outside_cross.moment"})  # fmt: skip
+                        "outside.heading_moment", "outside_patch.lift", "outside_sector.moment",
+                        "outside_resonance.moment", "outside_cable.moment",
+                        "outside_stall.moment", "outside_wake.moment"})  # fmt: skip
 """Parameters whose number means something else here than in the catalogue."""
 
 
@@ -279,21 +282,25 @@ def _reach(craft: Craft) -> Reach:
 
 
 def _suited(pilot: Pilot, craft: Craft) -> Pilot:
-    """The pilot with gains for what a craft's commands do."""
+    """The pilot with gains for what a craft's commands do.
+
+    Torques out of balance need the same share of speed on every craft: the trim goes with the root.
+    """
     tilt, yaw, _ = _reach(craft)
     return pilot._replace(
         tilt=tilt * pilot.tilt, rate=tilt * pilot.rate, side_trim=tilt * pilot.side_trim,
         most_tilt=tilt * pilot.most_tilt, turn=yaw * pilot.turn, yaw_rate=yaw * pilot.yaw_rate,
-        yaw_trim=yaw * pilot.yaw_trim, most_yaw=yaw * pilot.most_yaw,
+        yaw_trim=math.sqrt(yaw) * pilot.yaw_trim, most_yaw=max(yaw, 1.0) * pilot.most_yaw,
     )  # fmt: skip
 
 
 # --- physics --------------------------------------------------------------------------------------
 # State: 0-2 position, 3-5 velocity (both inertial), 6-9 quaternion body to inertial, 10-12 p q r,
 # 13-16 alpha_l beta_l alpha_f beta_f, 17-18 rotor speeds, 19-20 swash, 21-22 swash rates, 23 a cable's
-# twist in units of its greatest.
-N_STATE = 24
+# twist in units of its greatest, 24 side speed as the wake remembers it.
+N_STATE = 25
 CABLE = 0.3  # rad of turn after which a cable slips
+WAKE = 0.8  # s that a wake lasts
 # Out: 0-2 specific force, 3-5 angular acceleration (body axes).
 
 
@@ -392,9 +399,9 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     force += R.T @ push[10:13]
     moment += push[3:6]
     heading = math.atan2(R[1, 0], R[0, 0])
-    moment[1] += hidden.heading_moment * math.sin(3.0 * heading)
-    _unlisted(s, air, wu * wl / (rotors.hover_upper * rotors.hover_lower), hidden, force, moment)
+    _unlisted(s, air, heading, wu / rotors.hover_upper, hidden, force, moment)
     ds[23] = (omega[2] - abs(omega[2]) * s[23]) / CABLE
+    ds[24] = (air[1] - s[24]) / WAKE
 
     # actuators
     _actuate(s, command, hidden, ds)
@@ -436,13 +443,15 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
 
 
 @njit(cache=True)
-def _unlisted(s, air, product, hidden, force, moment):
-    """Adds what is in no catalogue. ``product``: of the rotor speeds, against hover's."""
+def _unlisted(s, air, heading, speed, hidden, force, moment):
+    """Adds what is in no catalogue. ``speed``: of the upper rotor, against hover's."""
     away = ((s[0] - 0.4) ** 2 + s[1] ** 2) / 0.5**2
     force[2] -= hidden.patch_lift * math.exp(-0.5 * away)
-    moment[0] += hidden.product_moment * (product - 1.0)
+    moment[0] += hidden.resonance_moment / (1.0 + ((speed - 1.01) / 0.006) ** 2)
+    moment[0] += hidden.wake_moment * s[24]
+    moment[1] += hidden.heading_moment * math.sin(3.0 * heading)
+    moment[1] += hidden.sector_moment * math.exp(6.0 * (math.cos(heading - 2.0) - 1.0))
     moment[1] += hidden.stall_moment * (0.5 + 0.5 * math.tanh((air[0] - 0.3) / 0.1))
-    moment[1] += hidden.cross_moment * air[1] * s[12]
     moment[2] -= hidden.cable_moment * s[23]
 
 
@@ -725,6 +734,7 @@ def fly(
     radio_gaps: bool = False,
     craft: Craft = LAMA,
     pilot: str = "usual",
+    known_as: Craft | None = None,
     card_noise: float | None = 1.0,
     longest: float = math.inf,
 ) -> Path:
@@ -735,7 +745,8 @@ def fly(
         gusts: True: force (0.2 N) and moment (6 mN m) with a memory of 0.5 s; or any air.
         sensors: a key of ``SENSORS``.
         runs: names in ``MANEUVERS``; all where None.
-        craft: what flies; one that is not shipped gets a vehicle file beside the card.
+        craft: what flies. known_as: what its vehicle file says; the same where None. One that is
+            not shipped gets a file beside the card.
         pilot: a key of ``PILOTS``.
         card_noise: factor by which the card's noise is wrong; None: the card has none.
         longest: s at which a run ends.
@@ -756,12 +767,13 @@ def fly(
             columns, kit, rng, lost_echoes=lost_echoes, radio_gaps=radio_gaps, first=i == 0
         )
         (folder / f"{name}.csv").write_text(csv_text(columns, kit))
-    vehicle = SHIPPED.get(craft)
+    known_as = known_as or craft
+    vehicle = SHIPPED.get(known_as)
     if vehicle is None:
-        write_vehicle(craft, folder / "vehicle.toml")
+        write_vehicle(known_as, folder / "vehicle.toml")
         vehicle = str(folder.resolve() / "vehicle.toml")
     said = {} if card_noise is None else {c: card_noise * std for c, std in kit.noise.items()}
-    card = card_text(names, vehicle, (craft.density, craft.gravity), said)
+    card = card_text(names, vehicle, (known_as.density, known_as.gravity), said)
     (folder / "card.toml").write_text(card)
     full = {f"{effect}.{parameter}": value for (effect, parameter), value in values.items()}
     truth = {

@@ -156,6 +156,22 @@ _FIXED = {
 }  # fmt: skip
 
 
+MOST_SPREAD = 1.5  # std
+
+
+def spread(craft: Craft, rng: np.random.Generator) -> Craft:
+    """A vehicle that another one's file describes as well as files do.
+
+    Every number is drawn about the file's, with its std, and never further off than MOST_SPREAD of it:
+    what is further off may rightly be named.
+    """
+    changed = {}
+    for field, share, _ in _FILE.values():
+        off = min(max(rng.standard_normal(), -MOST_SPREAD), MOST_SPREAD)
+        changed[field] = getattr(craft, field) * (1.0 + share * float(off))
+    return craft._replace(**changed)
+
+
 def write_vehicle(craft: Craft, path: Path) -> None:
     """A vehicle file that says what the craft is, as exactly as vehicles are usually known."""
     lines = ['name = "drawn"', 'description = "drawn for a study"', "[parameters]"]

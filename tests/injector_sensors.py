@@ -30,7 +30,7 @@ class Sensors(NamedTuple):
     step: s between rows, as the pilot commands. unrest: std of a row's time, share of the step.
     every_row: rows from one that is logged to the next, in turn. lost: share of rows lost in bursts
         of 2 to 5. gap: s, one gap in a flight's first run.
-    outliers: share of rows on which all channels are off by up to 40 std. quanta: channel -> step
+    outliers: share of rows on which all channels are off by up to 12 std. quanta: channel -> step
         of its readings. formats: channel -> how it is written.
     """
 
@@ -130,7 +130,7 @@ def blunt(columns: dict[str, np.ndarray], sensors: Sensors, rng: np.random.Gener
     n = len(columns["t"])
     for row in np.flatnonzero(rng.random(n) < sensors.outliers) if sensors.outliers else ():
         for channel, std in sensors.noise.items():
-            columns[channel][row] += std * rng.uniform(-40.0, 40.0)
+            columns[channel][row] += std * rng.uniform(-12.0, 12.0)
     for channel, quantum in sensors.quanta.items():
         columns[channel] = quantum * np.round(columns[channel] / quantum)
 

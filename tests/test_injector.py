@@ -9,7 +9,7 @@ import injector
 import numpy as np
 import pytest
 from injector_air import DISTURBANCES, GUSTS, Air, disturbances
-from injector_craft import COAX, LAMA, Craft, draw, rotors_of, write_vehicle
+from injector_craft import COAX, LAMA, Craft, draw, rotors_of, spread, write_vehicle
 from injector_sensors import POSE, SENSORS
 from shared_flights import shared_flight
 
@@ -172,6 +172,23 @@ def test_drawn_vehicles_are_of_all_sizes_and_bodies_that_can_be() -> None:
         assert moments[2] < c.mass * c.radius**2 and c.rotor_upper < c.inertia_z
 
 
+def test_a_vehicle_within_its_files_spread_keeps_the_file(tmp_path: Path) -> None:
+    craft = spread(LAMA, np.random.default_rng(3))
+    file = coax_env.load_vehicle("lama400d")
+    for name, field in (
+        ("mass", "mass"),
+        ("inertia_zz", "inertia_z"),
+        ("swash_to_flap", "swash_gain"),
+    ):
+        off = (getattr(craft, field) - file[name].value) / file[name].std
+        assert 0.0 < abs(off) <= 1.5 + 1e-9
+    offs = [(spread(LAMA, np.random.default_rng(i)).mass / 0.8 - 1.0) / 0.01 for i in range(200)]
+    assert abs(np.mean(offs)) < 0.2 and 0.75 < np.std(offs) < 1.0
+    assert (craft.radius, craft.gravity, craft.density) == (0.25, 9.804, 1.14)
+    injector.fly(tmp_path, {}, craft=craft, known_as=LAMA, runs=["lat_3211"])
+    assert read_flight(tmp_path).vehicle == "lama400d" and not (tmp_path / "vehicle.toml").exists()
+
+
 @pytest.mark.parametrize("memory", [0.03, 0.5, 2.0])
 @pytest.mark.parametrize("gusts", ["markov", "heavy_tails"])
 def test_gusts_have_the_std_and_memory_asked(gusts: str, memory: float) -> None:
@@ -267,7 +284,7 @@ def test_a_pose_looks_like_the_coax_log(tmp_path: Path) -> None:
     for channel in ("phi", "theta", "psi"):
         third = np.diff(run.measured[channel], 3)
         noise = 1.4826 * np.nanmedian(abs(third)) / math.sqrt(20.0)
-        assert noise == pytest.approx(POSE[channel], rel=0.25)
+        assert 0.9 < noise / POSE[channel] < 1.5, "and some of the motion itself"
 
 
 def test_telemetry_is_slow_and_has_gaps(tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ import pytest
 
 from coax_env import load_vehicle, read_flight
 from coax_env.diagnosis.problem import Problem
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.model import effects
@@ -95,13 +96,16 @@ def scaled_noise(noise: Noise) -> Noise:
     def of(level: str) -> float:
         if "memory" in level:
             return TIME
+        if level == "rotor_speed":
+            return TIME**-1.5
         force = MASS if "force" in level else MASS * LENGTH
-        return force * math.sqrt(TIME) if "white" in level else force
+        root = 0.5 * level.startswith("white") - 0.5 * level.startswith("trim")
+        return force * TIME**root
 
-    return Noise(
-        {level: value * of(level) for level, value in noise.process.items()},
-        {c: std * DIMENSIONS[CHANNEL_UNITS[c]] for c, std in noise.reading.items()},
-        {level: value * of(level) for level, value in noise.floor.items()},
+    return replace(
+        noise,
+        process={level: value * of(level) for level, value in noise.process.items()},
+        reading={c: std * DIMENSIONS[CHANNEL_UNITS[c]] for c, std in noise.reading.items()},
     )
 
 
@@ -117,7 +121,6 @@ def evidence(
     engine = problem.engine  # whose first states are as wide on every machine
     engine.starts = [(x, P * np.outer(starts, starts)) for x, P in engine.starts]
     values = {**problem.model.bare_values, **{f.name: f.value for f in problem.parameters}}
-    values["gust_memory"] = noise.process["memory"]
     _, lin = problem.engine.linearise(values, noise, problem.parameters)
     quadratic = Quadratic.of(lin, problem.parameters, values)
     found = {}

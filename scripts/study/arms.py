@@ -7,15 +7,18 @@ added changes no other. Kinds: "clean", "one", "two", "three" effects, "outside"
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from injector_air import GUSTY, STILL, Air
 from injector_sensors import SENSORS
 
-from study.plan import ALONE, OUTSIDE, RICH, PlannedFlight, several, sizes_of
+from study.plan import ALONE, FOREIGN, RICH, PlannedFlight, several, sizes_of
+
+T = TypeVar("T")
 
 LONGEST = 14.0
-"""s at which a run ends: the eight runs are then 104 s, with a full turn, the ground and both speeds."""
+"""s at which a run ends: the eight runs are then 108 s, with a full turn, the ground and speed."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,7 @@ ARMS = {
         sensors=("telemetry",), card=(None,), craft="coax",
     ),
     "drawn_vehicles": Arm("vehicles drawn between 0.05 and 5 kg", craft="drawn"),
+    "spread_vehicles": Arm("a vehicle within its file's spread, not as it says", craft="spread"),
     "other_pilots": Arm("a stabiliser 30 ms late; a slow hand", pilots=("stabiliser", "slow_human")),
     "restless": Arm(
         "trims that drift, rotor speeds that jitter with their reaction on the body",
@@ -69,7 +73,7 @@ ARMS = {
 
 SENSED = {
     "gyro_bias": "p", "accel_bias": "ax", "accel_scale": "ax", "imu_lever_arm": "ax",
-    "imu_tilt": "ax", "vibration": "ax",
+    "imu_tilt": "ax", "vibration": "ax", "gyro_scale": "p",
 }  # fmt: skip
 """Effects of one sensor, and a channel of it; without the sensor they are not hidden."""
 ECHO = frozenset({"sonar_scale", "sonar_tilt", "sonar_delay"})
@@ -78,14 +82,12 @@ LEAST_SCALE = -0.6
 """Of a scale: three times the usual size could turn a time constant's sign."""
 
 
-def plan_arms(
-    arms: Sequence[str], clean: int, effects: int, seed: int = 0
-) -> list[PlannedFlight]:
+def plan_arms(arms: Sequence[str], clean: int, effects: int, seed: int = 0) -> list[PlannedFlight]:
     """The flights of some arms, evenly mixed so that a part of the study is a fair sample.
 
     Args:
         arms: keys of ARMS. clean: flights without an effect, per arm. effects: with some, per arm;
-            two thirds have one, one sixth two, one sixth three. An arm of unlisted effects has no others.
+            two thirds have one, one sixth two, one sixth three. An arm of unlisted ones has no others.
         seed: the study's.
     """
     flights = [
@@ -121,7 +123,8 @@ def planned(name: str, kind: str, number: int, seed: int) -> PlannedFlight:
     effects = _hidden(kind, number, of_arm, unseen, rng)
     air = arm.air
     if arm.memory is not None:
-        force, moment = np.exp(rng.uniform(*np.log(arm.memory), 2)).tolist()
+        low, high = (float(np.log(bound)) for bound in arm.memory)
+        force, moment = np.exp(rng.uniform(low, high, 2)).tolist()
         air = air._replace(memory=(force, moment))
     return PlannedFlight(
         kind=kind,
@@ -140,7 +143,7 @@ def planned(name: str, kind: str, number: int, seed: int) -> PlannedFlight:
     )
 
 
-def _turn[T](options: Sequence[T], number: int) -> T:
+def _turn(options: Sequence[T], number: int) -> T:
     return options[number % len(options)]
 
 
@@ -157,7 +160,7 @@ def _hidden(
     if kind == "clean":
         return []
     if kind == "outside":
-        return [_turn(tuple(OUTSIDE), number)]
+        return [_turn(FOREIGN, number)]
     if kind == "one":  # every effect in turn
         seen = [e for e in ALONE if e not in unseen]
         return [seen[np.random.default_rng(of_arm).permutation(len(seen))[number % len(seen)]]]

@@ -89,10 +89,11 @@ SIZES: dict[str, dict[str, tuple[float, float, bool]]] = {
     "gyro_scale": dict.fromkeys("xyz", (0.03, 0.1, True)),
     "outside": {"heading_moment": (0.015, 0.03, False)},
     "outside_patch": {"lift": (0.3, 0.8, True)},
-    "outside_product": {"moment": (0.05, 0.15, True)},
+    "outside_sector": {"moment": (0.02, 0.05, True)},
+    "outside_resonance": {"moment": (0.01, 0.03, True)},
     "outside_cable": {"moment": (0.004, 0.01, False)},
     "outside_stall": {"moment": (0.01, 0.03, True)},
-    "outside_cross": {"moment": (0.02, 0.05, True)},
+    "outside_wake": {"moment": (0.01, 0.02, True)},
 }
 """effect -> parameter of the generator -> least, most, either sign: the catalogue's usual sizes."""
 
@@ -101,10 +102,12 @@ CARRIERS = {"wind": "rotor_drag"}
 OWN_FORM = {name.partition(".")[0] for name in injector.OTHER_FORM}
 """Effects whose numbers mean something else in the generator than in the catalogue."""
 OUTSIDE = {
-    "outside": "q", "outside_patch": "az", "outside_product": "p", "outside_cable": "r",
-    "outside_stall": "q", "outside_cross": "q",
+    "outside": "q", "outside_patch": "az", "outside_sector": "q", "outside_resonance": "p",
+    "outside_cable": "r", "outside_stall": "q", "outside_wake": "p",
 }  # fmt: skip
 """Effects that are in no list, and the channel that each disturbs."""
+FOREIGN = tuple(e for e in OUTSIDE if e != "outside")
+"""Those that no generic term is either."""
 ALONE = tuple(e for e in SIZES if e not in CARRIERS and e not in OUTSIDE)
 
 
@@ -137,8 +140,8 @@ SCALES = {
     "hub_stiffness.upper": "stiffness", "hub_stiffness.lower": "stiffness",
     "imu_lever_arm.x": "length", "imu_lever_arm.y": "length", "imu_lever_arm.z": "length",
     "outside.heading_moment": "roll", "outside_patch.lift": "weight",
-    "outside_product.moment": "roll", "outside_cable.moment": "yaw",
-    "outside_stall.moment": "roll", "outside_cross.moment": "roll",
+    "outside_sector.moment": "roll", "outside_resonance.moment": "roll",
+    "outside_cable.moment": "yaw", "outside_stall.moment": "roll", "outside_wake.moment": "roll",
 }  # fmt: skip
 """Parameter -> what its size goes with; any other is the same on every vehicle."""
 
@@ -148,8 +151,9 @@ class PlannedFlight:
     """One flight of the study.
 
     effects: name -> parameter -> size. gusts: the generator's usual air; `air`: fields of another one.
-    arm: the class of tests that it belongs to, if any. size: factor on the effects' usual sizes.
-    craft: a name of the generator's, or "drawn" from the seed. pilot: a name of the generator's.
+    arm: the class of tests that it belongs to, if any.
+    craft: a name of the generator's; or from the seed, "drawn", or "spread": the paper's vehicle, not
+        quite as its file says. pilot: a name of the generator's.
     card_noise: factor by which the card's noise is wrong; None: the card has none. longest: s of a run.
     """
 
