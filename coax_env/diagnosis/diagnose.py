@@ -55,6 +55,12 @@ from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 
+TURN = 2.0 * math.pi
+SONAR = frozenset({"sonar_tilt", "sonar_scale", "sonar_delay"})
+"""Effects of a height that is an echo's."""
+OF_POSITION = frozenset({"frame_yaw", "marker_offset", "pose_delay", "position_spring"})
+"""Effects that only a measured position shows."""
+
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -219,10 +225,8 @@ def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple
         if name not in effects.CATALOGUE:
             known = ", ".join(effects.CATALOGUE)
             raise InputError(f"no effect {name!r} to exclude; the catalogue has {known}")
-    absent = set(exclude) | set(vehicle.effects)
+    absent = set(exclude) | set(vehicle.effects) | _without_sensor(flight)
     absent.add("battery_sag" if _voltage_varies(flight) else "battery_voltage")
-    if "pn" in flight.channels:  # height then comes with the position, not from a sonar
-        absent |= {"sonar_tilt", "sonar_scale", "sonar_delay"}
     return tuple(
         e
         for e, entry in effects.CATALOGUE.items()
@@ -250,6 +254,30 @@ def stated(flight: Flight) -> dict[str, float]:
     if not logged:
         return {}
     return {"battery_voltage.nominal": round(float(np.mean(np.concatenate(logged))), 1)}
+
+
+def _without_sensor(flight: Flight) -> frozenset[str]:
+    """Effects of readings that the flight does not have, or that another effect stands for.
+
+    Where a position is aboard, the height comes with it; where no gyro is either, so does the attitude.
+    Without a position a late attitude and a late pose are one effect.
+    """
+    tracked, gyros = {"pn", "pe"} <= set(flight.channels), {"p", "q", "r"} & set(flight.channels)
+    absent = SONAR if tracked else OF_POSITION
+    if tracked and not gyros:
+        absent |= {"attitude_delay", "magnetic_field"}
+    return absent if _turns(flight) else absent | {"magnetic_field"}
+
+
+def _turns(flight: Flight) -> bool:
+    """Whether the headings of all runs together cover more than a quarter turn."""
+    headings = [run.measured["psi"] for run in flight.runs if "psi" in run.measured]
+    if not headings:
+        return False
+    around = np.sort(np.mod(np.concatenate(headings), TURN))
+    around = around[np.isfinite(around)]
+    gaps = np.diff(around, append=around[:1] + TURN)
+    return bool(gaps.size) and TURN - float(gaps.max()) > TURN / 4.0
 
 
 def _without_vibration(
