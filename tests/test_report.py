@@ -578,6 +578,7 @@ AT_HOVER = [
     ("rotor_drag", {"coefficient": 4e-4}, {"u": 1.0}, "u", lambda found: -found[0]),
     ("airframe_drag", {"area_x": 0.02}, {"u": 3.0}, "u", lambda found: -found[0]),
     ("airframe_drag", {"area_y": 0.01}, {"v": 3.0}, "v", lambda found: -found[1]),
+    ("position_spring", {"stiffness": 0.2}, {"x": 1.0}, "u", lambda found: -found[0]),
     ("yaw_damping", {"coefficient": 4e-3}, {"r": np.pi / 2}, "r", lambda found: -np.radians(found[0])),
     ("rate_damping", {"coefficient": 4e-3}, {"p": np.pi / 2}, "p", lambda found: -np.radians(found[0])),
     ("rate_damping", {"coefficient": 4e-3}, {"q": np.pi / 2}, "q", lambda found: -np.radians(found[1])),

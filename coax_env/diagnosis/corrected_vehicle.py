@@ -14,6 +14,7 @@ from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter, Record
 from coax_env.logs.flight import Flight
+from coax_env.model.effects import CATALOGUE
 from coax_env.model.vehicle import Parameter, Vehicle
 
 
@@ -57,6 +58,13 @@ def corrected_vehicle(
         source,
         flight,
     )
+    stated = {
+        f"{e}.{p.name}": Parameter(fit.values[f"{e}.{p.name}"], 0.0, p.unit, source)
+        for e in fit.active
+        for p in CATALOGUE[e].parameters
+        if p.held
+    }
+    vehicle = vehicle.with_parameters(stated)
     if line:
         amplitude = Parameter(line.amplitude, line.std, "m/s2", source)
         vehicle = vehicle.with_parameters({"vibration.amplitude": amplitude})

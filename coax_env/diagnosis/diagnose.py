@@ -55,6 +55,12 @@ from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 
+TURN = 2.0 * math.pi
+SONAR = frozenset({"sonar_tilt", "sonar_scale", "sonar_delay"})
+"""Effects of a height that is an echo's."""
+OF_POSITION = frozenset({"frame_yaw", "marker_offset", "pose_delay", "position_spring"})
+"""Effects that only a measured position shows."""
+
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -122,7 +128,7 @@ def diagnose(
     flight = flown_parts(flight, vehicle)
     line, calm, calm_vehicle = _without_vibration(flight, vehicle, exclude)
     new_line = line if "vibration" not in vehicle.effects else None
-    model = HeliModel(vehicle)
+    model = HeliModel(vehicle, stated(flight))
     noise = starting_noise(calm, calm_vehicle)
     candidates = namable(exclude, vehicle, flight)
     report = progress or (lambda text: None)
@@ -205,6 +211,8 @@ def diagnose(
 def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:
     """Effects that may be named: not excluded, not in the vehicle yet, and with their sensor aboard.
 
+    Of sag by time and by voltage the one, of what goes by another's name the other.
+
     Args:
         exclude: effects of the catalogue.
         vehicle: as given.
@@ -217,10 +225,59 @@ def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple
         if name not in effects.CATALOGUE:
             known = ", ".join(effects.CATALOGUE)
             raise InputError(f"no effect {name!r} to exclude; the catalogue has {known}")
-    absent = set(exclude) | set(vehicle.effects)
-    if "pn" in flight.channels:  # height then comes with the position, not from a sonar
-        absent |= {"sonar_tilt", "sonar_scale", "sonar_delay"}
-    return tuple(e for e, entry in effects.CATALOGUE.items() if e not in absent and not entry.line)
+    absent = set(exclude) | set(vehicle.effects) | _without_sensor(flight)
+    absent.add("battery_sag" if _voltage_varies(flight) else "battery_voltage")
+    return tuple(
+        e
+        for e, entry in effects.CATALOGUE.items()
+        if e not in absent and not entry.line and not entry.named_as
+    )
+
+
+VARYING = 0.1
+"""Volts from the lowest to the highest battery voltage, more than a reading's noise; ours."""
+
+
+def _voltage_varies(flight: Flight) -> bool:
+    """Whether the flight's battery is logged and its voltage shows more than noise."""
+    logged = [run.battery for run in flight.runs if run.battery is not None]
+    return bool(logged) and float(np.ptp(np.concatenate(logged))) > VARYING
+
+
+def stated(flight: Flight) -> dict[str, float]:
+    """Values that effects take from a flight as stated: the nominal voltage is the mean, to 0.1 V.
+
+    Whatever the nominal, the thrust coefficients take it up: only its distance from the flight's own
+    voltages matters, for how well the two can be told apart.
+    """
+    logged = [run.battery for run in flight.runs if run.battery is not None]
+    if not logged:
+        return {}
+    return {"battery_voltage.nominal": round(float(np.mean(np.concatenate(logged))), 1)}
+
+
+def _without_sensor(flight: Flight) -> frozenset[str]:
+    """Effects of readings that the flight does not have, or that another effect stands for.
+
+    Where a position is aboard, the height comes with it; where no gyro is either, so does the attitude.
+    Without a position a late attitude and a late pose are one effect.
+    """
+    tracked, gyros = {"pn", "pe"} <= set(flight.channels), {"p", "q", "r"} & set(flight.channels)
+    absent = SONAR if tracked else OF_POSITION
+    if tracked and not gyros:
+        absent |= {"attitude_delay", "magnetic_field"}
+    return absent if _turns(flight) else absent | {"magnetic_field"}
+
+
+def _turns(flight: Flight) -> bool:
+    """Whether the headings of all runs together cover more than a quarter turn."""
+    headings = [run.measured["psi"] for run in flight.runs if "psi" in run.measured]
+    if not headings:
+        return False
+    around = np.sort(np.mod(np.concatenate(headings), TURN))
+    around = around[np.isfinite(around)]
+    gaps = np.diff(around, append=around[:1] + TURN)
+    return bool(gaps.size) and TURN - float(gaps.max()) > TURN / 4.0
 
 
 def _without_vibration(

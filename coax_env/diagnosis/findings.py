@@ -44,7 +44,7 @@ def causes(
     dt = median_step(problem.engine.records)
     entries: list[dict[str, Any]] = []
     for effect in fit.active:
-        own = zip(problem.own[effect], effects.CATALOGUE[effect].parameters, strict=True)
+        own = zip(problem.own[effect], effects.CATALOGUE[effect].fitted, strict=True)
         entries.append(
             {
                 "effect": effect,
@@ -58,7 +58,7 @@ def causes(
                     for f, p in own
                 },
                 "evidence": evidence[effect].nats,
-                "confusable_with": list(found[effect]),
+                "confusable_with": [*found[effect], *effects.found_by_the_name_of(effect)],
                 "channels": channels_of(problem, fit, quadratic, effect),
                 **trust[effect].entries(),
             }

@@ -87,14 +87,14 @@ def _fair_share(
     free = [f for group in own.values() for f in group]
     values = {**model.bare_values, **{f.name: f.value for f in free}}
     passes, lin = Engine(model, records).linearise(values, noise, free)
-    information = np.einsum("rkk->rk", lin.information)
+    runs = tuple(dict.fromkeys(r.whole for r in records))
+    of_run = np.array([[float(r.whole == run) for r in records] for run in runs])
+    information = of_run @ np.einsum("rkk->rk", lin.information)
     ends = np.cumsum([0, *(len(group) for group in own.values())])
     groups = [information[:, a:b] for a, b in pairwise(ends)]
-    groups += excitation(model, values, passes).values()
-    runs = list(dict.fromkeys(r.whole for r in records))
-    of_run = np.array([[float(r.whole == run) for r in records] for run in runs])
-    shares, weights = _shares([of_run @ group for group in groups])
-    seconds = of_run @ [r.t[-1] - r.t[0] for r in records]
+    groups += [of_run @ moved for moved in excitation(model, values, passes).values()]
+    shares, weights = _shares(groups)
+    seconds = of_run @ np.array([r.t[-1] - r.t[0] for r in records])
     return [runs[i] for i in fair_part(shares, weights, seconds / seconds.sum())]
 
 

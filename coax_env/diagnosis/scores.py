@@ -96,7 +96,7 @@ def is_large(problem: Problem, effect: str, values: Mapping[str, float]) -> bool
     entry = effects.CATALOGUE[effect]
     sizes = [
         abs(values[full] - p.off) / p.smallest
-        for full, p in zip(entry.names(), entry.parameters, strict=True)
+        for full, p in zip(entry.names(), problem.model.sized(effect), strict=True)
         if p.smallest > 0.0
     ]
     for base in entry.replaces:

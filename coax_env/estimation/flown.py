@@ -122,6 +122,7 @@ def _part(run: Run, rows: np.ndarray, name: str) -> Run:
         measured={c: values[rows] for c, values in run.measured.items()},
         part_of=run.whole,
         began=run.beginning,
+        battery=None if run.battery is None else run.battery[rows],
     )
 
 

@@ -12,7 +12,8 @@ class FreeParameter:
     """A number the engine may change.
 
     ``value`` is the prior's mean and ``std`` its width; ``probe`` the finite step used for its
-    signature (0: a small one, for the derivative). ``reading_only``: it never moves the state.
+    signature near that mean (0: a small one, for the derivative). ``reading_only``: it never moves the
+    state.
     """
 
     name: str
@@ -33,7 +34,7 @@ class Record:
     origin: time at which the run began, also where the record is a part of it.
     run: name of the run of which it is a part; empty where it is a run itself.
     input_innovations: (n, k) what each command shows beyond the readings before it, or None
-    (input_innovations.py).
+    (input_innovations.py). battery: (n,) its voltage [V], or None.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Record:
     origin: float = 0.0
     input_innovations: np.ndarray | None = None
     run: str = ""
+    battery: np.ndarray | None = None
 
     @property
     def whole(self) -> str:
@@ -52,14 +54,17 @@ class Record:
 
 def part(record: Record, rows: np.ndarray) -> Record:
     """Some rows of a record, its clock kept."""
+
+    def of(values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None else values[rows]
+
     return replace(
         record,
         t=record.t[rows],
         command=record.command[rows],
         z=record.z[rows],
-        input_innovations=None
-        if record.input_innovations is None
-        else record.input_innovations[rows],
+        input_innovations=of(record.input_innovations),
+        battery=of(record.battery),
     )
 
 

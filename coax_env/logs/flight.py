@@ -21,7 +21,7 @@ from coax_env.files import read_bytes, staged_folder, write_text
 from coax_env.logs.card import CARD, Card, read_card
 from coax_env.logs.csv_log import read_csv
 from coax_env.logs.repairs import repaired
-from coax_env.logs.units import ROTOR_COMMANDS, SWASH_COMMANDS
+from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
 
@@ -37,6 +37,7 @@ class Run:
         measured: channel -> (n,) readings in the contract's units, NaN where there is no new one.
         part_of: the card's run of which it is a part (estimation/flown.py); empty where it is whole.
         began: time at which that one began [s]; None: with the first row.
+        battery: (n,) voltage, the last sample held [V]; None where none was logged.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Run:
     note: str = ""
     part_of: str = ""
     began: float | None = None
+    battery: np.ndarray | None = None
 
     @property
     def whole(self) -> str:
@@ -138,7 +140,15 @@ def read_flight(path: str | Path) -> Flight:
         unread |= dict.fromkeys(log.unknown)
         data = repaired(log, card.noise, counts, card.holds)
         runs.append(
-            Run(entry.name, data.t, data.command, data.measured, entry.maneuver, entry.note)
+            Run(
+                entry.name,
+                data.t,
+                data.command,
+                data.measured,
+                entry.maneuver,
+                entry.note,
+                battery=data.battery,
+            )
         )
     _check_columns(folder, card, renamed, unread)
     return Flight(
@@ -215,6 +225,9 @@ def _csv_text(run: Run) -> str:
     header = ["t", *ROTOR_COMMANDS, *SWASH_COMMANDS]
     to_log = (RPM_PER_RAD_S, RPM_PER_RAD_S, 1.0, 1.0)
     columns += [[f"{x:.12g}" for x in run.command[:, i] * to_log[i]] for i in range(4)]
+    if run.battery is not None:
+        header.append(BATTERY)
+        columns.append([f"{x:.9g}" for x in run.battery.tolist()])
     for channel in CHANNELS:
         if channel in run.measured:
             header.append(channel)

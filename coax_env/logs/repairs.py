@@ -15,7 +15,7 @@ from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
 from coax_env.logs.held import repeats
 from coax_env.logs.outliers import find_leaps, find_outliers
 from coax_env.logs.packets import broken_packets
-from coax_env.logs.units import ROTOR_COMMANDS, SWASH_COMMANDS
+from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
 SHORTEST_RUN = 2.0
@@ -35,11 +35,12 @@ _MEASURED_ROTOR = ("rpm_upper", "rpm_lower")
 
 @dataclass(frozen=True)
 class Repaired:
-    """A run's data as a flight has them: `Run.t`, `Run.command` and `Run.measured` (flight.py)."""
+    """A run's data as a flight has them: the fields of `Run` (flight.py)."""
 
     t: np.ndarray
     command: np.ndarray
     measured: Mapping[str, np.ndarray]
+    battery: np.ndarray | None
 
 
 def repaired(
@@ -79,7 +80,7 @@ def repaired(
     command, driving = _commands(log, data, measured, counts)
     measured = {c: values for c, values in measured.items() if c not in driving}
     _count_gaps(t, measured, counts)
-    return Repaired(t, command, measured)
+    return Repaired(t, command, measured, _battery(data))
 
 
 # --- time ------------------------------------------------------------------------------------
@@ -266,6 +267,14 @@ def _commands(
             tilt = np.zeros(len(data["t"]))
         columns.append(hold_last(tilt))
     return np.column_stack(columns), driving
+
+
+def _battery(data: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Battery voltage (n,) [V], the last sample held; None where none was logged."""
+    voltage = data.get(BATTERY)
+    if voltage is None or np.isnan(voltage).all():
+        return None
+    return hold_last(voltage)
 
 
 def hold_last(values: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from coax_env.model import effects
+from coax_env.model.usual_sizes import sized_for
 from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import (
     and_list,
@@ -45,7 +46,7 @@ def cause_sections(findings: Findings, bare: Vehicle, corrected: Vehicle) -> lis
     if not causes:
         nothing = prose("No effect of the catalogue is named: these flights show none.")
         return [Section("The causes", [nothing, alarms])]
-    rows = [row for k, cause in enumerate(causes) for row in _rows(k, cause)]
+    rows = [row for k, cause in enumerate(causes) for row in _rows(k, cause, bare)]
     header = ["parameter", "value", "std", "95 % interval", "unit", "usual size"]
     numbers = [
         prose(
@@ -121,10 +122,11 @@ def _plain_list(names: list[str]) -> str:
     return and_list([plain(name) for name in names])
 
 
-def _rows(index: int, cause: Mapping[str, Any]) -> list[list[str]]:
+def _rows(index: int, cause: Mapping[str, Any], vehicle: Vehicle) -> list[list[str]]:
     """A cause's parameters in a table."""
-    entry = effects.CATALOGUE.get(cause["effect"])
-    usual = {f"{entry.name}.{p.name}": p.usual for p in entry.parameters} if entry else {}
+    effect = cause["effect"]
+    sized = sized_for(vehicle, effect) if effect in effects.CATALOGUE else ()
+    usual = {f"{effect}.{p.name}": p.usual for p in sized}
     result = []
     for name, p in cause["parameters"].items():
         place, value, std = f"causes/{index}/parameters/{name}", p["value"], p["std"]
