@@ -19,7 +19,7 @@ from coax_env.model import state as S
 from coax_env.model.dynamics import WORK_SIZE, full_state, hover_trim, measure, step
 from coax_env.model.dynamics import measure_bare as measure_any
 from coax_env.model.dynamics import step_bare as step_any
-from coax_env.model.layout import N_CHANNELS, N_INPUTS
+from coax_env.model.layout import N_CHANNELS, N_FULL, N_INPUTS
 
 LAMA = coax_env.load_vehicle("lama400d")
 
@@ -166,7 +166,7 @@ def test_each_lane_flies_and_measures_as_one_helicopter(seed):
     _measure_registers(x, u, p, work, readings)
     for j in range(SIMD_WIDTH):
         one = [np.ascontiguousarray(a[:, j]) for a in (x, u, p)]
-        expected, measured = np.empty(26), np.empty(N_CHANNELS)
+        expected, measured = np.empty(N_FULL), np.empty(N_CHANNELS)
         step(one[0], one[1], 0.01, one[2], np.zeros(WORK_SIZE), expected)
         measure(*one, np.zeros(WORK_SIZE), measured)
         assert flown[:, j] == pytest.approx(expected, rel=1e-12, abs=1e-12)
