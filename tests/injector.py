@@ -44,6 +44,7 @@ from injector_craft import (
 )
 from injector_sensors import SENSORS, Sensors, blunt, card_text, clock, csv_text, thin
 from numba import njit
+from scipy.spatial.transform import Rotation
 
 RPM = 30.0 / math.pi
 STEP, SUBSTEPS = 0.01, 5
@@ -118,6 +119,22 @@ class Hidden(NamedTuple):
     sonar_tilt: float = 0.0
     sonar_delay: float = 0.0
     vibration: float = 0.0
+    upper_blowback: float = 0.0
+    coupling: float = 0.0
+    tether: float = 0.0
+    tether_north: float = 0.0
+    tether_east: float = 0.0
+    pose_delay: float = 0.0
+    attitude_delay: float = 0.0
+    marker_x: float = 0.0
+    marker_y: float = 0.0
+    marker_z: float = 0.0
+    frame_yaw: float = 0.0
+    iron_x: float = 0.0
+    iron_y: float = 0.0
+    gyro_scale_x: float = 0.0
+    gyro_scale_y: float = 0.0
+    gyro_scale_z: float = 0.0
     heading_moment: float = 0.0
     patch_lift: float = 0.0
     sector_moment: float = 0.0
@@ -177,6 +194,21 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
     "sonar_tilt": {"on": ("sonar_tilt", 1.0)},
     "sonar_delay": {"time": ("sonar_delay", 0.12)},
     "vibration": {"amplitude": ("vibration", 0.5)},
+    "upper_blowback": {"gain": ("upper_blowback", 0.0075)},
+    "gyroscopic_coupling": {"gain": ("coupling", 1.0)},
+    "position_spring": {
+        "stiffness": ("tether", 0.15), "north": ("tether_north", 0.8), "east": ("tether_east", -0.5)
+    },
+    "pose_delay": {"time": ("pose_delay", 0.04)},
+    "attitude_delay": {"time": ("attitude_delay", 0.03)},
+    "marker_offset": {
+        "x": ("marker_x", 0.04), "y": ("marker_y", -0.03), "z": ("marker_z", -0.06)
+    },
+    "frame_yaw": {"angle": ("frame_yaw", 0.15)},
+    "magnetic_field": {"x": ("iron_x", 0.08), "y": ("iron_y", -0.06)},
+    "gyro_scale": {
+        "x": ("gyro_scale_x", 0.06), "y": ("gyro_scale_y", -0.05), "z": ("gyro_scale_z", 0.08)
+    },
     # in no catalogue: M = a sin(3 psi), which a generic term is
     "outside": {"heading_moment": ("heading_moment", 0.02)},
     # and what no generic term is: pitch moment in one sector of the heading
@@ -200,6 +232,8 @@ OTHER_FORM = frozenset({"ground_effect.gain", "airframe_drag.area_x", "airframe_
                         "servo_rate.limit",
                         "motor_droop.upper", "motor_droop.lower",
                         "servo_play.width", "servo_deadband.width",
+                        "position_spring.stiffness", "position_spring.north",
+                        "position_spring.east", "upper_blowback.gain",
                         "outside.heading_moment", "outside_patch.lift", "outside_sector.moment",
                         "outside_resonance.moment", "outside_cable.moment",
                         "outside_stall.moment", "outside_wake.moment"})  # fmt: skip
@@ -360,6 +394,9 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     # discs
     alpha_l, beta_l = s[13], s[14]
     alpha_u, beta_u = craft.bar_lon * s[15], craft.bar_lat * s[16]
+    slide = hidden.upper_blowback / math.sqrt(1.0 + (air[0] ** 2 + air[1] ** 2) / 64.0)
+    alpha_u += slide * air[0]
+    beta_u -= slide * air[1]
     F_u = _thrust_vector(thrust_u, alpha_u, beta_u)
     F_l = _thrust_vector(thrust_l, alpha_l, beta_l)
     moment = _cross(np.array([0.0, 0.0, -craft.hub_upper]), F_u)
@@ -387,6 +424,9 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     moment[1] -= hidden.rate_damping * omega[1] * (0.8 + 0.4 * abs(omega[1]))
     moment[2] -= hidden.yaw_damping * omega[2] * (0.85 + 0.15 * abs(omega[2]))
     moment[2] += torque_u - torque_l
+    cable = np.array([hidden.tether_north - s[0], hidden.tether_east - s[1], 0.0])
+    stretch = math.sqrt(1.0 + (cable[0] ** 2 + cable[1] ** 2) / 900.0)
+    force += hidden.tether / stretch * (R.T @ cable)
     force += push[:3]
     force += R.T @ push[10:13]
     moment += push[3:6]
@@ -401,6 +441,9 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     moment[2] += hidden.spin_up * (upper * ds[17] - craft.rotor_lower * ds[18])
 
     # rigid body; the paper's rotational equations have no omega x I omega
+    turned = np.array([craft.inertia_x, craft.inertia_y, craft.inertia_z])
+    turned[2] *= 1.0 + hidden.yaw_inertia
+    moment -= hidden.coupling * _cross(omega, turned * omega)
     H = craft.rotor_lower * wl - upper * wu
     moment -= _cross(omega, np.array([0.0, 0.0, H]))
     out[0:3] = force / (craft.mass + hidden.added_mass)
@@ -889,12 +932,15 @@ def _fly_run(
     columns["rpm_upper_cmd"], columns["rpm_lower_cmd"] = RPM * commands[first:, :2].T
     columns["rpm_upper"], columns["rpm_lower"] = RPM * logged[:, :2].T
     columns["delta_lon"], columns["delta_lat"] = commands[first:, 2:].T
-    for i, channel in enumerate(("p", "q", "r", "ax", "ay", "az", "phi", "theta", "psi")):
+    for i, channel in enumerate(("p", "q", "r", "ax", "ay", "az")):
         columns[channel] = logged[:, 2 + i]
-    past = _late_rows(first, rows, hidden.sonar_delay, sensors.step)
+    past = _late_rows(first, rows, hidden.attitude_delay + hidden.pose_delay, sensors.step)
+    columns["phi"], columns["theta"], columns["psi"] = readings[past, 8:11].T
+    past = _late_rows(first, rows, hidden.sonar_delay + hidden.pose_delay, sensors.step)
     columns["h"] = -readings[past, 13] * (1.0 + hidden.sonar_tilt * (1.0 / logged[:, 17] - 1.0))
     columns["vn"], columns["ve"], columns["vd"] = logged[:, 14:17].T
-    columns["pn"], columns["pe"] = logged[:, 11:13].T
+    past = _late_rows(first, rows, hidden.pose_delay, sensors.step)
+    columns["pn"], columns["pe"] = readings[past, 11:13].T
     if hidden.per_volt > 0.0:
         product = commands[first:, 0] * commands[first:, 1]
         rotors = rotors_of(craft)
@@ -937,6 +983,17 @@ def _read(
     columns: dict[str, np.ndarray], sensors: Sensors, hidden: Hidden, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
     """What the sensors make of the truth; channels that they lack are left out."""
+    _misplace(columns, hidden)
+    if (
+        hidden.iron_x or hidden.iron_y
+    ):  # a compass between magnets: level, the field it points along
+        ahead, right = (
+            np.cos(columns["psi"]) + hidden.iron_x,
+            hidden.iron_y - np.sin(columns["psi"]),
+        )
+        columns["psi"] = np.arctan2(-right, ahead)
+    for i, axis in enumerate("xyz"):
+        columns["pqr"[i]] = columns["pqr"[i]] * (1.0 + getattr(hidden, f"gyro_scale_{axis}"))
     for first, x, y in (("p", "q", "r"), ("ax", "ay", "az")):  # turned axes: Rodrigues, both triads
         turned = _turn(np.stack([columns[c] for c in (first, x, y)]), hidden.tilt_x, hidden.tilt_y)
         columns[first], columns[x], columns[y] = turned
@@ -956,6 +1013,23 @@ def _read(
     blunt(columns, sensors, rng)
     columns["psi"] = (columns["psi"] + np.pi) % (2.0 * np.pi) - np.pi
     return {c: x for c, x in columns.items() if c in COMMANDED or c in sensors.noise}
+
+
+def _misplace(columns: dict[str, np.ndarray], hidden: Hidden) -> None:
+    """Place and velocity of the markers, attitude in their axes, in place."""
+    arm = [hidden.marker_x, hidden.marker_y, hidden.marker_z]
+    if not any(arm) and not hidden.frame_yaw:
+        return
+    angles = ("psi", "theta", "phi")
+    body = Rotation.from_euler("ZYX", np.stack([columns[c] for c in angles], axis=-1))
+    shift = body.apply(arm) * [1.0, 1.0, -1.0]
+    for i, (place, speed) in enumerate((("pn", "vn"), ("pe", "ve"), ("h", "vd"))):
+        columns[place] = columns[place] + shift[:, i]
+        sign = -1.0 if place == "h" else 1.0
+        columns[speed] = columns[speed] + sign * np.gradient(shift[:, i], columns["t"])
+    seen = body * Rotation.from_euler("z", hidden.frame_yaw)
+    for channel, values in zip(angles, seen.as_euler("ZYX").T, strict=True):
+        columns[channel] = values
 
 
 def _turn(vectors: np.ndarray, tilt_x: float, tilt_y: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from coax_env.estimation import helicopter_noise
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
 from coax_env.logs.flight import Run
-from coax_env.model import dynamics, effects
+from coax_env.model import dynamics, effects, usual_sizes
 from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
@@ -127,6 +127,7 @@ class HeliModel:
         """Of a vehicle; ``held``: values that effects which it does not have would take as stated."""
         self.vehicle = vehicle
         self.bare_values = {**(held or {}), **vehicle.values()}
+        self.size_ratios = usual_sizes.ratios(vehicle)
 
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """Parameter vector of the vehicle with some values changed, effects included.
@@ -204,8 +205,11 @@ class HeliModel:
             if p.std > 0.0 and name not in HELD
         ]
 
-    @staticmethod
-    def effect_parameters(effect: str) -> list[FreeParameter]:
+    def sized(self, effect: str) -> tuple[effects.EffectParameter, ...]:
+        """An effect's parameters with their sizes on this vehicle, generic groups' too."""
+        return usual_sizes.scaled(effects.GROUPS[effect].parameters, self.size_ratios)
+
+    def effect_parameters(self, effect: str) -> list[FreeParameter]:
         """An effect's parameters that may be fitted; the prior is centred on its off-value.
 
         Nothing is taken to be more than MOST_USUAL_SIZES usual sizes: beyond that it is another effect.
@@ -221,7 +225,8 @@ class HeliModel:
                 p.probe,
                 entry.stage == effects.SENSOR,
             )
-            for p in entry.fitted
+            for p in self.sized(effect)
+            if not p.held
         ]
 
 
@@ -251,4 +256,6 @@ def record_of(run: Run) -> Record:
     z = np.full((run.t.size, len(CHANNELS)), np.nan)
     for channel, values in run.measured.items():
         z[:, CHANNELS.index(channel)] = values
-    return Record(run.name, run.t, run.command, z, origin=float(run.t[0]), battery=run.battery)
+    return Record(
+        run.name, run.t, run.command, z, origin=run.beginning, run=run.whole, battery=run.battery
+    )

@@ -32,6 +32,7 @@ class Record:
     t: (n,) seconds, increasing. command: (n, k), held from each row to the next.
     z: (n, m) readings in the order of the model's channels, NaN where there is no new sample.
     origin: time at which the run began, also where the record is a part of it.
+    run: name of the run of which it is a part; empty where it is a run itself.
     input_innovations: (n, k) what each command shows beyond the readings before it, or None
     (input_innovations.py). battery: (n,) its voltage [V], or None.
     """
@@ -42,7 +43,13 @@ class Record:
     z: np.ndarray
     origin: float = 0.0
     input_innovations: np.ndarray | None = None
+    run: str = ""
     battery: np.ndarray | None = None
+
+    @property
+    def whole(self) -> str:
+        """Name of the run that it is, or is a part of."""
+        return self.run or self.name
 
 
 def part(record: Record, rows: np.ndarray) -> Record:

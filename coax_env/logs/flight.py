@@ -35,6 +35,8 @@ class Run:
         t: (n,) time, strictly increasing [s].
         command: (n, 4) omega_u, omega_l [rad/s], delta_lon, delta_lat [rad], without holes.
         measured: channel -> (n,) readings in the contract's units, NaN where there is no new one.
+        part_of: the card's run of which it is a part (estimation/flown.py); empty where it is whole.
+        began: time at which that one began [s]; None: with the first row.
         battery: (n,) voltage, the last sample held [V]; None where none was logged.
     """
 
@@ -44,7 +46,19 @@ class Run:
     measured: Mapping[str, np.ndarray]
     maneuver: str = ""
     note: str = ""
+    part_of: str = ""
+    began: float | None = None
     battery: np.ndarray | None = None
+
+    @property
+    def whole(self) -> str:
+        """Name of the card's run."""
+        return self.part_of or self.name
+
+    @property
+    def beginning(self) -> float:
+        """Time at which the card's run began [s]."""
+        return float(self.t[0]) if self.began is None else self.began
 
     @property
     def duration(self) -> float:
@@ -87,16 +101,16 @@ class Flight:
         return tuple(c for c in CHANNELS if any(c in run.measured for run in self.runs))
 
     def run(self, name: str) -> Run:
-        """The run of that name."""
+        """The run of that name, or its first part."""
         for run in self.runs:
-            if run.name == name:
+            if name in (run.name, run.whole):
                 return run
         raise InputError(f"no run {name!r} in this flight; it has {', '.join(self.run_names)}")
 
     def select(self, names: Iterable[str]) -> "Flight":
-        """The same flight with these runs only, in the flight's own order."""
-        wanted = {self.run(name).name for name in names}
-        return replace(self, runs=tuple(run for run in self.runs if run.name in wanted))
+        """The same flight with these runs only, all parts of each, in the flight's own order."""
+        wanted = {self.run(name) and name for name in names}
+        return replace(self, runs=tuple(run for run in self.runs if wanted & {run.name, run.whole}))
 
 
 # --- reading ---------------------------------------------------------------------------------
@@ -124,7 +138,7 @@ def read_flight(path: str | Path) -> Flight:
         hashes[entry.file] = _hash(file)
         renamed |= log.renamed
         unread |= dict.fromkeys(log.unknown)
-        data = repaired(log, card.noise, counts)
+        data = repaired(log, card.noise, counts, card.holds)
         runs.append(
             Run(
                 entry.name,
@@ -133,7 +147,7 @@ def read_flight(path: str | Path) -> Flight:
                 data.measured,
                 entry.maneuver,
                 entry.note,
-                data.battery,
+                battery=data.battery,
             )
         )
     _check_columns(folder, card, renamed, unread)

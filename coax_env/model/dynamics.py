@@ -105,6 +105,8 @@ def _properties(x, u, p, f):
     f[F.OMEGA_U_DOT] = 0.0
     f[F.OMEGA_L_DOT] = 0.0
     if WITH_EFFECTS:
+        f[F.LON_STEP] = u[U.DELTA_LON] - x[S.SWASH_LON]
+        f[F.LAT_STEP] = u[U.DELTA_LAT] - x[S.SWASH_LAT]
         f[F.BATTERY] = u[U.BATTERY]
         f[F.SPEED_SHARE_U] = f[F.SPEED_SHARE_L] = f[F.SPEED_SCALE] = 1.0
         f[F.SPEED_REST_U] = f[F.SPEED_REST_L] = 0.0
@@ -285,6 +287,8 @@ def _rates_in_flight(x, p, f, dx):
     radius = p[P.ROTOR_RADIUS]
     download = f[F.THRUST_U] * area / (4.0 * math.pi * radius * radius)
 
+    if WITH_EFFECTS:
+        f[F.ROTOR_X], f[F.ROTOR_Y], f[F.ROTOR_Z] = x_u + x_l, y_u + y_l, z_u + z_l
     gust = f[F.MASS] / p[P.GUST_MASS]
     f[F.FORCE_X] = x_u + x_l + gust * x[S.GUST_X]
     f[F.FORCE_Y] = y_u + y_l + gust * x[S.GUST_Y]

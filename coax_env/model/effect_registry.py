@@ -37,6 +37,9 @@ class EffectParameter:
     acts only once the effect itself does; ``timing``: a lag or delay of the command; ``probe``: finite
     step for the signature where the effect has no slope at its off-value; ``held``: is stated, never
     fitted, and does not act alone.
+
+    Sizes, bounds and probe are lama400d's. ``scale`` says with what of the vehicle they grow on
+    another machine, ``"weight * arm / rotor_speed"`` say (usual_sizes.py); empty: they do not.
     """
 
     name: str
@@ -50,6 +53,7 @@ class EffectParameter:
     timing: bool = False
     probe: float = 0.0
     held: bool = False
+    scale: str = ""
 
     def at(self, share: float) -> float:
         """The value so many usual sizes from the off-value, on the side that the bounds leave."""

@@ -19,6 +19,7 @@ from coax_env.model.layout import N_CHANNELS
     SPEED_SCALE,  # rotor speed reached per speed asked for [1]
     SERVO_PLAY, SERVO_DEADBAND,  # [rad]
     SERVO_RATE,  # most that the plate's tilt changes [rad/s]; 0: no limit
+    LON_STEP, LAT_STEP,  # by how much this row moves the swash plate's command on [rad]
     OMEGA_U, OMEGA_L, OMEGA_U_DOT, OMEGA_L_DOT,
     DELTA_LON, DELTA_LAT,  # swash plate tilt as the rotor feels it
     INFLOW_TIME, HOVER_U, HOVER_L,  # [s], [rad/s]; where an effect needs them
@@ -29,11 +30,12 @@ from coax_env.model.layout import N_CHANNELS
     # loads
     ALPHA_U, BETA_U, ALPHA_L, BETA_L,  # tilt of the two discs
     THRUST_U, THRUST_L, TORQUE_U, TORQUE_L,
+    ROTOR_X, ROTOR_Y, ROTOR_Z,  # force of both rotors
     FORCE_X, FORCE_Y, FORCE_Z,  # all but gravity
     MOMENT_X, MOMENT_Y, MOMENT_Z,
     # rates of change
     ALPHA_L_DOT, BETA_L_DOT,
     P_DOT, Q_DOT, R_DOT,
     READING,  # first of the N_CHANNELS sensor readings
-) = range(63)  # fmt: skip
+) = range(68)  # fmt: skip
 N_FLOW = READING + N_CHANNELS

@@ -212,6 +212,20 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
     "flap_blowback": [
         _own("the lower disc tilts back by {} at 1 m/s", "°", "gain", math.degrees(1.0)),
     ],
+    "upper_blowback": [
+        _own("the upper disc tilts back by {} at 1 m/s", "°", "gain", math.degrees(1.0)),
+    ],
+    "gyroscopic_coupling": [
+        Consequence("{} of the body's own gyroscopic moment acts on it", "%",
+                    lambda e, v: 100.0 * e["gain"]),
+    ],
+    "position_spring": [
+        Consequence("a metre beside its anchor it is pulled back by {}", "m/s²",
+                    lambda e, v: e["stiffness"] / v["mass"]),
+        _own("the anchor lies {} north of the origin", "mm", "north", 1000.0,
+             "the anchor lies {} south of the origin"),
+        _own("{} east of it", "mm", "east", 1000.0, "{} west of it"),
+    ],
     "yaw_damping": [
         Consequence(f"a turn at {TURN_RATE:g}°/s is braked by {{}}", "°/s²",
                     _turn_damping("inertia_zz")),
@@ -235,6 +249,24 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
         Consequence("{} of the torque that speeds a rotor up turns the body", "%",
                     lambda e, v: 100.0 * e["gain"]),
     ],
+    "pose_delay": [_own("position and attitude readings are {} late", "ms", "time", 1000.0)],
+    "attitude_delay": [_own("the attitude readings are {} late", "ms", "time", 1000.0)],
+    "marker_offset": [
+        _own("the tracked point lies {} ahead of the centre of gravity", "mm", "x", 1000.0,
+             "the tracked point lies {} behind the centre of gravity"),
+        _own("{} to its right", "mm", "y", 1000.0, "{} to its left"),
+        _own("{} below it", "mm", "z", 1000.0, "{} above it"),
+    ],
+    "frame_yaw": [
+        _own("the markers' axes are turned by {} to the right about the mast", "°", "angle",
+             math.degrees(1.0), "the markers' axes are turned by {} to the left about the mast"),
+    ],
+    "magnetic_field": [
+        Consequence("as it turns, the heading reads up to {} too high and too low", "°",
+                    lambda e, v: math.degrees(math.asin(min(math.hypot(e["x"], e["y"]), 1.0)))),
+    ],
+    "gyro_scale": _axes("the AXIS gyro reads {} too high", "the AXIS gyro reads {} too low",
+                        "%", 100.0, x="roll", y="pitch", z="yaw"),
     "imu_lever_arm": [
         _own("the accelerometers sit {} ahead of the centre of gravity", "mm", "x", 1000.0,
              "the accelerometers sit {} behind the centre of gravity"),
