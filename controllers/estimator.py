@@ -204,16 +204,14 @@ def design_estimator(
 def delay_as_lag(vehicle: Vehicle) -> Vehicle:
     """The commands' pure delays, which have no finite state, added to the actuators' lags instead."""
     values = vehicle.values()
-    late, swash_later = (max(values.get(f"{name}.time", 0.0), 0.0) for name in DELAYS)
+    late, swash_later = (max(values.get(name, 0.0), 0.0) for name in DELAYS)
     for name, delay in (("motor_lag", late), ("servo_lag", late + swash_later)):
         if delay > 0.0:
             own = [p.name for p in CATALOGUE[name].parameters]
             lags = {k: values.get(f"{name}.{k}", 0.0) + delay for k in own}
             vehicle = vehicle.with_effect(name, **lags)
-    on = [name for name in DELAYS if values.get(f"{name}.time", 0.0) > 0.0]
-    for name in on:
-        vehicle = vehicle.with_effect(name, time=0.0)
-    return vehicle
+    on = {name: 0.0 for name in DELAYS if values.get(name, 0.0) > 0.0}
+    return vehicle.with_values(on) if on else vehicle
 
 
 def integrated_readings(design: EstimatorDesign) -> dict[str, float]:

@@ -5,6 +5,7 @@ Each against a closed form first; then hidden in flights by other code in anothe
 
 import math
 from collections.abc import Callable, Collection
+from dataclasses import replace
 
 import injector
 import numpy as np
@@ -279,6 +280,15 @@ def test_the_nominal_voltage_is_the_flights_and_nothing_else_is_fitted():
     flight = logged(np.linspace(12.4, 11.84, 400))
     assert stated(flight) == {"battery_voltage.nominal": 12.1}
     assert stated(logged(None)) == {}
+    (run,) = flight.runs
+    rng = np.random.default_rng(2)
+    speeds = run.command * (1.0 + 0.07 * (run.battery[:, None] - 11.5))
+    seen = {
+        name: 30.0 / math.pi * speeds[:, k] + 5.0 * rng.standard_normal(400)
+        for k, name in enumerate(("rpm_upper", "rpm_lower"))
+    }
+    measured = replace(flight, runs=(replace(run, measured=seen),))
+    assert stated(measured)["battery_voltage.nominal"] == pytest.approx(11.5, abs=0.03)
     model = HeliModel(LAMA, stated(flight))
     assert [f.name for f in model.effect_parameters("battery_voltage")] == [
         "battery_voltage.per_volt"
@@ -437,7 +447,6 @@ def test_a_hidden_actuator_effect_is_found_and_nothing_else(effect):
 IN_THE_INJECTOR = {
     "battery": {"battery_voltage": {}},
     "inflow": {"dynamic_inflow": {}},
-    "phase": {"swash_phase": {"angle": -0.2, "per_rpm": 3e-4}},
     "radio and servo": {"command_delay": {}, "servo_lag": {}},
 }
 """Hidden by the independent simulator, whose forms are others too."""

@@ -242,7 +242,8 @@ def usual(effect: str) -> coax_env.Vehicle:
 
 def flown_by_hand(x, commands, k, delays, begin, p, work) -> np.ndarray:
     """Fly row k in place: commands arrive `delays` later, (rotors', plate's); what holds at the end."""
-    turns = sorted({0.0, DT, *(math.fmod(delay + 1e-12, DT) for delay in delays)})
+    rests = (delay - math.floor(delay / DT + 1e-9) * DT for delay in delays)
+    turns = sorted({0.0, DT, *(rest if rest > 1e-9 else 0.0 for rest in rests)})
     for first, last in pairwise(turns):
         held = np.empty(4)
         for columns, delay in ((slice(0, 2), delays[0]), (slice(2, 4), delays[1])):

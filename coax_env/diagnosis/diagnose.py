@@ -51,7 +51,7 @@ from coax_env.estimation.state_space import Record
 from coax_env.estimation.whiteness import Whiteness, whiteness
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model import effects
-from coax_env.model.layout import CHANNELS
+from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 
@@ -238,6 +238,10 @@ VARYING = 0.1
 """Volts from the lowest to the highest battery voltage, more than a reading's noise; ours."""
 
 
+FARTHEST = 0.5
+"""Share of the mean voltage that a nominal one may be away from it; ours."""
+
+
 def _voltage_varies(flight: Flight) -> bool:
     """Whether the flight's battery is logged and its voltage shows more than noise."""
     logged = [run.battery for run in flight.runs if run.battery is not None]
@@ -245,15 +249,36 @@ def _voltage_varies(flight: Flight) -> bool:
 
 
 def stated(flight: Flight) -> dict[str, float]:
-    """Values that effects take from a flight as stated: the nominal voltage is the mean, to 0.1 V.
+    """Values that effects take from a flight as stated: the battery's nominal voltage.
 
-    Whatever the nominal, the thrust coefficients take it up: only its distance from the flight's own
-    voltages matters, for how well the two can be told apart.
+    Where a rotor's speed is measured, the voltage at which it is what was commanded, by a line through
+    speed over command against voltage; else the mean, to 0.1 V: thrust coefficients take up the rest.
     """
     logged = [run.battery for run in flight.runs if run.battery is not None]
     if not logged:
         return {}
-    return {"battery_voltage.nominal": round(float(np.mean(np.concatenate(logged))), 1)}
+    mean = float(np.mean(np.concatenate(logged)))
+    nominal = round(mean, 1)
+    volts, ratio = _followed(flight)
+    if len(volts) and _voltage_varies(flight):
+        slope, at_mean = np.polyfit(volts - mean, ratio, 1)
+        if slope > 0.0 and abs(1.0 - at_mean) < FARTHEST * mean * slope:
+            nominal = mean + float((1.0 - at_mean) / slope)
+    return {"battery_voltage.nominal": nominal}
+
+
+def _followed(flight: Flight) -> tuple[np.ndarray, np.ndarray]:
+    """Battery voltages [V], and measured over commanded rotor speeds at them, (n,) each."""
+    volts, ratio = [np.empty(0)], [np.empty(0)]
+    for run in flight.runs:
+        for k, channel in enumerate(("rpm_upper", "rpm_lower")):
+            if run.battery is None or channel not in run.measured:
+                continue
+            command = run.command[:, k] * RPM_PER_RAD_S
+            read = np.isfinite(run.measured[channel]) & (command > 0.0)
+            volts.append(run.battery[read])
+            ratio.append(run.measured[channel][read] / command[read])
+    return np.concatenate(volts), np.concatenate(ratio)
 
 
 def _without_sensor(flight: Flight) -> frozenset[str]:

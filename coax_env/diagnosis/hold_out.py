@@ -14,9 +14,10 @@ from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.state_space import Noise, Record, part
 
 FAIR_SHARE = 0.25  # of the information on each effect that should be held out (contract: a quarter)
-MOST_LOST = 0.7  # share of it beyond which the rest no longer determines the effect; ours
+MOST_LOST = 0.6  # share of it beyond which the rest no longer determines the effect; ours
 LEAST_SEEN = 0.1  # share below which its gain cannot be measured on the held-out runs; ours
 UNFAIR = 10.0  # what one of those costs, in squared shares; ours
+UNDETERMINED = 1000.0  # and what is lost beyond MOST_LOST: every effect stays excited (contract); ours
 MOST_TIME = 1.0 / 3.0  # of the flown time that is held out at most; ours
 LEAST_FAIRER = 1e-9  # squared shares by which an exchange must be fairer: beyond rounding
 
@@ -120,7 +121,8 @@ def fair_part(shares: np.ndarray, weights: np.ndarray, seconds: np.ndarray) -> l
     def unfairness(chosen: Sequence[int]) -> float:
         held = shares[list(chosen)].sum(0)
         lost, unseen = np.maximum(held - MOST_LOST, 0.0), np.maximum(LEAST_SEEN - held, 0.0)
-        return float(weights @ ((held - FAIR_SHARE) ** 2 + UNFAIR * (lost + unseen)))
+        costs = (held - FAIR_SHARE) ** 2 + UNFAIR * unseen + UNDETERMINED * lost
+        return float(weights @ costs)
 
     def allowed(chosen: Sequence[int]) -> bool:
         return seconds[list(chosen)].sum() <= MOST_TIME

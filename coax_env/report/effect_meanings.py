@@ -193,7 +193,7 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
                lambda e, v: -e["gain"] * _upper_thrust_share(v)),
     ],
     "dynamic_inflow": [
-        _own("the inflow follows a change of rotor speed in {}", "ms", "time", 1000.0),
+        _own("the air through the rotors follows a change of their speed in {}", "ms", "time", 1000.0),
     ],
     "thrust_exponent": [
         Consequence("thrust goes as rotor speed to the power {}", "",
