@@ -24,7 +24,7 @@ def corrected_vehicle(
     quadratic: Quadratic,
     held: Sequence[Record],
     inflations: Mapping[str, float],
-    line: Line | None,
+    lines: Sequence[Line],
     flight: Flight,
 ) -> Vehicle:
     """The vehicle with the causes in it.
@@ -34,7 +34,7 @@ def corrected_vehicle(
         quadratic: linearised at the fit.
         held: runs that were held out; they are used now.
         inflations: variance inflation, by effect.
-        line: of a vibration that the vehicle file does not have.
+        lines: of a vibration that the vehicle file does not have.
         flight: what is recorded as the source.
     """
     free = problem.free(fit.active)
@@ -65,10 +65,13 @@ def corrected_vehicle(
         if p.held
     }
     vehicle = vehicle.with_parameters(stated)
-    if line:
-        amplitude = Parameter(line.amplitude, line.std, "m/s2", source)
-        vehicle = vehicle.with_parameters({"vibration.amplitude": amplitude})
-    return vehicle
+    units = {p.name: p.unit for p in CATALOGUE["vibration"].parameters}
+    return vehicle.with_parameters(
+        {
+            f"vibration.{line.kind}": Parameter(line.amplitude, line.std, units[line.kind], source)
+            for line in lines
+        }
+    )
 
 
 def with_held_out(

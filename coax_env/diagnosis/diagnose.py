@@ -126,8 +126,8 @@ def diagnose(
     flight.select(hold_out or ())
     check_hold_out(hold_out, flight.run_names)
     flight = flown_parts(flight, vehicle)
-    line, calm, calm_vehicle = _without_vibration(flight, vehicle, exclude)
-    new_line = line if "vibration" not in vehicle.effects else None
+    lines, calm, calm_vehicle = _without_vibration(flight, vehicle, exclude)
+    new_lines = lines if "vibration" not in vehicle.effects else ()
     model = HeliModel(vehicle, stated(flight))
     noise = starting_noise(calm, calm_vehicle)
     candidates = namable(exclude, vehicle, flight)
@@ -156,7 +156,7 @@ def diagnose(
     found = confounding.alternatives(problem, fit, quadratic, evidence, white["after"])
     report("asking left-out runs, halves and other noise whether the names hold")
     trust = trusts(problem, fit, quadratic, evidence, found, white["after"])
-    causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_line)
+    causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)
     unexplained = described + findings.unexplained(white["after"], speaking_for)
@@ -168,7 +168,7 @@ def diagnose(
     report("refitting the corrected model on everything")
     inflations = {e: weighed.inflation for e, weighed in evidence.items()}
     inflations |= unlisted.inflations(problem, fit, quadratic, terms)
-    corrected = corrected_vehicle(problem, fit, quadratic, held, inflations, new_line, flight)
+    corrected = corrected_vehicle(problem, fit, quadratic, held, inflations, new_lines, flight)
     alarms = calibrated(settings.evidence, class_of(flight, vehicle, fit))
     by_evidence = [c["effect"] for c in causes if c["effect"] in found]
     design = confounding.separating_maneuver(problem, fit, quadratic, found, by_evidence, flight)
@@ -198,7 +198,7 @@ def diagnose(
         remarks=(
             *flight.notes,
             *double_counting(flight, vehicle),
-            *([vibration_removed(line)] if line else []),
+            *([vibration_removed(lines)] if lines else []),
             *remarks(problem, fit, quadratic, found),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
             *check.remarks,
@@ -307,12 +307,12 @@ def _turns(flight: Flight) -> bool:
 
 def _without_vibration(
     flight: Flight, vehicle: Vehicle, exclude: Collection[str]
-) -> tuple[vibration.Line | None, Flight, Vehicle]:
-    """The line at rotor speed, if there is one, and flight and vehicle without it."""
-    line = vibration.find(flight) if "vibration" not in exclude else None
-    if line is None:
-        return None, flight, vehicle
-    return line, vibration.taken_out(flight, line), vibration.without(vehicle)
+) -> tuple[tuple[vibration.Line, ...], Flight, Vehicle]:
+    """The lines at rotor speed, if there are some, and flight and vehicle without them."""
+    lines = vibration.find(flight) if "vibration" not in exclude else ()
+    if not lines:
+        return (), flight, vehicle
+    return lines, vibration.taken_out(flight, lines), vibration.without(vehicle)
 
 
 def _gain(

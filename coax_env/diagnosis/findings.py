@@ -27,7 +27,7 @@ def causes(
     evidence: Mapping[str, Evidence],
     found: Alternatives,
     trust: Mapping[str, Trust],
-    line: Line | None,
+    lines: Sequence[Line],
 ) -> list[dict[str, Any]]:
     """The causes: those that are sure before those that are doubtful, each strongest first.
 
@@ -37,7 +37,7 @@ def causes(
         evidence: of each cause.
         found: the confounded alternatives of each cause.
         trust: what speaks for and against each name.
-        line: of a vibration that the vehicle file does not have.
+        lines: of a vibration that the vehicle file does not have.
     """
     free = problem.free_names(fit.active)
     std = dict(zip(free, np.sqrt(np.diag(quadratic.covariance(free))), strict=True))
@@ -63,8 +63,8 @@ def causes(
                 **trust[effect].entries(),
             }
         )
-    if line:
-        entries.append(_vibration(line))
+    if lines:
+        entries.append(_vibration(lines))
     return sorted(entries, key=lambda c: (c["trust"] != "sure", -c["evidence"]))
 
 
@@ -84,16 +84,24 @@ def stated_std(
     return with_timing(parameter, std * math.sqrt(inflation) * ratio, dt)
 
 
-def _vibration(line: Line) -> dict[str, Any]:
-    """The cause that is found by its line and not by a signature."""
-    value = {"value": line.amplitude, "std": line.std, "unit": "m/s2", "determined": True}
+def _vibration(lines: Sequence[Line]) -> dict[str, Any]:
+    """The cause that is found by its lines and not by a signature."""
+    units = {p.name: p.unit for p in effects.CATALOGUE["vibration"].parameters}
     return {
         "effect": "vibration",
-        "parameters": {"vibration.amplitude": value},
-        "evidence": line.evidence,
+        "parameters": {
+            f"vibration.{line.kind}": {
+                "value": line.amplitude,
+                "std": line.std,
+                "unit": units[line.kind],
+                "determined": True,
+            }
+            for line in lines
+        },
+        "evidence": sum(line.evidence for line in lines),
         "confusable_with": [],
-        "channels": list(line.channels),
-        **of_line(line).entries(),
+        "channels": [c for line in lines for c in line.channels],
+        **of_line(max(lines, key=lambda line: line.evidence)).entries(),
     }
 
 

@@ -13,6 +13,7 @@ from coax_env.estimation.helicopter_noise import WHITE_LEVELS
 from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
+from coax_env.model.effects import CATALOGUE
 from coax_env.plain_words import and_list, channel_name
 
 
@@ -31,11 +32,15 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
     ]
 
 
-def vibration_removed(line: Line) -> str:
-    """That a vibration was taken out of the accelerometers."""
+def vibration_removed(lines: Sequence[Line]) -> str:
+    """That a vibration was taken out of the readings."""
+    units = {p.name: p.unit for p in CATALOGUE["vibration"].parameters}
+    sizes = ", ".join(
+        f"{' '.join(line.channels)} by {line.amplitude:.2g} {units[line.kind]}" for line in lines
+    )
     return (
-        f"the accelerometers vibrate at the {line.rotor} rotor's speed by {line.amplitude:.2g} m/s2:"
-        " that line was taken out of their readings before anything else was looked for"
+        f"the body shakes at the {lines[0].rotor} rotor's speed: {sizes};"
+        " that line was taken out of these readings before anything else was looked for"
     )
 
 

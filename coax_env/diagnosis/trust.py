@@ -128,7 +128,7 @@ def of_line(line: Line, chosen: Settings = SETTINGS) -> Trust:
         tuple(name for name, part in zip(runs, rest, strict=True) if not returns(part)),
     )
     doubts = tuple(on_parts(of_parts, len(runs), chosen))
-    return Trust(True, of_parts.runs, of_parts.kept, {"vibration.amplitude": True}, doubts)
+    return Trust(True, of_parts.runs, of_parts.kept, {f"vibration.{line.kind}": True}, doubts)
 
 
 def determined(

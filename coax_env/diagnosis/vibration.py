@@ -1,4 +1,4 @@
-"""Vibration: a line at rotor speed, and its aliases, in the accelerometers.
+"""Vibration: a line at rotor speed, and its aliases, in what the body shakes.
 
 Its phase drifts with every error of the rotor speed, so it has no signature over a run as other
 effects have. It is looked for in the readings themselves, order-tracked: in segments of a second the
@@ -6,11 +6,13 @@ readings are fitted with sine and cosine of the rotor's azimuth, the phase free 
 of the samples, so that aliases need no thought (Fyfe and Munck 1997 for the order tracking; the
 least-squares periodogram of Lomb 1976 for uneven times). The power there is compared with that at
 neighbouring frequencies of the same segments: noise that is merely louder than assumed is louder
-there too, and is no vibration.
+there too, and is no vibration. Where no rotor speed is measured, the commanded one is taken, times the
+one factor near 1 with which the line is strongest.
 
 This comes before the search. A line of usual size would make every accelerometer reading look several
-sigmas off, and something else would be blamed for it; so it is taken out of the readings first,
-segment by segment, and the search sees what is left.
+sigmas off, and something else would be blamed for it; in a tracked pose, whose noise is far below the
+shaking, it would colour every innovation of attitude and height. So it is taken out of the readings
+first, segment by segment, and the search sees what is left.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,11 +21,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.helicopter_noise import SHAKEN
 from coax_env.logs.flight import Flight, Run
 from coax_env.model.effects import CATALOGUE
+from coax_env.model.layout import ANGLES
 from coax_env.model.vehicle import Vehicle
 
-ACCELEROMETERS = ("ax", "ay", "az")
+KINDS = {
+    kind: tuple(c for c in SHAKEN if SHAKEN[c] == kind) for kind in dict.fromkeys(SHAKEN.values())
+}
+"""Parameter of the effect -> channels that share it as their root mean square."""
 ROTORS = ("upper", "lower")
 SEGMENT = 1.0  # s
 LEAST_SAMPLES = 12  # of a channel in a segment
@@ -32,18 +39,23 @@ NEIGHBOURS = (-5.0, -4.0, -3.0, -2.0, 2.0, 3.0, 4.0, 5.0)
 """Frequencies beside the line [Hz]; those nearer than 1 Hz to the other rotor's are left out."""
 SMEAR = 0.01
 """Part of the amplitude that phase errors within a segment and clipped peaks take away (measured)."""
+SLIPS = np.linspace(0.985, 1.015, 13)
+"""Speeds over the commanded ones that are tried where none is measured: a bench line's error; ours."""
 SHOWS = 2.0  # times its neighbours that a line's power must be for a channel to be said to show it
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line found in the accelerometers.
+    """A line found in one kind of channels.
 
-    amplitude: [m/s2], root mean square over the axes, with its std. evidence: nats. channels: where it
-    shows, strongest first. ratios: run -> power over its neighbours', segment by segment.
+    kind: a key of KINDS. rotor: at whose speed, times slip. amplitude: root mean square over the
+    channels, in their unit, with its std. evidence: nats. channels: where it shows, strongest first.
+    ratios: run -> power over its neighbours', segment by segment.
     """
 
+    kind: str
     rotor: str
+    slip: float
     amplitude: float
     std: float
     evidence: float
@@ -55,23 +67,30 @@ class Line:
         return _evidence(ratios) if ratios else 0.0
 
 
-def find(flight: Flight) -> Line | None:
-    """The line at one of the two rotor speeds, where the flight has one that matters."""
-    lines = [line for rotor in ROTORS if (line := _line(flight, rotor))]
-    smallest = CATALOGUE["vibration"].parameters[0].smallest
-    lines = [x for x in lines if x.evidence > SETTINGS.evidence and x.amplitude > smallest]
-    return max(lines, key=lambda x: x.evidence, default=None)
+def find(flight: Flight) -> tuple[Line, ...]:
+    """The lines at one of the two rotor speeds, where the flight has some that matter, by kind."""
+    smallest = {p.name: p.smallest for p in CATALOGUE["vibration"].parameters}
+
+    def of(rotor: str) -> tuple[Line, ...]:
+        lines = (_line(flight, rotor, kind) for kind in KINDS)
+        return tuple(
+            x
+            for x in lines
+            if x and x.evidence > SETTINGS.evidence and x.amplitude > smallest[x.kind]
+        )
+
+    return max(map(of, ROTORS), key=lambda lines: sum(x.evidence for x in lines))
 
 
-def taken_out(flight: Flight, line: Line) -> Flight:
-    """The flight without the line in its accelerometers."""
+def taken_out(flight: Flight, lines: Sequence[Line]) -> Flight:
+    """The flight without the lines in its readings."""
     runs = []
     for run in flight.runs:
         measured = dict(run.measured)
-        for channel in ACCELEROMETERS:
-            if channel in measured:
+        for line in lines:
+            for channel in (c for c in KINDS[line.kind] if c in measured):
                 values = measured[channel].copy()
-                for segment in _segments(run, channel, line.rotor):
+                for segment in _segments(run, channel, line.rotor, line.slip):
                     values[segment.rows] -= segment.line()
                 measured[channel] = values
         runs.append(replace(run, measured=measured))
@@ -124,11 +143,13 @@ class _Segment:
         return waves @ fit[-2:]
 
 
-def _segments(run: Run, channel: str, rotor: str) -> Iterator[_Segment]:
-    speed, other = (_speed(run, r) for r in (rotor, *(r for r in ROTORS if r != rotor)))
+def _segments(run: Run, channel: str, rotor: str, slip: float = 1.0) -> Iterator[_Segment]:
+    speed, other = (slip * _speed(run, r) for r in (rotor, *(r for r in ROTORS if r != rotor)))
     azimuth = np.concatenate([[0.0], np.cumsum(speed[:-1] * np.diff(run.t))])
     values = run.measured[channel]
     there = np.isfinite(values)
+    if channel in ANGLES:
+        values = _unwrapped(values, there)
     which = np.floor((run.t - run.t[0]) / SEGMENT)
     for k in np.unique(which):
         rows = np.flatnonzero((which == k) & there)
@@ -138,39 +159,47 @@ def _segments(run: Run, channel: str, rotor: str) -> Iterator[_Segment]:
             yield _Segment(rows, t, values[rows], azimuth[rows], ahead)
 
 
+def _unwrapped(values: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Angles without jumps of a turn, (n,)."""
+    values = values.copy()
+    values[there] = np.unwrap(values[there])
+    return values
+
+
+def _is_measured(run: Run, rotor: str) -> bool:
+    measured = run.measured.get(f"rpm_{rotor}")
+    return measured is not None and int(np.isfinite(measured).sum()) >= 2
+
+
 def _speed(run: Run, rotor: str) -> np.ndarray:
     """Rotor speed at every row [rad/s]: as measured, else as commanded."""
-    measured = run.measured.get(f"rpm_{rotor}")
-    there = np.isfinite(measured) if measured is not None else np.zeros(0, bool)
-    if measured is None or there.sum() < 2:
+    if not _is_measured(run, rotor):
         return run.command[:, ROTORS.index(rotor)]
+    measured = run.measured[f"rpm_{rotor}"]
+    there = np.isfinite(measured)
     return np.interp(run.t, run.t[there], measured[there]) * (2.0 * np.pi / 60.0)
 
 
 # --- the test ---------------------------------------------------------------------------------------
 
 
-def _line(flight: Flight, rotor: str) -> Line | None:
-    """The line at one rotor's speed, however weak; None without accelerometers."""
-    ratio: dict[str, list[float]] = {
-        c: [] for c in ACCELEROMETERS
-    }  # power over the neighbours' mean
+def _line(flight: Flight, rotor: str, kind: str = "amplitude") -> Line | None:
+    """The line at one rotor's speed in one kind of channels, however weak; None without them."""
+    if all(_is_measured(run, rotor) for run in flight.runs):
+        return _line_at(flight, rotor, kind, 1.0)
+    lines = [_line_at(flight, rotor, kind, float(slip)) for slip in SLIPS]
+    return max((x for x in lines if x), key=lambda x: x.evidence, default=None)
+
+
+def _line_at(flight: Flight, rotor: str, kind: str, slip: float) -> Line | None:
+    """The line at the rotor's speed times a factor."""
+    ratio: dict[str, list[float]] = {c: [] for c in KINDS[kind]}  # power over the neighbours' mean
     squares: list[float] = []  # amplitude squared, by segment and axis
     by_run: dict[str, list[float]] = {run.name: [] for run in flight.runs}
     for run in flight.runs:
-        for channel in (c for c in ACCELEROMETERS if c in run.measured):
-            segments = list(_segments(run, channel, rotor))
-            powers, beside = (
-                [],
-                [],
-            )  # at the rotor's own frequency; beside it, but not at the other's
-            for segment in segments:
-                own, *rest = segment.powers(np.array([0.0, *NEIGHBOURS])).tolist()
-                powers.append(own)
-                beside += [
-                    p for f, p in zip(NEIGHBOURS, rest, strict=True) if abs(f - segment.ahead) > 1.0
-                ]
-            level = float(np.mean(beside)) if beside else 0.0
+        for channel in (c for c in ratio if c in run.measured):
+            segments = list(_segments(run, channel, rotor, slip))
+            powers, level = _powers(segments)
             if level > 0.0:
                 ratio[channel] += [p / level for p in powers]
                 by_run[run.name] += [p / level for p in powers]
@@ -179,13 +208,14 @@ def _line(flight: Flight, rotor: str) -> Line | None:
                 ]
     if len(squares) < 2:
         return None
-    mean = float(np.mean(squares))
-    amplitude = float(np.sqrt(max(mean, 0.0)))
+    amplitude = float(np.sqrt(max(float(np.mean(squares)), 0.0)))
     spread = float(np.std(squares, ddof=1) / np.sqrt(len(squares)))
     std = spread / max(2.0 * amplitude, float(np.sqrt(spread)))
     shown = {c: float(np.mean(r)) for c, r in ratio.items() if r}
     return Line(
+        kind=kind,
         rotor=rotor,
+        slip=slip,
         amplitude=amplitude,
         std=float(np.hypot(std, SMEAR * amplitude)),
         evidence=_evidence([r for own in ratio.values() for r in own]),
@@ -193,6 +223,19 @@ def _line(flight: Flight, rotor: str) -> Line | None:
         or tuple(shown),
         ratios=by_run,
     )
+
+
+def _powers(segments: Sequence[_Segment]) -> tuple[list[float], float]:
+    """Each segment's power at the rotor's own frequency, and the mean power beside it.
+
+    Not where the other rotor's line is.
+    """
+    powers, beside = [], []
+    for segment in segments:
+        own, *rest = segment.powers(np.array([0.0, *NEIGHBOURS])).tolist()
+        powers.append(own)
+        beside += [p for f, p in zip(NEIGHBOURS, rest, strict=True) if abs(f - segment.ahead) > 1.0]
+    return powers, float(np.mean(beside)) if beside else 0.0
 
 
 def _evidence(ratios: Sequence[float]) -> float:

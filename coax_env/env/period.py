@@ -216,8 +216,9 @@ def true_readings(x, u, p, azimuth, work, readings):
         x, u, p, work: as in `fly_period`. azimuth: of the upper rotor [rad].
     """
     measure(x, u, p, work, readings)
-    if p[_VIBRATION] != 0.0:
-        add_vibration(readings, azimuth, p[_VIBRATION])
+    v = _VIBRATION
+    if p[v] + p[v + 1] + p[v + 2] + p[v + 3] != 0.0:  # none is negative
+        add_vibration(readings, azimuth, p[v], p[v + 1], p[v + 2], p[v + 3])
 
 
 @compiled()

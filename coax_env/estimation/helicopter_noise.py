@@ -166,6 +166,14 @@ def with_memories(p: np.ndarray, noise: Noise) -> None:
     p[P.GUST_MEMORIES] = [noise.process.get(name, GUST_MEMORY) for name in MEMORIES]
 
 
+SHAKEN = {
+    **dict.fromkeys(("ax", "ay", "az"), "amplitude"),
+    **dict.fromkeys(("p", "q", "r"), "rate"),
+    **dict.fromkeys(("phi", "theta"), "tilt"),
+    "h": "heave",
+}
+"""Channel -> the parameter of `vibration` that shakes it."""
+
 # --- where it starts ---------------------------------------------------------------------------------
 
 
@@ -182,11 +190,12 @@ def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
     process, floor, ceiling = _starting_process(vehicle)
     prior = dict.fromkeys(MEMORIES, MEMORY_PRIOR)
     prior[ROTOR_LEVEL] = (process[ROTOR_LEVEL], ROTOR_PRIOR_STD)
-    shake = vehicle.values().get("vibration.amplitude", 0.0) / np.sqrt(2.0)
+    own = vehicle.values()
     reading = {}
     for c in flight.channels:
         std = sensor_std(flight, c)
-        reading[c] = float(np.hypot(std, shake if c in ("ax", "ay", "az") else 0.0))
+        shake = own.get(f"vibration.{SHAKEN[c]}", 0.0) if c in SHAKEN else 0.0
+        reading[c] = float(np.hypot(std, shake / np.sqrt(2.0)))
         prior[c] = (reading[c], CARD_PRIOR_STD if c in flight.noise else SCATTER_PRIOR_STD)
         floor[c], ceiling[c] = reading[c] / READING_RANGE, reading[c] * READING_RANGE
     return Noise(process, reading, floor, ceiling, prior)

@@ -77,9 +77,9 @@ class Learnable:
 
 def learnable(flight: Flight, vehicle: Vehicle) -> Learnable:
     """What these flights would determine of effects and own numbers."""
-    line = vibration.find(flight)
-    calm = vibration.taken_out(flight, line) if line else flight
-    model = HeliModel(vibration.without(vehicle) if line else vehicle)
+    lines = vibration.find(flight)
+    calm = vibration.taken_out(flight, lines)
+    model = HeliModel(vibration.without(vehicle) if lines else vehicle)
     records = [record_of(run) for run in calm.runs]
     problem = Problem.of(model, records, namable((), vehicle, flight))
     fit = start(problem, starting_noise(calm, model.vehicle))

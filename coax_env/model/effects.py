@@ -975,12 +975,15 @@ def sonar_delay(x, f, p, e):
 @effect(
     SENSOR,
     EffectParameter("amplitude", "m/s2", usual=0.5, smallest=0.1, lower=0.0),
-    channels="ax ay az",
+    EffectParameter("rate", "rad/s", usual=0.3, smallest=0.05, lower=0.0),
+    EffectParameter("tilt", "rad", usual=2e-3, smallest=2e-4, lower=0.0),
+    EffectParameter("heave", "m", usual=5e-4, smallest=5e-5, lower=0.0),
+    channels="ax ay az p q phi theta h",
     source="a rotor out of balance; a line at its speed and the aliases that sampling makes of it",
     line=True,
 )
 def vibration(x, f, p, e):
-    """The accelerometers shake at rotor speed: readings + amplitude sin(azimuth) (vibration.py)."""
+    """The body shakes at rotor speed: accelerometers, gyros, roll and pitch, height (vibration.py)."""
 
 
 # --- what no list explains --------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from coax_env.model.sensors import BASE_RATE, Sensor
 """Columns of a sensor table. RATE in samples per row, DELAY in rows; FLAG: place of the instrument's
 "new" flag among the readings held, -1 without one."""
 
-_ACCELEROMETER = CHANNELS.index("ax")
+_ACCELEROMETER, _GYRO, _ROLL, _HEIGHT = (CHANNELS.index(c) for c in ("ax", "p", "phi", "h"))
 
 
 def sensor_table(
@@ -50,18 +50,25 @@ def sensor_table(
 
 
 @compiled()
-def add_vibration(readings, azimuth, amplitude):
+def add_vibration(readings, azimuth, amplitude, rate, tilt, heave):
     """Add to a row of readings (18,), in place, what the upper rotor at an azimuth [rad] shakes.
 
-    An unbalance turns with the rotor: a line at rotor speed on every axis (effect `vibration`). An
-    amplitude [m/s2] of zero changes nothing.
+    An unbalance turns with the rotor: a line at rotor speed on every axis (effect `vibration`). What
+    is zero changes nothing.
 
     Args:
-        readings: (18,), in place. azimuth: of the upper rotor [rad]. amplitude: [m/s2].
+        readings: (18,), in place. azimuth: of the upper rotor [rad].
+        amplitude: of the accelerometers [m/s2]. rate: of the gyros [rad/s]. tilt: of roll and pitch
+            [rad]. heave: of the height [m].
     """
-    readings[_ACCELEROMETER] += amplitude * math.sin(azimuth)
-    readings[_ACCELEROMETER + 1] += amplitude * math.cos(azimuth)
-    readings[_ACCELEROMETER + 2] += amplitude * math.sin(azimuth)
+    sine, cosine = math.sin(azimuth), math.cos(azimuth)
+    for first, size in ((_ACCELEROMETER, amplitude), (_GYRO, rate)):
+        readings[first] += size * sine
+        readings[first + 1] += size * cosine
+        readings[first + 2] += size * sine
+    readings[_ROLL] += tilt * sine
+    readings[_ROLL + 1] += tilt * cosine
+    readings[_HEIGHT] += heave * sine
 
 
 @compiled()

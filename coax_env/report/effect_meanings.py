@@ -294,5 +294,10 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
     ],
     "sonar_scale": [_share("the height reads {}", lambda e, v: e["scale"])],
     "sonar_delay": [_own("the height reading is {} late", "ms", "time", 1000.0)],
-    "vibration": [_own("the accelerometers shake by {} to either side", "m/s²", "amplitude")],
+    "vibration": [
+        _own("the accelerometers shake by {} to either side", "m/s²", "amplitude"),
+        _own("the gyros shake by {} to either side", "°/s", "rate", math.degrees(1.0)),
+        _own("roll and pitch shake by {} to either side", "°", "tilt", math.degrees(1.0)),
+        _own("the height shakes by {} to either side", "mm", "heave", 1000.0),
+    ],
 }  # fmt: skip
