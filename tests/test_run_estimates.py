@@ -8,6 +8,8 @@ import pytest
 from coax_env.estimation.quadratic import Linearised
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.identification.maximum_likelihood import _squared_moves, each_run
+from coax_env.identification.undetermined import left_open
+from coax_env.plain_words import plain
 
 NAMES = ("mass", "inertia_zz", "arm_upper")
 WIDTHS = np.array([0.5, 2.0, 1.0])
@@ -94,3 +96,42 @@ def test_moves_are_as_large_as_the_flights_determine_them_to_be():
     half = dict(zip(NAMES, MEANS + 0.5 * WIDTHS, strict=True))
     hardly = _squared_moves(free, half, np.linalg.inv(prior))
     assert hardly == pytest.approx(0.75), "of nothing determined one number's worth is expected"
+
+
+# --- what is left open ----------------------------------------------------------------------------
+
+
+def posterior(free: list[FreeParameter], *seen: tuple[np.ndarray, float]) -> np.ndarray:
+    """Covariance after readings of combinations, weights in units of the priors, with this std."""
+    std = np.array([f.std for f in free])
+    rows = [np.outer(w / std, w / std) / spread**2 for w, spread in seen]
+    return np.linalg.inv(sum(rows) + np.diag(std**-2.0))
+
+
+def test_motion_alone_determines_thrust_over_mass_and_neither():
+    """Their difference is read to a hundredth: their sum keeps its prior, and so do both numbers."""
+    free = [FreeParameter(n, 1.0, s) for n, s in zip(NAMES, WIDTHS, strict=True)]
+    tied, alone = np.array([1.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
+    undetermined, words = left_open(free, posterior(free, (tied, 0.01), (alone, 0.01)))
+    assert undetermined == ("mass", "arm_upper")
+    (one,) = words
+    assert one.endswith(" together") and plain("mass") in one and plain("arm_upper") in one
+    _, words = left_open(free, posterior(free, (np.abs(tied), 0.01), (alone, 0.01)))
+    assert " up with " in words[0] and words[0].endswith(" down")
+
+
+def test_what_all_flights_see_leaves_nothing_open_and_what_none_sees_stays():
+    """A number by itself is named, but is no combination; three quarters of the prior is the line."""
+    free = [FreeParameter(n, 1.0, s) for n, s in zip(NAMES, WIDTHS, strict=True)]
+    axes = np.eye(3)
+    assert left_open(free, posterior(free, *((w, 0.05) for w in axes))) == ((), ())
+    assert left_open(free, posterior(free, (axes[0], 0.05), (axes[2], 0.05))) == (
+        ("inertia_zz",),
+        (),
+    )
+    for kept, named in ((0.72, ()), (0.78, ("mass",))):
+        spread = kept / np.sqrt(
+            1.0 - kept**2
+        )  # of a reading that leaves so much of the prior's std
+        seen = [(axes[0], spread), (axes[1], 0.05), (axes[2], 0.05)]
+        assert left_open(free, posterior(free, *seen)) == (named, ())
