@@ -37,14 +37,13 @@ from coax_env.model.layout import (
     GUSTS,
     LOWER_FLAP,
     N_COMMANDS,
-    N_FULL,
     PLACE,
     RATE,
     ROTOR_SPEED,
     SWASH,
     VELOCITY,
 )
-from coax_env.model.linear import sampled
+from coax_env.model.linear import N_SAMPLED, sampled
 from coax_env.model.sampling import is_new
 from coax_env.model.sensors import BASE_RATE, Sensor, slow_instruments, suite
 from coax_env.model.vehicle import Vehicle
@@ -70,7 +69,7 @@ _PAIRS = (("vn", "ve"), ("pn", "pe"), ("x", "y"))
 """Horizontal pairs, which are turned into the heading before use: the design is for psi = 0."""
 _NAMES = (*(name for name, _ in FULL_STATES), *(f"bias_{name}" for name in BIAS_STD))
 _UNITS = dict(FULL_STATES)
-_BIASES = slice(N_FULL, None)
+_BIASES = slice(N_SAMPLED, None)
 _SPEED = CHANNELS.index("v")  # the unsigned one, not the state
 
 
@@ -163,15 +162,15 @@ def design_estimator(
     used = [s for s in suite(sensors, vehicle) if s.index != _SPEED]  # |V| has no slope at hover
     A_flown, B_flown, C_channels, D_channels, x_trim, u_trim = sampled(delay_as_lag(vehicle), DT)
     A, B = np.eye(len(_NAMES)), np.zeros((len(_NAMES), N_COMMANDS))
-    A[:N_FULL, :N_FULL], B[:N_FULL] = A_flown, B_flown
+    A[:N_SAMPLED, :N_SAMPLED], B[:N_SAMPLED] = A_flown, B_flown
     A[GUSTS, GUSTS] = np.eye(6) * math.exp(-DT / DISTURBANCE_MEMORY)
-    A[N_FULL:, N_FULL:] *= math.exp(-DT / BIAS_MEMORY)
+    A[N_SAMPLED:, N_SAMPLED:] *= math.exp(-DT / BIAS_MEMORY)
     # readings of the channels, then, for the suite ``state``, the states as they are
-    C_all = np.eye(len(CHANNELS) + N_FULL, len(_NAMES), k=-len(CHANNELS))
-    C_all[: len(CHANNELS), :N_FULL] = C_channels
+    C_all = np.eye(len(CHANNELS) + N_SAMPLED, len(_NAMES), k=-len(CHANNELS))
+    C_all[: len(CHANNELS), :N_SAMPLED] = C_channels
     for k, name in enumerate(BIAS_STD):
-        C_all[CHANNELS.index(name), N_FULL + k] = 1.0
-    D_all = np.vstack([D_channels, np.zeros((N_FULL, N_COMMANDS))])
+        C_all[CHANNELS.index(name), N_SAMPLED + k] = 1.0
+    D_all = np.vstack([D_channels, np.zeros((N_SAMPLED, N_COMMANDS))])
     rows = [s.index for s in used]
     y_trim = np.concatenate([_trim_readings(vehicle, x_trim, u_trim), x_trim])[rows]
 

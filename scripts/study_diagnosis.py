@@ -9,7 +9,7 @@ from typing import Any
 
 import command_line
 import numpy as np
-from study import plan, store, table, threshold
+from study import arm_table, arms, plan, store, table, threshold
 from study.one_flight import fly_and_diagnose
 from study.plan import PlannedFlight
 from tqdm import tqdm
@@ -25,10 +25,9 @@ QUICK = {"clean": 8, "effects": 16}
 
 def main() -> None:
     options = parse()
-    runs = None if options.full else plan.RICH
-    flights = plan.plan(options.clean, options.effects, options.seed, runs, options.many)
+    flights = planned(options)
     if options.calibrate:
-        flights = [f for f in flights if f.kind in ("still", "gusty")]
+        flights = [f for f in flights if not f.effects]
     make_folder(options.out)
     command = "scripts/study_diagnosis.py " + shlex.join(sys.argv[1:])
     waiting = store.missing(options.out, flights)
@@ -46,6 +45,23 @@ def main() -> None:
     print((options.out / "table.md").read_text())
 
 
+def planned(options: Any) -> list[PlannedFlight]:
+    """The flights that the command line asks for."""
+    if options.arms:
+        return arms.plan_arms(options.arms, options.clean, options.effects, options.seed)
+    runs = None if options.full else plan.RICH
+    return plan.plan(options.clean, options.effects, options.seed, runs, options.many)
+
+
+def arm_names(text: str) -> list[str]:
+    """Names of arms, by commas, or "all"."""
+    names = list(arms.ARMS) if text == "all" else [name for name in text.split(",") if name]
+    unknown = sorted(set(names) - set(arms.ARMS))
+    if unknown:
+        raise InputError(f"no arm {unknown[0]!r}: there are {', '.join(arms.ARMS)}")
+    return names
+
+
 def parse() -> Any:
     """The command line."""
     parser = command_line.parser("study_diagnosis", __doc__, seed=True)
@@ -55,6 +71,10 @@ def parse() -> Any:
     parser.add_argument(
         "--many", type=int, default=0,
         help=f"gusty flights with up to {plan.MANY} effects each, for the intervals",
+    )  # fmt: skip
+    parser.add_argument(
+        "--arms", default="", metavar="ARM,ARM|all",
+        help="flights of these arms, --clean and --effects of each, instead, without baselines",
     )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="24 flights in all")
     parser.add_argument(
@@ -73,6 +93,7 @@ def parse() -> Any:
     parser.add_argument("--no-baselines", action="store_true", help="the package alone")
     command_line.add_workers(parser, "flights", -1)
     options = parser.parse_args()
+    options.arms = arm_names(options.arms)
     if options.quick:
         options.clean, options.effects = QUICK["clean"], QUICK["effects"]
     counts = (options.clean, options.effects, options.many)
@@ -105,6 +126,11 @@ def write_results(out: Path, rows: list[dict[str, Any]], command: str) -> None:
     Args:
         out: the study's folder. rows: results of flights, failures included. command: that made them.
     """
+    if rows[0]["plan"]["arm"]:
+        write_text(out / "table.md", arm_table.arm_text(rows, command))
+        counted = arm_table.figures(rows)
+        write_json(out / "arms.json", {"command": command, "flights": len(rows), "arms": counted})
+        return
     write_text(out / "table.md", table.table_text(rows, command))
     methods = sorted({m for row in rows for m in row.get("methods", ())})
     write_json(

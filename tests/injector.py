@@ -5,6 +5,20 @@ frame, hub forces as vectors, Heun's method at 2 ms - flown in closed loop by a 
 with effects in other functional forms than the catalogue's wherever two forms are sensible. It
 writes a flight folder as any logger would, and ``truth.json`` beside it for the test to read.
 
+What flies and in what is an input: the vehicle (injector_craft.py), the air (injector_air.py), the
+sensors (injector_sensors.py), the pilot (``PILOTS``).
+
+To hide something new: a field of ``Hidden``, its off-value the default; an entry of ``EFFECTS`` (and of
+``OTHER_FORM`` where its number is another one than the catalogue's); and a line where it acts:
+
+- commands, before motors and servos: ``_acting`` (late ones: ``_late_row``, and ``_is_late``);
+- motors and servos: ``_actuate``, ``_follow_at_once``; a state more: ``N_STATE``;
+- forces, moments, flaps, mass: ``_derivative``;
+- readings of another time: ``_fly_run``, which has all rows, those before the log too (``_late_rows``);
+- what a sensor makes of a reading, and another channel: ``_read``.
+
+Its usual sizes belong in ``scripts/study/plan.py``.
+
     python tests/injector.py DIR --effect ground_effect --effect swash_offset.lon=-0.015 --gusts
 """
 
@@ -16,24 +30,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from injector_air import GUSTS, GUSTY, STILL, Air, disturbances
+from injector_craft import (
+    CRAFTS,
+    LAMA,
+    SHIPPED,
+    Craft,
+    draw,
+    rotors_of,
+    tilt_authority,
+    write_vehicle,
+    yaw_authority,
+)
+from injector_sensors import SENSORS, Sensors, blunt, card_text, clock, csv_text, thin
 from numba import njit
 
-# --- the vehicle: Tables I-VI, C_Dfus 1 -----------------------------------------------------------
-MASS, RADIUS, RHO, GRAVITY = 0.8, 0.25, 1.14, 9.804
-HUB_U, HUB_L = 0.185, 0.105
-I_XX, I_YY, I_ZZ = 5.33e-3, 6.26e-3, 2.50e-3
-J_U, J_L, J_F = 7.66e-4, 7.66e-4, 2.55e-4
-TAU_FLAP, TAU_BAR = 0.05, 3.0
-K_B, K_Q, K_P = 0.91, 0.54, 0.54
-K_T, K_QQ = RHO * math.pi * RADIUS**4, RHO * math.pi * RADIUS**5
-T_U, T_L = 7.18e-3 * K_T, 4.98e-3 * K_T  # T / w^2
-Q_U, Q_L = 5.98e-4 * K_QQ, 5.20e-4 * K_QQ
-DOWNWASH = 0.14 * 0.04 / (4.0 * math.pi * RADIUS**2)  # fuselage load per upper thrust
-_RATIO = math.sqrt(Q_U / Q_L)
-HOVER_U = math.sqrt(MASS * GRAVITY / (T_U * (1.0 - DOWNWASH) + T_L * _RATIO**2))
-HOVER_L = HOVER_U * _RATIO
 RPM = 30.0 / math.pi
-
 STEP, SUBSTEPS = 0.01, 5
 SETTLE = 6.0  # s flown before the log starts
 
@@ -95,6 +107,12 @@ class Hidden(NamedTuple):
     sonar_delay: float = 0.0
     vibration: float = 0.0
     heading_moment: float = 0.0
+    patch_lift: float = 0.0
+    sector_moment: float = 0.0
+    resonance_moment: float = 0.0
+    cable_moment: float = 0.0
+    stall_moment: float = 0.0
+    wake_moment: float = 0.0
 
 
 # effect -> parameter -> (field of Hidden, size where none is given)
@@ -140,20 +158,115 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
     "sonar_tilt": {"on": ("sonar_tilt", 1.0)},
     "sonar_delay": {"time": ("sonar_delay", 0.12)},
     "vibration": {"amplitude": ("vibration", 0.5)},
-    "outside": {"heading_moment": ("heading_moment", 0.02)},  # in no catalogue: M = a sin(3 psi)
+    # in no catalogue: M = a sin(3 psi), which a generic term is
+    "outside": {"heading_moment": ("heading_moment", 0.02)},
+    # and what no generic term is: pitch moment in one sector of the heading
+    "outside_sector": {"moment": ("sector_moment", 0.03)},
+    # lift over a place: half a meter wide, 0.4 m north of where flights begin
+    "outside_patch": {"lift": ("patch_lift", 0.5)},
+    # roll moment near one speed of the upper rotor, which meets a natural frequency there
+    "outside_resonance": {"moment": ("resonance_moment", 0.02)},
+    # yaw moment of a cable that twists and slips (Dahl): it depends on the way there
+    "outside_cable": {"moment": ("cable_moment", 0.006)},
+    # pitch moment that is all there from a slow walk on, and forwards only
+    "outside_stall": {"moment": ("stall_moment", 0.02)},
+    # roll moment of the side speed of a while ago
+    "outside_wake": {"moment": ("wake_moment", 0.015)},
 }  # fmt: skip
 
 OTHER_FORM = frozenset({"ground_effect.gain", "airframe_drag.area_x", "airframe_drag.area_y",
                         "airframe_drag.area_z", "wake_interference.gain",
                         "rate_damping.coefficient", "vibration.amplitude", "battery_sag.rate",
-                        "outside.heading_moment"})  # fmt: skip
+                        "outside.heading_moment", "outside_patch.lift", "outside_sector.moment",
+                        "outside_resonance.moment", "outside_cable.moment",
+                        "outside_stall.moment", "outside_wake.moment"})  # fmt: skip
 """Parameters whose number means something else here than in the catalogue."""
+
+
+# --- pilots -------------------------------------------------------------------------------------
+
+
+class Pilot(NamedTuple):
+    """Gains from what is seen to commands: swash in rad, lift and yaw as shares of the hover speeds.
+
+    home: m/s per m. speed: rad per m/s. tilt, rate: rad per rad, per rad/s. height, climb, turn,
+    yaw_rate: share per m, m/s, rad, rad/s. side_trim, lift_trim, yaw_trim: the same per s, integrals.
+    most_tilt [rad], most_yaw: limits. senses: 1/s, of their lag. delay: s before what is seen is
+    acted on. hold: rows between decisions. tremor_rotor [rad/s], tremor_swash [rad]: std, memory [s].
+    """
+
+    home: float = 0.1
+    speed: float = 0.25
+    tilt: float = 0.4
+    rate: float = 0.05
+    height: float = 0.10
+    climb: float = 0.11
+    turn: float = 0.015
+    yaw_rate: float = 0.017
+    side_trim: float = 0.012
+    lift_trim: float = 0.03
+    yaw_trim: float = 0.006
+    most_tilt: float = 0.08
+    most_yaw: float = 0.06
+    senses: float = 22.0
+    delay: float = 0.0
+    hold: int = 1
+    tremor_rotor: tuple[float, float] = (0.4, 0.12)
+    tremor_swash: tuple[float, float] = (0.003, 0.25)
+
+
+USUAL = Pilot()
+PILOTS = {
+    "usual": USUAL,
+    "stabiliser": Pilot(
+        home=0.3, speed=0.2, tilt=0.5, rate=0.10, height=0.16, climb=0.15, turn=0.03, yaw_rate=0.03,
+        senses=60.0, delay=0.03, hold=2, tremor_rotor=(0.3, 0.05), tremor_swash=(0.002, 0.05),
+    ),
+    "slow_human": Pilot(
+        home=0.06, speed=0.14, tilt=0.22, rate=0.04, height=0.06, climb=0.10, turn=0.009,
+        yaw_rate=0.012, side_trim=0.006, senses=12.0, delay=0.1, tremor_rotor=(0.6, 0.4),
+        tremor_swash=(0.004, 0.5),
+    ),
+}  # fmt: skip
+"""Beside the usual one: a full-state stabiliser at half the rate, 30 ms late; a slow hand."""
+
+
+class Reach(NamedTuple):
+    """What a craft's commands do, against the paper's: factors on the commands that do the same."""
+
+    tilt: float
+    yaw: float
+    speed: float
+
+
+def _reach(craft: Craft) -> Reach:
+    return Reach(
+        tilt_authority(LAMA) / tilt_authority(craft),
+        yaw_authority(LAMA) / yaw_authority(craft),
+        rotors_of(craft).hover_upper / rotors_of(LAMA).hover_upper,
+    )
+
+
+def _suited(pilot: Pilot, craft: Craft) -> Pilot:
+    """The pilot with gains for what a craft's commands do.
+
+    Torques out of balance need the same share of speed on every craft: the trim goes with the root.
+    """
+    tilt, yaw, _ = _reach(craft)
+    return pilot._replace(
+        tilt=tilt * pilot.tilt, rate=tilt * pilot.rate, side_trim=tilt * pilot.side_trim,
+        most_tilt=tilt * pilot.most_tilt, turn=yaw * pilot.turn, yaw_rate=yaw * pilot.yaw_rate,
+        yaw_trim=math.sqrt(yaw) * pilot.yaw_trim, most_yaw=max(yaw, 1.0) * pilot.most_yaw,
+    )  # fmt: skip
 
 
 # --- physics --------------------------------------------------------------------------------------
 # State: 0-2 position, 3-5 velocity (both inertial), 6-9 quaternion body to inertial, 10-12 p q r,
-# 13-16 alpha_l beta_l alpha_f beta_f, 17-18 rotor speeds, 19-20 swash, 21-22 swash rates.
-N_STATE = 23
+# 13-16 alpha_l beta_l alpha_f beta_f, 17-18 rotor speeds, 19-20 swash, 21-22 swash rates, 23 a cable's
+# twist in units of its greatest, 24 side speed as the wake remembers it.
+N_STATE = 25
+CABLE = 0.3  # rad of turn after which a cable slips
+WAKE = 0.8  # s that a wake lasts
 # Out: 0-2 specific force, 3-5 angular acceleration (body axes).
 
 
@@ -188,32 +301,37 @@ def _thrust_vector(thrust, alpha, beta):
 
 
 @njit(cache=True)
-def _derivative(s, command, gust, hidden, out):
-    """ds/dt; ``out`` gets specific force and angular acceleration."""
+def _derivative(s, command, push, hidden, craft, rotors, out):
+    """ds/dt; ``out`` gets specific force and angular acceleration. ``push``: injector_air.py."""
     R = _rotation(s)
     omega = s[10:13]
-    wu, wl = s[17], s[18]
+    wu, wl = s[17] + push[8], s[18] + push[9]
     air = R.T @ (s[3:6] - np.array([hidden.wind_north, hidden.wind_east, 0.0]))
     ds = np.zeros(N_STATE)
 
     # rotors
-    thrust_u = T_U * wu * wu * (1.0 + hidden.thrust_scale) * (wu / HOVER_U) ** hidden.thrust_excess
-    thrust_l = T_L * wl * wl * (1.0 + hidden.thrust_scale) * (wl / HOVER_L) ** hidden.thrust_excess
+    stronger = 1.0 + hidden.thrust_scale
+    thrust_u = rotors.thrust_upper * wu * wu * stronger
+    thrust_l = rotors.thrust_lower * wl * wl * stronger
+    thrust_u *= (wu / rotors.hover_upper) ** hidden.thrust_excess
+    thrust_l *= (wl / rotors.hover_lower) ** hidden.thrust_excess
     thrust_l -= hidden.wake * 0.5 * math.sqrt(thrust_u * thrust_l)
-    height = max(-s[2], 0.4 * RADIUS)
-    rise = 1.0 / (1.0 - hidden.ge_gain * (RADIUS / (4.0 * height)) ** 2)  # Cheeseman-Bennett
+    height = max(-s[2], 0.4 * craft.radius)
+    rise = 1.0 / (1.0 - hidden.ge_gain * (craft.radius / (4.0 * height)) ** 2)  # Cheeseman-Bennett
     rise *= 1.0 + hidden.axial * air[2] / math.sqrt(1.0 + (air[2] / 4.2) ** 2)
+    rise *= 1.0 + push[6]
     thrust_u *= rise
     thrust_l *= rise
-    torque_u = Q_U * wu * wu
-    torque_l = Q_L * wl * wl * (1.0 + hidden.torque_scale)
+    torque_u = rotors.torque_upper * wu * wu * (1.0 + push[7])
+    torque_l = rotors.torque_lower * wl * wl * (1.0 + hidden.torque_scale)
 
     # discs
     alpha_l, beta_l = s[13], s[14]
-    alpha_u, beta_u = K_Q * s[15], K_P * s[16]
+    alpha_u, beta_u = craft.bar_lon * s[15], craft.bar_lat * s[16]
     F_u = _thrust_vector(thrust_u, alpha_u, beta_u)
     F_l = _thrust_vector(thrust_l, alpha_l, beta_l)
-    moment = _cross(np.array([0.0, 0.0, -HUB_U]), F_u) + _cross(np.array([0.0, 0.0, -HUB_L]), F_l)
+    moment = _cross(np.array([0.0, 0.0, -craft.hub_upper]), F_u)
+    moment = moment + _cross(np.array([0.0, 0.0, -craft.hub_lower]), F_l)
     force = F_u + F_l
     centre = np.array([hidden.cg_x, hidden.cg_y, 0.0])
     moment -= _cross(centre, force)
@@ -224,11 +342,12 @@ def _derivative(s, command, gust, hidden, out):
     moment[1] += hidden.stiffness_lower * math.sin(alpha_l)
 
     # fuselage and air
-    force[2] += DOWNWASH * thrust_u
+    force[2] += rotors.downwash * thrust_u
     speed = math.sqrt(air[0] ** 2 + air[1] ** 2 + air[2] ** 2 + 0.3**2)
-    force[0] -= 0.5 * RHO * hidden.area_x * speed * air[0]
-    force[1] -= 0.5 * RHO * hidden.area_y * speed * air[1]
-    force[2] -= 0.5 * RHO * hidden.area_z * speed * air[2]
+    half = 0.5 * craft.density
+    force[0] -= half * hidden.area_x * speed * air[0]
+    force[1] -= half * hidden.area_y * speed * air[1]
+    force[2] -= half * hidden.area_z * speed * air[2]
     disc_drag = 2.0 * hidden.rotor_drag * math.sqrt(wu * wl)
     force[0] -= disc_drag * air[0]
     force[1] -= disc_drag * air[1]
@@ -236,25 +355,29 @@ def _derivative(s, command, gust, hidden, out):
     moment[1] -= hidden.rate_damping * omega[1] * (0.8 + 0.4 * abs(omega[1]))
     moment[2] -= hidden.yaw_damping * omega[2] * (0.85 + 0.15 * abs(omega[2]))
     moment[2] += torque_u - torque_l
-    force += gust[:3]
-    moment += gust[3:]
+    force += push[:3]
+    force += R.T @ push[10:13]
+    moment += push[3:6]
     heading = math.atan2(R[1, 0], R[0, 0])
-    moment[1] += hidden.heading_moment * math.sin(3.0 * heading)
+    _unlisted(s, air, heading, wu / rotors.hover_upper, hidden, force, moment)
+    ds[23] = (omega[2] - abs(omega[2]) * s[23]) / CABLE
+    ds[24] = (air[1] - s[24]) / WAKE
 
     # actuators
     _actuate(s, command, hidden, ds)
-    moment[2] += hidden.spin_up * ((J_U + J_F) * ds[17] - J_L * ds[18])
+    upper = craft.rotor_upper + craft.bar
+    moment[2] += hidden.spin_up * (upper * ds[17] - craft.rotor_lower * ds[18])
 
     # rigid body; the paper's rotational equations have no omega x I omega
-    H = J_L * wl - (J_U + J_F) * wu
+    H = craft.rotor_lower * wl - upper * wu
     moment -= _cross(omega, np.array([0.0, 0.0, H]))
-    out[0:3] = force / (MASS + hidden.added_mass)
-    out[3] = moment[0] / I_XX
-    out[4] = moment[1] / I_YY
-    out[5] = moment[2] / (I_ZZ * (1.0 + hidden.yaw_inertia))
+    out[0:3] = force / (craft.mass + hidden.added_mass)
+    out[3] = moment[0] / craft.inertia_x
+    out[4] = moment[1] / craft.inertia_y
+    out[5] = moment[2] / (craft.inertia_z * (1.0 + hidden.yaw_inertia))
     ds[0:3] = s[3:6]
     ds[3:6] = R @ out[0:3]
-    ds[5] += GRAVITY
+    ds[5] += craft.gravity
     p, q, r = omega[0], omega[1], omega[2]
     ds[6] = 0.5 * (-s[7] * p - s[8] * q - s[9] * r)
     ds[7] = 0.5 * (s[6] * p + s[8] * r - s[9] * q)
@@ -266,14 +389,27 @@ def _derivative(s, command, gust, hidden, out):
     cos, sin = math.cos(hidden.swash_phase), math.sin(hidden.swash_phase)
     lon = cos * s[19] - sin * s[20] + hidden.swash_lon
     lat = sin * s[19] + cos * s[20] + hidden.swash_lat
-    gain = K_B * (1.0 + hidden.swash_gain)
+    gain = craft.swash_gain * (1.0 + hidden.swash_gain)
     back = hidden.blowback / math.sqrt(1.0 + (air[0] ** 2 + air[1] ** 2) / 64.0)
-    ds[13] = (gain * lon - alpha_l + back * air[0]) / TAU_FLAP - q
-    ds[14] = (gain * lat - beta_l - back * air[1]) / TAU_FLAP - p
-    bar = TAU_BAR * (1.0 + hidden.bar_time)
+    ds[13] = (gain * lon - alpha_l + back * air[0]) / craft.flap_time - q
+    ds[14] = (gain * lat - beta_l - back * air[1]) / craft.flap_time - p
+    bar = craft.bar_time * (1.0 + hidden.bar_time)
     ds[15] = -s[15] / bar - q
     ds[16] = -s[16] / bar - p
     return ds
+
+
+@njit(cache=True)
+def _unlisted(s, air, heading, speed, hidden, force, moment):
+    """Adds what is in no catalogue. ``speed``: of the upper rotor, against hover's."""
+    away = ((s[0] - 0.4) ** 2 + s[1] ** 2) / 0.5**2
+    force[2] -= hidden.patch_lift * math.exp(-0.5 * away)
+    moment[0] += hidden.resonance_moment / (1.0 + ((speed - 1.01) / 0.006) ** 2)
+    moment[0] += hidden.wake_moment * s[24]
+    moment[1] += hidden.heading_moment * math.sin(3.0 * heading)
+    moment[1] += hidden.sector_moment * math.exp(6.0 * (math.cos(heading - 2.0) - 1.0))
+    moment[1] += hidden.stall_moment * (0.5 + 0.5 * math.tanh((air[0] - 0.3) / 0.1))
+    moment[2] -= hidden.cable_moment * s[23]
 
 
 @njit(cache=True)
@@ -291,15 +427,17 @@ def _actuate(s, command, hidden, ds):
 
 
 @njit(cache=True)
-def _follow_at_once(s, command, hidden):
+def _follow_at_once(s, command, hidden, craft):
     """Actuators without a lag jump with the command; angular momentum is kept where asked."""
     if hidden.motor_upper == 0.0:
         jump = command[0] - s[17]
-        s[12] += hidden.spin_up * (J_U + J_F) * jump / (I_ZZ * (1.0 + hidden.yaw_inertia))
+        upper = craft.rotor_upper + craft.bar
+        s[12] += hidden.spin_up * upper * jump / (craft.inertia_z * (1.0 + hidden.yaw_inertia))
         s[17] = command[0]
     if hidden.motor_lower == 0.0:
         jump = command[1] - s[18]
-        s[12] -= hidden.spin_up * J_L * jump / (I_ZZ * (1.0 + hidden.yaw_inertia))
+        lower = craft.rotor_lower
+        s[12] -= hidden.spin_up * lower * jump / (craft.inertia_z * (1.0 + hidden.yaw_inertia))
         s[18] = command[1]
     if hidden.servo_lag == 0.0:
         s[19:21] = command[2:4]
@@ -313,12 +451,12 @@ def _euler(R):
 
 
 @njit(cache=True)
-def _pilot(seen, target, memory, trust, swash_gain):
+def _pilot(seen, target, memory, trust, swash_gain, dt, pilot, rotors):
     """Commands from what the pilot sees.
 
     ``seen``: position, velocity (inertial), attitude, rates. ``target``: north, east, height,
     heading and the rate of each. ``memory``: integrals of the errors, forward, right, up, heading.
-    ``trust``: 1 flies on position, 0 keeps attitude only.
+    ``trust``: 1 flies on position, 0 keeps attitude only. ``dt``: s since the last look.
     """
     cos, sin = math.cos(seen[8]), math.sin(seen[8])
     north, east = target[0] - seen[0], target[1] - seen[1]
@@ -326,27 +464,34 @@ def _pilot(seen, target, memory, trust, swash_gain):
     right = -sin * north + cos * east
     u = cos * seen[3] + sin * seen[4]
     v = -sin * seen[3] + cos * seen[4]
-    want_u = 0.1 * forward + cos * target[4] + sin * target[5]
-    want_v = 0.1 * right - sin * target[4] + cos * target[5]
+    want_u = pilot.home * forward + cos * target[4] + sin * target[5]
+    want_v = pilot.home * right - sin * target[4] + cos * target[5]
     turn = _wrap(target[3] - seen[8])
     up = target[2] + seen[2]
     climb = target[6] + seen[5]
     error = np.array([want_u - u, want_v - v, up, turn])
-    limit = np.array([0.08, 0.08, 0.15, 0.15])
-    rate = np.array([0.012, 0.012, 0.03, 0.006])
+    limit = np.array([pilot.most_tilt, pilot.most_tilt, 0.15, 0.15])
+    rate = np.array([pilot.side_trim, pilot.side_trim, pilot.lift_trim, pilot.yaw_trim])
     for i in range(4):
         if i >= 2 or trust > 0.5:
-            memory[i] += STEP * rate[i] * error[i]
+            memory[i] += dt * rate[i] * error[i]
         memory[i] = min(max(memory[i], -limit[i]), limit[i])
-    theta_want = min(max(-0.25 * trust * error[0], -0.3), 0.3)
-    phi_want = min(max(0.25 * trust * error[1], -0.3), 0.3)
-    lon = swash_gain * (0.4 * (theta_want - seen[7]) - 0.05 * seen[10]) - memory[0]
-    lat = swash_gain * (0.4 * (phi_want - seen[6]) - 0.05 * seen[9]) + memory[1]
-    lift = 0.10 * up + 0.11 * climb + memory[2]
+    theta_want = min(max(-pilot.speed * trust * error[0], -0.3), 0.3)
+    phi_want = min(max(pilot.speed * trust * error[1], -0.3), 0.3)
+    lon = pilot.tilt * (theta_want - seen[7]) - pilot.rate * seen[10]
+    lat = pilot.tilt * (phi_want - seen[6]) - pilot.rate * seen[9]
+    lift = pilot.height * up + pilot.climb * climb + memory[2]
     lift = min(max(lift, -0.12), 0.12)
-    yaw = 0.015 * turn + 0.017 * (target[7] - seen[11]) + memory[3]
-    yaw = min(max(yaw, -0.06), 0.06)
-    return np.array([HOVER_U * (1.0 + lift + yaw), HOVER_L * (1.0 + lift - yaw), lon, lat])
+    yaw = pilot.turn * turn + pilot.yaw_rate * (target[7] - seen[11]) + memory[3]
+    yaw = min(max(yaw, -pilot.most_yaw), pilot.most_yaw)
+    return np.array(
+        [
+            rotors.hover_upper * (1.0 + lift + yaw),
+            rotors.hover_lower * (1.0 + lift - yaw),
+            swash_gain * lon - memory[0],
+            swash_gain * lat + memory[1],
+        ]
+    )
 
 
 @njit(cache=True)
@@ -355,96 +500,119 @@ def _wrap(angle):
 
 
 @njit(cache=True)
-def _fly(n, settle, target, trust, extra, tremor, shake, gust_std, gust_memory, hidden):
-    """Fly ``settle + n`` rows; returns the commands and true readings of the last n.
+def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden, craft, rotors):
+    """Fly the rows of a clock; returns the commands and true readings of all of them.
 
     Readings: 0-1 rotor speeds, 2-4 rates, 5-7 accelerometers, 8-10 attitude, 11-13 position,
-    14-16 velocity, 17 heights per row in slant and delayed as the sonar would (height).
-    ``tremor``: (rows, 4) added to the commands; ``shake``: (rows, SUBSTEPS, 6) white, unit.
+    14-16 velocity, 17 cosine of the tilt. ``clock``: (rows,) s, the log begins at 0. ``dt``: (rows,)
+    s to the next row; ``step``: s, what it usually is. ``targets`` (rows, 8), ``trusts`` (rows,):
+    the pilot's. ``extra``, ``tremor``: (rows, 4) added to the commands. ``pushes``:
+    (rows * SUBSTEPS + 1, DISTURBANCES).
     """
-    commands = np.empty((n, 4))
-    readings = np.empty((n, 18))
+    rows = len(clock)
+    commands = np.empty((rows, 4))
+    readings = np.empty((rows, 18))
     s = np.zeros(N_STATE)
-    s[0], s[1], s[2] = target[0, 0], target[0, 1], -target[0, 2]
-    s[6], s[9] = math.cos(target[0, 3] / 2.0), math.sin(target[0, 3] / 2.0)
-    s[17], s[18] = HOVER_U, HOVER_L
-    gust = np.zeros(6)
+    s[0], s[1], s[2] = targets[0, 0], targets[0, 1], -targets[0, 2]
+    s[6], s[9] = math.cos(targets[0, 3] / 2.0), math.sin(targets[0, 3] / 2.0)
+    s[17], s[18] = rotors.hover_upper, rotors.hover_lower
     out = np.zeros(6)
     out2 = np.zeros(6)
     memory = np.zeros(4)
     seen = np.zeros(12)
-    flown = np.zeros((settle + n, 4))
-    sunk = np.zeros(settle + n)
-    h = STEP / SUBSTEPS
-    decay = math.exp(-h / gust_memory)
-    drive = math.sqrt(1.0 - decay * decay)
-    for k in range(settle + n):
-        row = max(k - settle, 0)
+    saw = np.empty((rows, 12))
+    behind = int(round(pilot.delay / step))
+    wanted = np.zeros(4)
+    inertia = craft.inertia_z * (1.0 + hidden.yaw_inertia)
+    for k in range(rows):
         R = _rotation(s)
         attitude = _euler(R)
+        saw[k, 0:6] = s[0:6]
+        saw[k, 6:9] = attitude
+        saw[k, 9:12] = s[10:13]
         if k == 0:
             seen[:3] = s[:3]
             seen[8] = attitude[2]
-        for i in range(3):  # the pilot's own senses lag by 40 ms
-            seen[i] += 0.22 * (s[i] - seen[i])
-            seen[3 + i] += 0.22 * (s[3 + i] - seen[3 + i])
-            seen[6 + i] += 0.22 * _wrap(attitude[i] - seen[6 + i])
-            seen[9 + i] += 0.22 * (s[10 + i] - seen[9 + i])
-        command = _pilot(seen, target[row], memory, trust[row], 0.4 + 0.6 * trust[row])
-        command += tremor[k]
-        if k >= settle:
-            command += extra[row]
+        keen = pilot.senses * dt[k]
+        for i in range(12):  # the pilot's own senses lag
+            error = saw[max(k - behind, 0), i] - seen[i]
+            seen[i] += keen * (_wrap(error) if 6 <= i < 9 else error)
+        trust = trusts[k]
+        if k % pilot.hold == 0:
+            wanted = _pilot(
+                seen,
+                targets[k],
+                memory,
+                trust,
+                0.4 + 0.6 * trust,
+                pilot.hold * dt[k],
+                pilot,
+                rotors,
+            )
+        command = wanted + tremor[k]
+        if clock[k] >= 0.0:
+            command += extra[k]
         # what is logged is what is flown, to the last digit
         command[0] = round(command[0] * RPM * 10.0) / 10.0 / RPM
         command[1] = round(command[1] * RPM * 10.0) / 10.0 / RPM
         command[2] = round(min(max(command[2], -0.25), 0.25) * 1e5) / 1e5
         command[3] = round(min(max(command[3], -0.25), 0.25) * 1e5) / 1e5
-        flown[k] = command
+        commands[k] = command
         rates = s[10:13].copy()  # a gyro does not see the jump of this very instant
-        actual = _delayed(flown, k, 0, hidden)
-        sag = math.exp(-hidden.sag * max(k - settle, 0) * STEP)
-        actual[0] *= sag
-        actual[1] *= sag
-        _follow_at_once(s, actual, hidden)
-        ds = _derivative(s, actual, gust, hidden, out)
-        sunk[k] = -s[2]
-        if k >= settle:
-            commands[row] = command
-            readings[row, 0:2] = s[17:19]
-            readings[row, 2:5] = rates
-            lever = np.array([hidden.lever_x, hidden.lever_y, hidden.lever_z])
-            readings[row, 5:8] = (
-                out[0:3] + _cross(out[3:6], lever) + _cross(rates, _cross(rates, lever))
-            )
-            readings[row, 8:11] = attitude
-            readings[row, 11:14] = s[0:3]
-            readings[row, 14:17] = s[3:6]
-            past = k - int(round(hidden.sonar_delay / STEP))
-            slant = 1.0 + hidden.sonar_tilt * (1.0 / R[2, 2] - 1.0)
-            readings[row, 17] = sunk[max(past, 0)] * slant
+        push = pushes[k * SUBSTEPS]
+        actual = _acting(commands, clock, dt, k, 0, hidden)
+        _follow_at_once(s, actual, hidden, craft)
+        ds = _derivative(s, actual, push, hidden, craft, rotors, out)
+        readings[k, 0:2] = s[17:19] + push[8:10]
+        readings[k, 2:5] = rates
+        lever = np.array([hidden.lever_x, hidden.lever_y, hidden.lever_z])
+        readings[k, 5:8] = out[0:3] + _cross(out[3:6], lever) + _cross(rates, _cross(rates, lever))
+        readings[k, 8:11] = attitude
+        readings[k, 11:14] = s[0:3]
+        readings[k, 14:17] = s[3:6]
+        readings[k, 17] = R[2, 2]
+        h = dt[k] / SUBSTEPS
         for j in range(SUBSTEPS):
-            if hidden.servo_delay > 0.0:
-                delayed = _delayed(flown, k, j, hidden)
-                actual[2:4] = delayed[2:4]
-                _follow_at_once(s, actual, hidden)
-            ds = _derivative(s, actual, gust, hidden, out2)
+            push, later = pushes[k * SUBSTEPS + j], pushes[k * SUBSTEPS + j + 1]
+            if j > 0 and _is_late(hidden):
+                actual = _acting(commands, clock, dt, k, j, hidden)
+                _follow_at_once(s, actual, hidden, craft)
+            ds = _derivative(s, actual, push, hidden, craft, rotors, out2)
             middle = s + h * ds
-            ds2 = _derivative(middle, actual, gust, hidden, out2)
+            ds2 = _derivative(middle, actual, push, hidden, craft, rotors, out2)
             s = s + 0.5 * h * (ds + ds2)
             s[6:10] /= math.sqrt(s[6] ** 2 + s[7] ** 2 + s[8] ** 2 + s[9] ** 2)
-            for i in range(6):
-                gust[i] = decay * gust[i] + drive * gust_std[i] * shake[k, j, i]
+            taken = (craft.rotor_upper + craft.bar) * (later[8] - push[8])
+            taken -= craft.rotor_lower * (later[9] - push[9])
+            s[12] += taken / inertia
     return commands, readings
 
 
 @njit(cache=True)
-def _delayed(flown, k, j, hidden):
-    """The command that acts now: swash commands are shifted by the pure delay."""
-    actual = flown[k].copy()
-    behind = hidden.servo_delay / STEP - j / SUBSTEPS
-    back = max(int(math.ceil(behind - 1e-9)), 0)
-    actual[2:4] = flown[max(k - back, 0), 2:4]
+def _is_late(hidden):
+    """Whether a command may begin to act between two rows."""
+    return hidden.servo_delay > 0.0
+
+
+@njit(cache=True)
+def _acting(commands, clock, dt, k, j, hidden):
+    """The command that acts in substep j of row k: delays and supply, before motors and servos."""
+    actual = commands[k].copy()
+    actual[2:4] = commands[_late_row(clock, dt, k, j, hidden.servo_delay), 2:4]
+    sag = math.exp(-hidden.sag * max(clock[k], 0.0))
+    actual[0] *= sag
+    actual[1] *= sag
     return actual
+
+
+@njit(cache=True)
+def _late_row(clock, dt, k, j, delay):
+    """The row whose command, ``delay`` s late, acts in substep j of row k."""
+    behind = delay - j / SUBSTEPS * dt[k]
+    row = k
+    while row > 0 and clock[k] - clock[row] < behind - 1e-9 * dt[k]:
+        row -= 1
+    return row
 
 
 # --- maneuvers ------------------------------------------------------------------------------------
@@ -469,8 +637,10 @@ def _steps(t: np.ndarray, at: float, unit: float, pattern: Iterable[tuple[float,
 T3211 = ((3, 1.0), (2, -1.0), (1, 1.0), (1, -1.0))
 
 
-def _plan(name: str, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _plan(name: str, t: np.ndarray, craft: Craft) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Target (n, 8) north, east, height, heading, their rates; trust (n,); extra command (n, 4)."""
+    upper, lower = rotors_of(craft)[-2:]
+    reach = _reach(craft)
     n = len(t)
     target = np.tile([0.0, 0.0, 1.6, 0.0], (n, 1))
     trust = np.ones(n)
@@ -483,9 +653,10 @@ def _plan(name: str, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         trust[(t >= 2.0) & (t < 5.0)] = 0.2
         extra[:, 2 if kind == "lon" else 3] = 0.07 * _steps(t, 2.0, 0.4, T3211)
     elif kind == "heave":
-        extra[:, :2] = 0.035 * _steps(t, 2.0, 0.6, T3211)[:, None] * [HOVER_U, HOVER_L]
+        extra[:, :2] = 0.035 * _steps(t, 2.0, 0.6, T3211)[:, None] * [upper, lower]
     elif kind == "yaw":
-        extra[:, :2] = 0.022 * _steps(t, 2.0, 0.5, T3211)[:, None] * [HOVER_U, -HOVER_L]
+        extra[:, :2] = 0.022 * _steps(t, 2.0, 0.5, T3211)[:, None] * [upper, -lower]
+        extra[:, :2] *= reach.yaw
     elif form == "run":
         speed = np.interp(t, [2, 4, 6, 9, 10, 13, 15, 17], [0, 2.6, 2.6, 0, 0, -2.6, -2.6, 0])
         target[:, 0 if kind == "forward" else 1] = np.cumsum(speed) * STEP
@@ -498,76 +669,93 @@ def _plan(name: str, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     elif kind == "heading":
         target[:, 3] = np.interp(t, [2.0, 14.0], [0.0, 2.0 * math.pi])
         target[:, 0] = np.interp(t, [4.0, 9.0], [0.0, 1.0])
+    extra[:, 2:] *= reach.tilt
     window = np.ones(81) / 81.0
     smooth = [np.convolve(np.pad(x, 40, mode="edge"), window, "valid") for x in target.T]
     rates = [np.gradient(x, STEP) for x in smooth]
     return np.column_stack(smooth + rates), trust, extra
 
 
-# --- sensors and files --------------------------------------------------------------------------
-
-NOISE = {
-    "rpm_upper": 2.0, "rpm_lower": 2.0, "p": 0.0349, "q": 0.0349, "r": 0.0349,
-    "ax": 0.1, "ay": 0.1, "az": 0.1, "phi": 0.0087, "theta": 0.0087, "psi": 0.0087,
-    "h": 0.05, "vn": 0.5, "ve": 0.5, "vd": 0.5,
-}  # fmt: skip
-SENSORS = {
-    "full": (NOISE, {}),
-    "onboard": (
-        NOISE | {"vn": 0.2, "ve": 0.2, "vd": 0.2},
-        {"h": 5, "phi": 2, "theta": 2, "psi": 2, "vn": 10, "ve": 10, "vd": 10},
-    ),
-}
-"""name -> (std per channel, rows between readings where more than one)."""
-
-_FORMATS = {"h": "%.3f", "vn": "%.3f", "ve": "%.3f", "vd": "%.3f"} | dict.fromkeys(
-    ("rpm_upper_cmd", "rpm_lower_cmd", "rpm_upper", "rpm_lower"), "%.1f"
-)
+# --- a flight ------------------------------------------------------------------------------------
 
 
 def fly(
     folder: str | Path,
     effects: Mapping[str, Mapping[str, float] | float],
     *,
-    gusts: bool = False,
+    gusts: bool | Air = False,
     sensors: str = "full",
     seed: int = 0,
     runs: Iterable[str] | None = None,
     lost_echoes: bool = False,
     radio_gaps: bool = False,
+    craft: Craft = LAMA,
+    pilot: str = "usual",
+    known_as: Craft | None = None,
+    card_noise: float | None = 1.0,
+    longest: float = math.inf,
 ) -> Path:
     """Write a flight with these effects hidden, and what they were in ``truth.json``.
 
     Args:
         effects: name -> parameters; ``{}`` takes the usual size, a number sets the first one.
-        gusts: force (0.2 N) and moment (6 mN m) with a memory of 0.5 s.
+        gusts: True: force (0.2 N) and moment (6 mN m) with a memory of 0.5 s; or any air.
         sensors: a key of ``SENSORS``.
         runs: names in ``MANEUVERS``; all where None.
+        craft: what flies. known_as: what its vehicle file says; the same where None. One that is
+            not shipped gets a file beside the card.
+        pilot: a key of ``PILOTS``.
+        card_noise: factor by which the card's noise is wrong; None: the card has none.
+        longest: s at which a run ends.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    air = gusts if isinstance(gusts, Air) else GUSTY if gusts else STILL
     values = chosen_values(effects)
     hidden = Hidden(**{EFFECTS[e][p][0]: value for (e, p), value in values.items()})
-    noise, every = SENSORS[sensors]
+    kit = SENSORS[sensors]
     names = list(MANEUVERS) if runs is None else list(runs)
-    for name in names:
+    for i, name in enumerate(names):
         rng = np.random.default_rng([seed, list(MANEUVERS).index(name)])
-        columns = _fly_run(name, hidden, gusts, rng)
-        _add_noise(columns, noise, hidden, rng)
-        _thin(columns, every, lost_echoes, radio_gaps, rng)
-        (folder / f"{name}.csv").write_text(_csv(columns))
-    (folder / "card.toml").write_text(_card(names, noise))
+        length = min(MANEUVERS[name], longest)
+        columns = _fly_run(name, length, hidden, air, kit, craft, PILOTS[pilot], rng)
+        columns = _read(columns, kit, hidden, rng)
+        columns = thin(
+            columns, kit, rng, lost_echoes=lost_echoes, radio_gaps=radio_gaps, first=i == 0
+        )
+        (folder / f"{name}.csv").write_text(csv_text(columns, kit))
+    known_as = known_as or craft
+    vehicle = SHIPPED.get(known_as)
+    if vehicle is None:
+        write_vehicle(known_as, folder / "vehicle.toml")
+        vehicle = str(folder.resolve() / "vehicle.toml")
+    said = {} if card_noise is None else {c: card_noise * std for c, std in kit.noise.items()}
+    card = card_text(names, vehicle, (known_as.density, known_as.gravity), said)
+    (folder / "card.toml").write_text(card)
     full = {f"{effect}.{parameter}": value for (effect, parameter), value in values.items()}
     truth = {
         "hidden": list(effects),
         "values": full,
         "comparable": {name: value for name, value in full.items() if name not in OTHER_FORM},
-        "gusts": gusts,
+        "gusts": air.gusts != "none",
         "sensors": sensors,
         "seed": seed,
     }
     (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
     return folder
+
+
+def drawn(rng: np.random.Generator) -> Craft:
+    """A vehicle between 0.05 and 5 kg that the pilot can fly: one that is lost is drawn anew."""
+    while True:
+        craft = draw(rng)
+        try:
+            for name in ("lat_3211", "yaw_3211"):
+                noise = np.random.default_rng(0)
+                _fly_run(name, 8.0, Hidden(), GUSTY, SENSORS["full"], craft, USUAL, noise)
+        except RuntimeError:
+            continue
+        return craft
 
 
 def chosen_values(
@@ -588,34 +776,71 @@ def chosen_values(
 
 
 def _fly_run(
-    name: str, hidden: Hidden, gusts: bool, rng: np.random.Generator
+    name: str,
+    length: float,
+    hidden: Hidden,
+    air: Air,
+    sensors: Sensors,
+    craft: Craft,
+    pilot: Pilot,
+    rng: np.random.Generator,
 ) -> dict[str, np.ndarray]:
-    n = round(MANEUVERS[name] / STEP)
-    settle = round(SETTLE / STEP)
-    target, trust, extra = _plan(name, STEP * np.arange(n))
-    rows = settle + n
+    """True readings of a run, `length` s of it, on the sensors' clock."""
+    times = clock(sensors, SETTLE, length, rng)
+    dt = np.full(len(times) - 1, sensors.step) if sensors.unrest == 0.0 else np.diff(times)
+    rows = len(dt)
+    target, trust, extra = _plan(name, STEP * np.arange(round(MANEUVERS[name] / STEP)), craft)
+    at = np.clip(np.round(times[:-1] / STEP).astype(int), 0, len(target) - 1)
+    reach = _reach(craft)
     tremor = np.empty((rows, 4))
-    for i, (std, memory) in enumerate(((0.4, 0.12), (0.4, 0.12), (0.003, 0.25), (0.003, 0.25))):
-        tremor[:, i] = _wander(rng.standard_normal(rows), std, memory)
-    gust_std = np.array([0.2, 0.2, 0.2, 0.006, 0.006, 0.003]) * gusts
-    shake = rng.standard_normal((rows, SUBSTEPS, 6)) if gusts else np.zeros((rows, SUBSTEPS, 6))
-    commands, readings = _fly(n, settle, target, trust, extra, tremor, shake, gust_std, 0.5, hidden)
-    if not np.isfinite(readings).all() or abs(readings[:, 8:10]).max() > 0.8:
+    rotor, memory = pilot.tremor_rotor
+    rotor *= reach.speed * min(reach.yaw, 1.0)
+    swash, swash_memory = pilot.tremor_swash
+    swash *= min(reach.tilt, 1.0)
+    for i, (std, lasting) in enumerate([(rotor, memory)] * 2 + [(swash, swash_memory)] * 2):
+        tremor[:, i] = _wander(rng.standard_normal(rows), std, lasting, sensors.step)
+    pushes = disturbances(air, craft, rows, SUBSTEPS, sensors.step / SUBSTEPS, rng)
+    if sensors.unrest > 0.0:
+        pushes = _on(pushes, times, sensors.step)
+    pushes = np.ascontiguousarray(pushes)
+    commands, readings = _fly(
+        times[:-1], dt, sensors.step, target[at], trust[at], extra[at], tremor, pushes,
+        _suited(pilot, craft), hidden, craft, rotors_of(craft),
+    )  # fmt: skip
+    first = int(np.searchsorted(times, -1e-12))
+    logged = readings[first:]
+    if not np.isfinite(logged).all() or abs(logged[:, 8:10]).max() > 0.8:
         raise RuntimeError(f"the pilot lost the helicopter in {name}: {hidden}")
-    columns = {"t": STEP * np.arange(n)}
-    columns["rpm_upper_cmd"], columns["rpm_lower_cmd"] = RPM * commands[:, 0], RPM * commands[:, 1]
-    columns["rpm_upper"], columns["rpm_lower"] = RPM * readings[:, 0], RPM * readings[:, 1]
-    columns["delta_lon"], columns["delta_lat"] = commands[:, 2], commands[:, 3]
+    columns = {"t": times[first:-1]}
+    columns["rpm_upper_cmd"], columns["rpm_lower_cmd"] = RPM * commands[first:, :2].T
+    columns["rpm_upper"], columns["rpm_lower"] = RPM * logged[:, :2].T
+    columns["delta_lon"], columns["delta_lat"] = commands[first:, 2:].T
     for i, channel in enumerate(("p", "q", "r", "ax", "ay", "az", "phi", "theta", "psi")):
-        columns[channel] = readings[:, 2 + i]
-    columns["h"] = readings[:, 17]
-    columns["vn"], columns["ve"], columns["vd"] = readings[:, 14:17].T
+        columns[channel] = logged[:, 2 + i]
+    past = _late_rows(first, rows, hidden.sonar_delay, sensors.step)
+    columns["h"] = -readings[past, 13] * (1.0 + hidden.sonar_tilt * (1.0 / logged[:, 17] - 1.0))
+    columns["vn"], columns["ve"], columns["vd"] = logged[:, 14:17].T
+    columns["pn"], columns["pe"] = logged[:, 11:13].T
     return columns
 
 
-def _wander(white: np.ndarray, std: float, memory: float) -> np.ndarray:
-    """Noise with an exponential memory."""
-    decay = math.exp(-STEP / memory)
+def _late_rows(first: int, rows: int, delay: float, step: float) -> np.ndarray:
+    """The rows that a sensor shows, `delay` s late, at each logged row."""
+    return np.maximum(np.arange(first, rows) - int(round(delay / step)), 0)
+
+
+def _on(pushes: np.ndarray, times: np.ndarray, step: float) -> np.ndarray:
+    """A history on an even clock, at the substeps of an uneven one."""
+    even = times[0] + step / SUBSTEPS * np.arange(len(pushes))
+    shares = np.arange(SUBSTEPS) / SUBSTEPS
+    at = (times[:-1, None] + np.diff(times)[:, None] * shares).ravel()
+    at = np.append(at, times[-1])
+    return np.column_stack([np.interp(at, even, column) for column in pushes.T])
+
+
+def _wander(white: np.ndarray, std: float, memory: float, step: float) -> np.ndarray:
+    """Noise with an exponential memory [s]; `step`: s between values."""
+    decay = math.exp(-step / memory)
     drive = std * math.sqrt(1.0 - decay * decay)
     out = np.empty_like(white)
     state = 0.0
@@ -625,17 +850,17 @@ def _wander(white: np.ndarray, std: float, memory: float) -> np.ndarray:
     return out
 
 
-def _add_noise(
-    columns: dict[str, np.ndarray],
-    noise: Mapping[str, float],
-    hidden: Hidden,
-    rng: np.random.Generator,
-) -> None:
-    """What the sensors make of the truth, in place."""
+COMMANDED = ("t", "rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat")
+
+
+def _read(
+    columns: dict[str, np.ndarray], sensors: Sensors, hidden: Hidden, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """What the sensors make of the truth; channels that they lack are left out."""
     for first, x, y in (("p", "q", "r"), ("ax", "ay", "az")):  # turned axes: Rodrigues, both triads
         turned = _turn(np.stack([columns[c] for c in (first, x, y)]), hidden.tilt_x, hidden.tilt_y)
         columns[first], columns[x], columns[y] = turned
-    wobble = np.cumsum(columns["rpm_upper"]) / 60.0 * STEP * 2.0 * np.pi
+    wobble = np.cumsum(columns["rpm_upper"]) / 60.0 * sensors.step * 2.0 * np.pi
     for i, axis in enumerate("xyz"):
         shake = hidden.vibration * np.sin(wobble + 2.1 * i)
         accel = columns["a" + axis] + shake
@@ -646,9 +871,11 @@ def _add_noise(
         angle = ("phi", "theta", "psi")[i]
         columns[angle] = columns[angle] + getattr(hidden, f"attitude_{axis}")
     columns["h"] = columns["h"] * (1.0 + hidden.sonar_scale)
-    for channel, std in noise.items():
+    for channel, std in sensors.noise.items():
         columns[channel] = columns[channel] + std * rng.standard_normal(len(columns["t"]))
+    blunt(columns, sensors, rng)
     columns["psi"] = (columns["psi"] + np.pi) % (2.0 * np.pi) - np.pi
+    return {c: x for c, x in columns.items() if c in COMMANDED or c in sensors.noise}
 
 
 def _turn(vectors: np.ndarray, tilt_x: float, tilt_y: float) -> np.ndarray:
@@ -662,51 +889,17 @@ def _turn(vectors: np.ndarray, tilt_x: float, tilt_y: float) -> np.ndarray:
     return back @ vectors
 
 
-def _thin(
-    columns: dict[str, np.ndarray],
-    every: Mapping[str, int],
-    lost_echoes: bool,
-    radio_gaps: bool,
-    rng: np.random.Generator,
-) -> None:
-    """Leave the readings that a real log would have, in place; NaN elsewhere."""
-    n = len(columns["t"])
-    if lost_echoes:
-        columns["h"] = np.where(rng.random(n) < 0.005, 6.5, columns["h"])
-    for channel, step in every.items():
-        columns[channel] = np.where(np.arange(n) % step == 0, columns[channel], np.nan)
-    if radio_gaps:
-        for _ in range(2):
-            start = int(rng.integers(200, n - 100))
-            gap = slice(start, start + int(rng.integers(5, 25)))
-            for channel in NOISE:
-                columns[channel][gap] = np.nan
-
-
-def _csv(columns: Mapping[str, np.ndarray]) -> str:
-    texts = []
-    for channel, values in columns.items():
-        form = "%.2f" if channel == "t" else _FORMATS.get(channel, "%.5f")
-        texts.append(["" if x != x else form % x for x in values.tolist()])
-    rows = [",".join(columns), *(",".join(row) for row in zip(*texts, strict=True))]
-    return "\n".join(rows) + "\n"
-
-
-def _card(names: Iterable[str], noise: Mapping[str, float]) -> str:
-    lines = ["[vehicle]", 'name = "lama400d"', "[air]"]
-    lines += [f"density = {RHO}", f"gravity = {GRAVITY}", "[noise]"]
-    lines += [f"{channel} = {std}" for channel, std in noise.items()]
-    for name in names:
-        lines += ["[[run]]", f'name = "{name}"', f'file = "{name}.csv"', f'maneuver = "{name}"']
-    return "\n".join(lines) + "\n"
-
-
 def _main() -> None:
     parser = argparse.ArgumentParser(description="Write a flight with effects hidden in it.")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--effect", action="append", default=[], metavar="NAME[.PARAMETER=VALUE]")
     parser.add_argument("--gusts", action="store_true")
+    parser.add_argument("--air", choices=GUSTS, help="other gusts than --gusts flies in")
+    parser.add_argument("--memory", type=float, default=0.5, help="s, of the gusts")
     parser.add_argument("--sensors", choices=SENSORS, default="full")
+    parser.add_argument("--craft", choices=CRAFTS, default="lama")
+    parser.add_argument("--pilot", choices=PILOTS, default="usual")
+    parser.add_argument("--card-noise", type=float, default=1.0, help="factor; 0: not on the card")
     parser.add_argument("--lost-echoes", action="store_true")
     parser.add_argument("--radio-gaps", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
@@ -718,9 +911,11 @@ def _main() -> None:
         table = effects.setdefault(effect, {})
         if value:
             table[parameter or next(iter(EFFECTS[effect]))] = float(value)
+    air = Air(args.air or ("markov" if args.gusts else "none"), memory=(args.memory, args.memory))
     fly(
-        args.folder, effects, gusts=args.gusts, sensors=args.sensors, seed=args.seed,
-        lost_echoes=args.lost_echoes, radio_gaps=args.radio_gaps,
+        args.folder, effects, gusts=air, sensors=args.sensors, seed=args.seed,
+        lost_echoes=args.lost_echoes, radio_gaps=args.radio_gaps, craft=CRAFTS[args.craft],
+        pilot=args.pilot, card_noise=args.card_noise or None,
     )  # fmt: skip
     print((args.folder / "truth.json").read_text())
 

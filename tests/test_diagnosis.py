@@ -32,7 +32,8 @@ from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine, objective
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.files import write_text
 from coax_env.logs.flight import Flight
 from coax_env.model import effects

@@ -366,13 +366,13 @@ def test_drift_is_a_step_to_first_order(lag):
     start, command = settled_state(2)
     start[16:26] = [1990.0, 2150.0, 0.02, -0.01, 0.1, -0.1, 0.2, 1e-3, -1e-3, 1e-4]
     vehicle = LAMA.with_effect("motor_lag", upper=lag, lower=lag)
-    work, out = np.zeros(dynamics.WORK_SIZE), np.zeros(26 + len(CHANNELS))
+    work, out = np.zeros(dynamics.WORK_SIZE), np.zeros(N_FULL + len(CHANNELS))
     errors = []
     steps = np.array([4e-3, 2e-3, 1e-3])
     for dt in steps:
         u = dynamics.kernel_input(command)
         dynamics.drift_and_readings(start, u, dt, vehicle.vector, work, out)
-        error = start + out[:26] - fly(start, command, dt, dt, vehicle)
+        error = start + out[:N_FULL] - fly(start, command, dt, dt, vehicle)
         np.testing.assert_allclose(error[16:], 0.0, atol=1e-10)
         errors.append(np.abs(error[:16]).max())
     slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
@@ -390,12 +390,12 @@ def test_readings_beside_the_drift_are_the_readings(dt, effect):
     vehicle = LAMA
     for name, values in effect.items():
         vehicle = vehicle.with_effect(name, **values)
-    work, out = np.zeros(dynamics.WORK_SIZE), np.zeros(26 + len(CHANNELS))
+    work, out = np.zeros(dynamics.WORK_SIZE), np.zeros(N_FULL + len(CHANNELS))
     dynamics.drift_and_readings(
         start, dynamics.kernel_input(command), dt, vehicle.vector, work, out
     )
     expected = dynamics.readings(start, command, vehicle)
-    np.testing.assert_allclose(out[26:], list(expected.values()), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(out[N_FULL:], list(expected.values()), rtol=1e-12, atol=1e-14)
     if dt == 0.0:
         assert not out[:16].any() and not out[20:26].any()
 
@@ -932,7 +932,7 @@ def test_no_index_leaves_its_array(lag, tmp_path):
         "from numba.core.dispatcher import Dispatcher;"
         "v = coax_env.load_vehicle('lama400d');"
         f"v = v.with_effect('motor_lag', upper={lag}, lower={lag});"
-        "x, u = np.ones(26), d.kernel_input(np.full(4, 200.0));"
+        "x, u = np.ones(29), d.kernel_input(np.full(4, 200.0));"
         "work, readings = np.zeros(d.WORK_SIZE), np.zeros(18);"
         "d.step(x, u, 0.03, v.vector, work, x); d.measure(x, u, v.vector, work, readings);"
         "print(np.isfinite(x).all() and np.isfinite(readings).all());"

@@ -26,7 +26,7 @@ from coax_env.estimation.engine import (
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.quadratic import Linearised, Quadratic, bounded_solve
 from coax_env.estimation.sparse import padded, with_places
-from coax_env.estimation.state_space import FreeParameter, Noise, Record
+from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.estimation.whiteness import whiteness
 from coax_env.kernel.angles import wrap_angle, wrap_angles
 from coax_env.kernel.compilation import pointer
@@ -83,10 +83,11 @@ class Pendulum:
     drift_and_readings = _drift_and_readings
     exact = np.array([True, True])
     work_size = 1
+    noise_places = np.array([[0, 0], [1, 1]])
     start_at = np.array([0.2, 0.0])
     start_std = np.array([0.3, 0.5])
 
-    def vector(self, values: Mapping[str, float]) -> np.ndarray:
+    def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         return np.array([{**TRUTH, **values}[name] for name in TRUTH])
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
@@ -98,8 +99,8 @@ class Pendulum:
     def start_noise(self, noise: Noise) -> np.ndarray:
         return np.zeros(2)
 
-    def process_noise(self, noise: Noise) -> np.ndarray:
-        return np.array([0.0, noise.process["torque"] ** 2])
+    def process_noise(self, noise: Noise, vector: np.ndarray) -> ProcessNoise:
+        return ProcessNoise(np.array([0.0, noise.process["torque"] ** 2]), np.zeros(2))
 
 
 def swing(
@@ -212,9 +213,9 @@ def test_the_clock_may_start_anywhere():
     found = []
     for start in (0.0, 137.0):
         engine = Engine(Pendulum(), [replace(record, t=record.t + start)])
-        log_likelihood, by_noise, by_start = engine.noise_score(TRUTH, NOISE)
+        score = engine.noise_score(TRUTH, NOISE)
         _, lin = engine.linearise(TRUTH, NOISE, [prior("damping", 0.3)])
-        found.append((np.array(log_likelihood), by_noise, by_start, lin.slope, lin.blocks))
+        found.append((*(np.array(part) for part in vars(score).values()), lin.slope, lin.blocks))
     for first, later in zip(*found, strict=True):
         np.testing.assert_allclose(first, later, rtol=1e-6, atol=1e-6)
 
@@ -297,9 +298,11 @@ def test_noise_score_is_the_gradient_of_the_likelihood():
         return replace(NOISE, process={**NOISE.process, "torque": factor * NOISE.process["torque"]})
 
     for level in (0.5, 1.0, 2.0):
-        _, by_noise, _ = engine.noise_score(TRUTH, at(level))
+        by_noise = engine.noise_score(TRUTH, at(level)).in_noise
         more, less = at(level * 1.01), at(level / 1.01)
-        found = float(np.sum(by_noise @ (model.process_noise(more) - model.process_noise(less))))
+        p = model.vector(TRUTH)
+        change = model.process_noise(more, p).intensity - model.process_noise(less, p).intensity
+        found = float(np.sum(by_noise @ change))
         exact = engine.log_likelihood(TRUTH, more) - engine.log_likelihood(TRUTH, less)
         assert found == pytest.approx(exact, rel=0.02, abs=0.02)
 
@@ -316,7 +319,7 @@ def test_start_score_is_the_gradient_in_the_first_variances(state):
         return Engine(model, [record])
 
     for std in Pendulum.start_std[state] * np.array([0.3, 1.0, 3.0]):
-        *_, by_start = engine_at(std).noise_score(TRUTH, NOISE)
+        by_start = engine_at(std).noise_score(TRUTH, NOISE).in_start
         more, less = 1.02 * std, std / 1.02
         found = by_start[0, state] * (more**2 - less**2)
         exact = engine_at(more).log_likelihood(TRUTH, NOISE)
@@ -444,9 +447,7 @@ def test_a_stiff_row_has_the_jacobian_of_the_step():
     _, along = Engine(stiff, [record])._filter_run(
         0,
         stiff.vector(values),
-        stiff.process_noise(NOISE),
-        np.full(3, 0.01),
-        NOISE,
+        replace(NOISE, reading=dict.fromkeys(CHANNELS, 0.1)),
         _Buffers(),
         _Buffers(),
     )

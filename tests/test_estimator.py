@@ -14,7 +14,7 @@ from coax_env.env import hover
 from coax_env.env.period import DT
 from coax_env.kernel.random_streams import stream_key
 from coax_env.model.dynamics import derivative
-from coax_env.model.layout import CHANNELS, FULL_STATES
+from coax_env.model.layout import CHANNELS, FULL_STATES, N_FULL
 from coax_env.model.sampling import is_new
 from coax_env.model.sensors import suite
 from controllers import estimator
@@ -45,7 +45,7 @@ def noise_of(design) -> np.ndarray:
 
 def test_the_first_spread_is_that_of_the_tasks_starts(spreads):
     stream = np.array([stream_key(np.uint64(1)), 0], dtype=np.uint64)
-    starts = np.zeros((4000, 26))
+    starts = np.zeros((4000, N_FULL))
     for x in starts:
         hover.random_start(stream, TRIM[1], x)
     found = (starts - starts.mean(axis=0)).std(axis=0)

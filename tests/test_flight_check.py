@@ -131,7 +131,7 @@ def test_more_flight_tells_more(monkeypatch):
 
     def as_given(problem: Problem, noise: Noise) -> Fit:
         off = {f.name: f.value for f in problem.parameters}
-        return Fit((), {**off, **problem.model.bare_values, "gust_memory": 0.5}, noise)
+        return Fit((), {**off, **problem.model.bare_values}, noise)
 
     monkeypatch.setattr("coax_env.inspection.learnable.start", as_given)
     run = flown("lon_3211").runs[0]

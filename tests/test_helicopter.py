@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from coax_env import load_vehicle
-from coax_env.estimation.helicopter import (
+from coax_env.estimation.helicopter import HELD, MOST_USUAL_SIZES, HeliModel, record_of
+from coax_env.estimation.helicopter_noise import (
     GUST_LEVELS,
-    HELD,
     LEAST_READING_STD,
-    MOST_USUAL_SIZES,
+    MEMORIES,
+    ROTOR_LEVEL,
+    TRIM_LEVELS,
     WHITE_LEVELS,
-    HeliModel,
-    record_of,
     sensor_std,
     starting_noise,
 )
@@ -25,16 +25,17 @@ from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.flight import Flight, Run
 from coax_env.model import dynamics, effects
 from coax_env.model import parameters as P
-from coax_env.model.layout import CHANNELS, FULL_STATES
+from coax_env.model.layout import CHANNELS, FULL_STATES, N_FULL
 
 LAMA = load_vehicle("lama400d")
 MODEL = HeliModel(LAMA)
 X = {name: i for i, (name, _) in enumerate(FULL_STATES)}
 LEVELS = {
-    "force_xy": 0.2, "force_z": 0.3, "moment_xy": 4e-3, "moment_z": 5e-3, "memory": 0.8,
+    "force_xy": 0.2, "force_z": 0.3, "moment_xy": 4e-3, "moment_z": 5e-3,
+    **dict.fromkeys(MEMORIES, 0.8),
     "white_force_xy": 0.02, "white_force_z": 0.03, "white_moment_xy": 4e-4, "white_moment_z": 5e-4,
 }  # fmt: skip
-QUIET = dict.fromkeys(GUST_LEVELS, 0.0) | {"memory": 1.0}
+QUIET = dict.fromkeys(GUST_LEVELS, 0.0) | {ROTOR_LEVEL: 0.1}
 
 
 # --- noise ----------------------------------------------------------------------------------------
@@ -42,22 +43,24 @@ QUIET = dict.fromkeys(GUST_LEVELS, 0.0) | {"memory": 1.0}
 
 def test_gust_states_are_stationary_at_their_levels():
     """x' = -x/tau + w has variance q tau / 2: what decays in a moment is what the noise brings."""
-    q, first = MODEL.process_noise(Noise(LEVELS)), MODEL.start_noise(Noise(LEVELS))
+    q, decay = MODEL.process_noise(Noise(LEVELS), LAMA.vector)
+    first = MODEL.start_noise(Noise(LEVELS))
     expected = {"gust_X": 0.2, "gust_Y": 0.2, "gust_Z": 0.3,
                 "gust_L": 4e-3, "gust_M": 4e-3, "gust_N": 5e-3}  # fmt: skip
     for name, level in expected.items():
-        assert q[X[name]] * 0.8 / 2.0 == pytest.approx(level**2), name
+        assert q[X[name]] / (2.0 * decay[X[name]]) == pytest.approx(level**2), name
+        assert decay[X[name]] == pytest.approx(1.0 / 0.8)
         assert first[X[name]] == pytest.approx(level**2), name
     assert not first[:20].any()
 
 
 def test_white_noise_is_white_force_over_mass_and_moment_over_inertia():
     """Newton: a white force of intensity b makes the velocity's variance grow by (b/m)^2 a second."""
-    extra = MODEL.process_noise(Noise(LEVELS)) - MODEL.process_noise(
-        Noise({k: v for k, v in LEVELS.items() if k not in WHITE_LEVELS})
-    )
+    gusts_alone = Noise({k: v for k, v in LEVELS.items() if k not in WHITE_LEVELS})
+    extra = MODEL.process_noise(Noise(LEVELS), LAMA.vector).intensity
+    extra = extra - MODEL.process_noise(gusts_alone, LAMA.vector).intensity
     v = LAMA.values()
-    expected = np.zeros(26)
+    expected = np.zeros(extra.size)
     expected[[X["u"], X["v"], X["w"]]] = np.array([0.02, 0.02, 0.03]) / v["mass"]
     inertias = [v["inertia_xx"], v["inertia_yy"], v["inertia_zz"]]
     expected[[X["p"], X["q"], X["r"]]] = np.divide([4e-4, 4e-4, 5e-4], inertias)
@@ -66,7 +69,7 @@ def test_white_noise_is_white_force_over_mass_and_moment_over_inertia():
 
 def test_without_gusts_the_model_is_nearly_believed():
     """What is left is far below what any sensor here sees in a second, but not zero."""
-    q = np.sqrt(MODEL.process_noise(Noise(QUIET)))
+    q = np.sqrt(MODEL.process_noise(Noise(QUIET), LAMA.vector).intensity)
     assert (q[:20] > 0.0).all() and not q[20:].any()
     for states, least in (
         (("u", "v", "w"), 0.02), (("p", "q", "r"), 0.01), (("phi", "theta", "psi"), 0.006),
@@ -188,25 +191,25 @@ def test_an_input_innovation_corrects_its_states(gain):
         "command_gain.force_z": {"gust_Z": (1, 1, 0, 0)},
     }[gain]
     rng = np.random.default_rng(2)
-    x, work, out = 0.1 * rng.standard_normal(26), np.zeros(dynamics.WORK_SIZE), np.zeros(26)
+    x, work, out = 0.1 * rng.standard_normal(N_FULL), np.zeros(dynamics.WORK_SIZE), np.zeros(N_FULL)
     x[16:18] = 210.0
     command, innovations = np.array([210.0, 220.0, 0.02, -0.01]), rng.standard_normal(4)
     vector = MODEL.vector({gain: 0.01})
     corrected = x.copy()
     for state, weights in taken.items():
         corrected[X[state]] += 0.01 * np.dot(weights, innovations)
-    expected = np.zeros(26)
+    expected = np.zeros(N_FULL)
     dynamics.step(corrected, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
     u_with_innovations = np.append(dynamics.kernel_input(command), innovations)
     MODEL.step.__wrapped__(x, u_with_innovations, 0.01, vector, work, out)
     np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-14)
     # the drift is the same to first order: the correction comes on top of what is flown
-    both, flown = np.zeros((2, 26 + len(CHANNELS)))
+    both, flown = np.zeros((2, N_FULL + len(CHANNELS)))
     MODEL.drift_and_readings.__wrapped__(x, u_with_innovations, 0.01, vector, work, both)
     dynamics.drift_and_readings(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, flown)
     drift = both - flown
-    np.testing.assert_allclose(drift[:26], corrected - x, rtol=1e-9, atol=1e-13)
-    assert not drift[26:].any()
+    np.testing.assert_allclose(drift[:N_FULL], corrected - x, rtol=1e-9, atol=1e-13)
+    assert not drift[N_FULL:].any()
     # and who hears nothing flies the kernel's own step
     MODEL.step.__wrapped__(x, u_with_innovations[:5].copy(), 0.01, vector, work, out)
     dynamics.step(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
@@ -244,13 +247,13 @@ def test_a_sensors_std_is_found_under_a_smooth_motion():
     assert sensor_std(a_flight({"h": 0.3}, h=noisy), "h") == 0.3, "the card knows"
 
 
-def test_readings_start_from_the_card_or_from_twice_their_scatter():
+def test_readings_start_from_the_card_or_from_their_scatter():
     rng = np.random.default_rng(4)
     loud, still = 0.4 * rng.standard_normal(4000), np.zeros(4000)
     flight = a_flight({"az": 0.3}, ax=loud, ay=still, az=loud)
     reading = starting_noise(flight, LAMA).reading
-    assert reading["ax"] == pytest.approx(0.8, rel=0.08)
-    assert reading["ay"] == LEAST_READING_STD["ay"] and reading["az"] == 0.3
+    assert reading["ax"] == pytest.approx(0.4, rel=0.08)
+    assert 0.0 < reading["ay"] < 0.01 * LEAST_READING_STD["ay"] and reading["az"] == 0.3
     shaken = starting_noise(flight, LAMA.with_effect("vibration", amplitude=0.4)).reading
     assert shaken["az"] == pytest.approx(math.sqrt(0.3**2 + 0.4**2 / 2.0)), "a sine's rms is on top"
 
@@ -264,6 +267,8 @@ def test_gusts_start_small_and_end_at_a_floor_below():
         assert 5e-5 * size < noise.floor[name] < 0.2 * noise.process[name]
     for gust, white in zip(GUST_LEVELS, WHITE_LEVELS, strict=True):
         assert noise.process[white] == noise.floor[white] < noise.floor[gust]
+    for name in TRIM_LEVELS:
+        assert noise.process[name] == noise.floor[name]
 
 
 def test_record_of_puts_every_channel_in_its_column():

@@ -7,7 +7,7 @@ import pytest
 
 from coax_env.env import hover, tasks
 from coax_env.kernel.random_streams import stream_key
-from coax_env.model.layout import STATES
+from coax_env.model.layout import N_FULL, STATES
 from coax_env.model.sensors import suite
 
 X = {name: i for i, (name, _) in enumerate(STATES)}
@@ -103,7 +103,7 @@ def test_a_state_that_is_no_number_ends_the_flight(i):
 
 def test_starts_are_uniform_about_hover_and_settled():
     command, own = np.array([210.0, 225.0, 0.01, -0.02]), stream(1)
-    starts = np.full((3000, 26), 7.0)
+    starts = np.full((3000, N_FULL), 7.0)
     for x in starts:
         hover.random_start(own, command, x)
     centre = np.zeros(26)

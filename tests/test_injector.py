@@ -8,14 +8,19 @@ from pathlib import Path
 import injector
 import numpy as np
 import pytest
+from injector_air import DISTURBANCES, GUSTS, Air, disturbances
+from injector_craft import COAX, LAMA, Craft, draw, rotors_of, spread, write_vehicle
+from injector_sensors import POSE, SENSORS
 from shared_flights import shared_flight
 
 import coax_env
 from coax_env.logs.flight import read_flight
+from coax_env.model.vehicle import Vehicle
 
 
-def test_it_shares_no_code_with_the_package() -> None:
-    tree = ast.parse(Path(injector.__file__).read_text())
+@pytest.mark.parametrize("module", ["", "_air", "_craft", "_sensors"])
+def test_it_shares_no_code_with_the_package(module: str) -> None:
+    tree = ast.parse(Path(injector.__file__).with_name(f"injector{module}.py").read_text())
     modules = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import)
                for alias in node.names}  # fmt: skip
     modules |= {node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
@@ -25,11 +30,27 @@ def test_it_shares_no_code_with_the_package() -> None:
 def test_bare_physics_are_the_packages_at_random_states() -> None:
     """Quaternion, hub forces and inertial velocity against eqs (26)-(44) in body axes."""
     rng = np.random.default_rng(4)
-    vehicle = coax_env.load_vehicle("lama400d")
+    compare_physics(LAMA, coax_env.load_vehicle("lama400d"), rng)
+    air = {"density": 1.2, "gravity": 9.81}
+    compare_physics(COAX, coax_env.load_vehicle("skybotix_coax").in_air(air), rng)
+
+
+def test_a_drawn_vehicle_is_what_its_file_says(tmp_path: Path) -> None:
+    """Its physics against the package's, which reads the file and nothing else."""
+    rng = np.random.default_rng(5)
+    for i in range(4):
+        craft = draw(rng)
+        write_vehicle(craft, tmp_path / f"{i}.toml")
+        compare_physics(craft, coax_env.load_vehicle(tmp_path / f"{i}.toml"), rng)
+
+
+def compare_physics(craft: Craft, vehicle: Vehicle, rng: np.random.Generator) -> None:
+    rotors = rotors_of(craft)
     for _ in range(50):
         state = rng.normal(0, 1, 16) * [2, 2, 2, 1, 1, 1, *[0.1] * 4, 0.4, 0.4, 2, 1, 1, 0.3]
         state[15] -= 5.0
-        command = np.array([*rng.uniform(180, 250, 2), *rng.normal(0, 0.05, 2)])
+        speeds = rotors.hover_upper * rng.uniform(0.85, 1.2, 2)
+        command = np.array([*speeds, *rng.normal(0, 0.05, 2)])
         phi, theta, psi = state[10:13]
         half = [
             np.array([math.cos(angle / 2), *(math.sin(angle / 2) * np.eye(3)[axis])])
@@ -43,7 +64,9 @@ def test_bare_physics_are_the_packages_at_random_states() -> None:
         s[10:13] = state[3:6]
         s[13:17] = state[6:10]
         s[17:21] = command
-        ds = injector._derivative(s, command, np.zeros(6), injector.Hidden(), np.zeros(6))
+        ds = injector._derivative(
+            s, command, np.zeros(DISTURBANCES), injector.Hidden(), craft, rotors, np.zeros(6)
+        )
         expected = coax_env.derivative(state, command, vehicle)
         body_acceleration = R.T @ ds[3:6] - np.cross(state[3:6], state[0:3])
         np.testing.assert_allclose(body_acceleration, expected[0:3], rtol=1e-9, atol=1e-9)
@@ -122,3 +145,171 @@ def test_what_is_not_in_the_table_is_refused(tmp_path: Path) -> None:
         injector.fly(tmp_path, {"gremlins": {}})
     with pytest.raises(KeyError):
         injector.fly(tmp_path, {"wind": {"up": 1.0}})
+
+
+# --- its inputs ---------------------------------------------------------------------------------------
+
+
+def test_hover_is_where_thrust_is_the_weight_and_torques_balance() -> None:
+    rng = np.random.default_rng(1)
+    for craft in (LAMA, COAX, *(draw(rng) for _ in range(20))):
+        rotors = rotors_of(craft)
+        s = np.zeros(injector.N_STATE)
+        s[2], s[6], s[17:19] = -2.0, 1.0, rotors[-2:]
+        ds = injector._derivative(
+            s, s[17:21], np.zeros(DISTURBANCES), injector.Hidden(), craft, rotors, np.zeros(6)
+        )
+        np.testing.assert_allclose(ds, 0.0, atol=1e-9 * craft.gravity)
+
+
+def test_drawn_vehicles_are_of_all_sizes_and_bodies_that_can_be() -> None:
+    crafts = [draw(np.random.default_rng(i)) for i in range(200)]
+    masses = np.array([c.mass for c in crafts])
+    assert masses.min() < 0.1 and masses.max() > 2.5 and 0.25 < np.mean(masses < 0.5) < 0.75
+    for c in crafts:
+        moments = sorted((c.inertia_x, c.inertia_y, c.inertia_z))
+        assert moments[2] <= moments[0] + moments[1]
+        assert moments[2] < c.mass * c.radius**2 and c.rotor_upper < c.inertia_z
+
+
+def test_a_vehicle_within_its_files_spread_keeps_the_file(tmp_path: Path) -> None:
+    craft = spread(LAMA, np.random.default_rng(3))
+    file = coax_env.load_vehicle("lama400d")
+    for name, field in (
+        ("mass", "mass"),
+        ("inertia_zz", "inertia_z"),
+        ("swash_to_flap", "swash_gain"),
+    ):
+        off = (getattr(craft, field) - file[name].value) / file[name].std
+        assert 0.0 < abs(off) <= 1.5 + 1e-9
+    offs = [(spread(LAMA, np.random.default_rng(i)).mass / 0.8 - 1.0) / 0.01 for i in range(200)]
+    assert abs(np.mean(offs)) < 0.2 and 0.75 < np.std(offs) < 1.0
+    assert (craft.radius, craft.gravity, craft.density) == (0.25, 9.804, 1.14)
+    injector.fly(tmp_path, {}, craft=craft, known_as=LAMA, runs=["lat_3211"])
+    assert read_flight(tmp_path).vehicle == "lama400d" and not (tmp_path / "vehicle.toml").exists()
+
+
+@pytest.mark.parametrize("memory", [0.03, 0.5, 2.0])
+@pytest.mark.parametrize("gusts", ["markov", "heavy_tails"])
+def test_gusts_have_the_std_and_memory_asked(gusts: str, memory: float) -> None:
+    air = Air(gusts, memory=(memory, 0.5 * memory))
+    rng = np.random.default_rng(1)
+    history = disturbances(air, LAMA, 100_000, 5, 0.002, rng)
+    np.testing.assert_allclose(
+        history[1000:, :6].std(axis=0), [0.2] * 3 + [0.006] * 2 + [0.003], rtol=0.25
+    )
+    for columns, lasting in ((slice(0, 3), memory), (slice(3, 6), 0.5 * memory)):
+        x = history[:, columns]
+        lag = round(lasting / 0.002)
+        alike = np.mean(x[lag:] * x[:-lag], axis=0) / np.mean(x * x, axis=0)
+        np.testing.assert_allclose(alike, math.exp(-1.0), atol=0.12)
+    shocks = np.diff(history[:, 0].reshape(-1)[1:][::5])
+    tails = np.mean(shocks**4) / np.mean(shocks**2) ** 2
+    assert (tails > 4.0) == (gusts == "heavy_tails")
+
+
+def test_dryden_has_the_standards_proportions() -> None:
+    """MIL-F-8785C at 1.6 m: sigma_u / sigma_w = (0.177 + 0.0043)^-0.4 = 1.98, down in 1.6 m."""
+    air = Air("dryden", wind=3.0)
+    rng = np.random.default_rng(3)
+    history = disturbances(air, LAMA, 400_000, 5, 0.002, rng)[:, 10:13]
+    std = history.std(axis=0)
+    assert std[2] == pytest.approx(0.2, rel=0.05)
+    assert np.hypot(*std[:2]) / math.sqrt(2.0) == pytest.approx(1.98 * 0.2, rel=0.1)
+    down = history[:, 2]
+    lag = round(1.6 / 3.0 / 0.002)
+    # of (1 + sqrt3 T s) / (1 + T s)^2 the correlation after t is exp(-t/T) (1 - t / 2T)
+    assert np.mean(down[lag:] * down[:-lag]) / np.mean(down**2) == pytest.approx(
+        0.5 * math.exp(-1.0), abs=0.05
+    )
+
+
+def test_single_gusts_come_and_go() -> None:
+    history = disturbances(
+        Air("one_minus_cosine"), LAMA, 20_000, 5, 0.002, np.random.default_rng(1)
+    )
+    push = abs(history[:, 0]) / 0.2
+    assert 1.5 < push.max() < 5.0
+    assert 0.2 < np.mean(push > 0.75) < 0.6, "with calm between them"
+
+
+def test_unrest_of_rotors_and_trim(tmp_path: Path) -> None:
+    air = Air(jitter=1.0, trim_torque=0.01, trim_thrust=0.005)
+    history = disturbances(air, LAMA, 50_000, 5, 0.002, np.random.default_rng(1))
+    assert not history[:, :6].any() and not history[:, 10:].any()
+    np.testing.assert_allclose(history[:, 8:10].std(axis=0), 1.0, rtol=0.05)
+    steps = np.diff(history[:, 6:8], axis=0).std(axis=0) / math.sqrt(0.002)
+    np.testing.assert_allclose(steps, [0.005, 0.01], rtol=0.02)
+    flights = [
+        injector.fly(tmp_path / str(i), {}, gusts=a, runs=["hover"], seed=1)
+        for i, a in enumerate((Air(jitter=1.0), Air()))
+    ]
+    shaken, still = (read_flight(folder).run("hover") for folder in flights)
+    speed = shaken.measured["rpm_upper"] - shaken.command[:, 0] * injector.RPM
+    assert np.nanstd(speed) == pytest.approx(math.hypot(2.0, injector.RPM), rel=0.1)
+    # what the rotors gain in angular momentum the body loses
+    expected = math.hypot(LAMA.rotor_upper + LAMA.bar, LAMA.rotor_lower) / LAMA.inertia_z
+    turn = math.sqrt(np.nanvar(shaken.measured["r"]) - np.nanvar(still.measured["r"]))
+    assert turn == pytest.approx(expected, rel=0.3)
+
+
+@pytest.mark.parametrize("gusts", GUSTS)
+@pytest.mark.parametrize("craft", [LAMA, COAX, draw(np.random.default_rng(8))])
+def test_every_pilot_flies_every_craft_in_every_air(
+    tmp_path: Path, craft: Craft, gusts: str
+) -> None:
+    for pilot in injector.PILOTS:
+        flight = read_flight(
+            injector.fly(
+                tmp_path / pilot, {}, gusts=Air(gusts), craft=craft, pilot=pilot, longest=10.0,
+                runs=["lon_3211", "yaw_3211", "forward_run"], seed=3,
+            )
+        )  # fmt: skip
+        for run in flight.runs:
+            assert run.duration == pytest.approx(9.99)
+            assert np.nanmax(abs(run.measured["theta"])) < 0.6
+            assert 0.5 < np.nanmedian(run.measured["h"]) < 3.0
+
+
+def test_a_pose_looks_like_the_coax_log(tmp_path: Path) -> None:
+    """150 rows a second on an uneven clock, short losses; noise that third differences see."""
+    flight = read_flight(
+        injector.fly(tmp_path, {}, gusts=True, sensors="pose", craft=COAX, runs=["hover"])
+    )
+    run = flight.run("hover")
+    assert set(flight.channels) >= set(POSE) and "p" not in flight.channels
+    step = np.diff(run.t)
+    assert np.median(step) == pytest.approx(1 / 150, rel=0.03)
+    assert 1e-3 < step[step < 0.012].std() < 3e-3 and 0.012 < step.max() < 0.06
+    for channel in ("phi", "theta", "psi"):
+        third = np.diff(run.measured[channel], 3)
+        noise = 1.4826 * np.nanmedian(abs(third)) / math.sqrt(20.0)
+        assert 0.9 < noise / POSE[channel] < 1.5, "and some of the motion itself"
+
+
+def test_telemetry_is_slow_and_has_gaps(tmp_path: Path) -> None:
+    flight = read_flight(
+        injector.fly(
+            tmp_path, {}, sensors="telemetry", craft=COAX, runs=["lon_3211", "hover"],
+            card_noise=None,
+        )
+    )  # fmt: skip
+    assert flight.noise == {} and "pn" not in flight.channels and "rpm_upper" not in flight.channels
+    first, second = (np.diff(run.t) for run in flight.runs)
+    for step in (first, second):
+        assert set(np.round(step, 2)) >= {0.03, 0.04} and np.median(step) == pytest.approx(0.04)
+    assert first.max() > 1.3 > second.max() > 0.1
+    height = flight.run("hover").measured["h"]
+    seen = height[~np.isnan(height)]
+    np.testing.assert_allclose(seen, np.round(seen, 2), atol=1e-9)
+    assert 0.3 < len(seen) / len(height) < 0.7
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_wrong_card_changes_the_card_alone(tmp_path: Path, factor: float) -> None:
+    for name, said in (("right", 1.0), ("wrong", factor)):
+        injector.fly(tmp_path / name, {}, runs=["lat_3211"], seed=1, card_noise=said)
+    right, wrong = (tmp_path / name for name in ("right", "wrong"))
+    assert (right / "lat_3211.csv").read_bytes() == (wrong / "lat_3211.csv").read_bytes()
+    for channel, std in SENSORS["full"].noise.items():
+        assert read_flight(wrong).noise[channel] == pytest.approx(factor * std)

@@ -20,7 +20,8 @@ from coax_env.diagnosis.input_innovations import (
 )
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation import kalman
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import replay_runs
 from coax_env.model import parameters as P
 from coax_env.model.layout import CHANNELS, GUSTS

@@ -30,6 +30,8 @@ from coax_env.kernel.angles import wrap_angles
 GATE = 8.0
 H = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
 """The pendulum's readings: its angle, and its rate twice."""
+DECAY = np.array([0.0, 7.0])
+"""1/s: of what the noise has added to each state."""
 
 
 def step_of(x: np.ndarray, u: float, h: float, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +97,8 @@ def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) ->
         # predict; F, as H, is that of the predicted state
         F = step_of(x_before, record.command[k, 0], dt[k], p)[1]
         x = step_of(x, record.command[k, 0], dt[k], p)[0]
-        P = F @ P @ F.T + np.diag(q) * dt[k]
+        grown = [(1.0 - math.exp(-2.0 * d * dt[k])) / (2.0 * d) if d else dt[k] for d in DECAY]
+        P = F @ P @ F.T + np.diag(q * grown)
         found["F"].append(F)
     return {
         **{name: np.array(rows) for name, rows in found.items()},
@@ -116,11 +119,12 @@ def fast_filter(
             np.zeros((readings, 2), np.float32), np.zeros(readings),
             np.zeros((math.ceil(n / refresh), m, 2), np.float32),
         ),
-        kalman.Path(np.zeros((n, 2, 2), np.float32), np.zeros(n, np.int64), np.zeros((n, 2))),
+        kalman.Path(np.zeros((n, 2, 2), np.float32), np.zeros(n, np.int64), np.zeros((n, 2)),
+                    np.arange(2), np.zeros((n, 2, 2), np.float32), np.zeros(readings)),
     )  # fmt: skip
     kept = kalman.Covariances(np.zeros((n, 2, 2)), np.arange(n))
     run = kalman.RunData(np.append(np.diff(record.t), 0.0), record.command, record.z)
-    start = kalman.Variances(Pendulum.start_at, np.diag(Pendulum.start_std**2), R, q)
+    start = kalman.Variances(Pendulum.start_at, np.diag(Pendulum.start_std**2), R, q, DECAY)
     log_likelihood, beyond = kalman.filter_pass(
         kalman.CompiledModel.of(model), run, start, p, GATE, refresh, trace, kept
     )
@@ -141,7 +145,8 @@ def test_the_pass_is_the_textbooks_filter(sine, clock):
         t = DT * np.cumsum(np.random.default_rng(3).uniform(0.3, 2.0, 200))
     record = replace(record, z=z, t=t)
     model = Pendulum()
-    p, q = model.vector(values), model.process_noise(NOISE)
+    p = model.vector(values)
+    q = model.process_noise(NOISE, p).intensity
     R = np.array([NOISE.reading[c] for c in CHANNELS]) ** 2
     dense = dense_filter(record, p, R, q)
     log_likelihood, beyond, trace, kept = fast_filter(record, p, R, q)
@@ -150,7 +155,7 @@ def test_the_pass_is_the_textbooks_filter(sine, clock):
     for ours, theirs in (
         (trace.states, dense["x"]), (kept.P, dense["P"]), (trace.e, dense["e"]),
         (trace.path.predicted, dense["predicted"]), (trace.gains.K, dense["K"]),
-        (trace.gains.per_sigma, dense["per_sigma"]),
+        (trace.gains.per_sigma, dense["per_sigma"]), (trace.path.P, dense["P"]),
         (trace.path.F[trace.path.F_of[:-1]], dense["F"][:-1]),
         (trace.gains.H, np.broadcast_to(H, trace.gains.H.shape)),
     ):  # fmt: skip
@@ -166,7 +171,8 @@ def test_a_step_that_changes_much_has_its_own_jacobian(factor):
     steps[2::5] *= factor  # never where the Jacobians are refreshed alone
     record = replace(record, t=np.cumsum(steps))
     model = Pendulum()
-    p, q = model.vector(values), model.process_noise(NOISE)
+    p = model.vector(values)
+    q = model.process_noise(NOISE, p).intensity
     R = np.array([NOISE.reading[c] for c in CHANNELS]) ** 2
     _, _, trace, _ = fast_filter(record, p, R, q, refresh=4)
     for k, dt in enumerate(np.diff(record.t)):

@@ -14,7 +14,8 @@ from coax_env.design.next_maneuver import advise, design
 from coax_env.diagnosis.fits import fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import Engine
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import MEMORIES, starting_noise
 from coax_env.estimation.state_space import Noise
 from coax_env.model.layout import CHANNELS
 from coax_env.simulation.maneuvers import AXES, Maneuver, maneuver, steps_3211
@@ -24,7 +25,8 @@ LAMA = load_vehicle("lama400d")
 MODEL = HeliModel(LAMA)
 RATES = {c: 100.0 for c in CHANNELS if c not in ("pn", "pe", "v")} | {"h": 20.0, "vn": 10.0}
 STILL = Noise(
-    {"force_xy": 0.01, "force_z": 0.01, "moment_xy": 1e-3, "moment_z": 5e-4, "memory": 0.5},
+    {"force_xy": 0.01, "force_z": 0.01, "moment_xy": 1e-3, "moment_z": 5e-4,
+     **dict.fromkeys(MEMORIES, 0.5)},
     {"rpm_upper": 2.0, "rpm_lower": 2.0, "p": 0.035, "q": 0.035, "r": 0.035, "ax": 0.1, "ay": 0.1,
      "az": 0.1, "phi": 0.009, "theta": 0.009, "psi": 0.009, "h": 0.05, "vn": 0.2, "ve": 0.2,
      "vd": 0.2},
@@ -55,7 +57,7 @@ def tied_on_a_hover(
         ),
     )  # fmt: skip
     start = {f.name: f.value for f in problem.parameters}
-    start |= {**MODEL.bare_values, "gust_memory": gusts.memory_s}
+    start |= MODEL.bare_values
     found = []
     for effect in effects:
         fit = fitted(problem, Fit((*common, effect), start, noise), steps=3)

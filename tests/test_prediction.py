@@ -14,6 +14,7 @@ import pytest
 from coax_env import InputError, load_vehicle
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.helicopter_noise import GUST_LEVELS, MEMORIES
 from coax_env.estimation.prediction import (
     ChannelReplay,
     RunReplay,
@@ -33,11 +34,12 @@ LAMA = load_vehicle("lama400d")
 G = LAMA["gravity"].value
 MEMORY = 0.8  # s
 NOISE = Noise(
-    {"force_xy": 0.3, "force_z": 0.3, "moment_xy": 5e-3, "moment_z": 5e-3, "memory": MEMORY},
+    {"force_xy": 0.3, "force_z": 0.3, "moment_xy": 5e-3, "moment_z": 5e-3,
+     **dict.fromkeys(MEMORIES, MEMORY)},
     {"phi": 1e-3, "theta": 1e-3, "psi": 1e-3, "h": 1e-3, "vn": 1e-3, "ve": 1e-3, "vd": 1e-3,
      "p": 1e-3, "q": 1e-3, "r": 1e-3, "pn": 1e-3, "az": 1e-2},
 )  # fmt: skip
-QUIET = replace(NOISE, process=dict.fromkeys(NOISE.process, 1e-9) | {"memory": MEMORY})
+QUIET = NOISE.with_levels(dict.fromkeys(GUST_LEVELS, 1e-9))
 
 
 def hover(seconds: float = 5.0, dt: float = 0.01, start: float = 0.0, **readings) -> Record:
@@ -56,7 +58,7 @@ def hover(seconds: float = 5.0, dt: float = 0.01, start: float = 0.0, **readings
 def flown(record: Record, noise: Noise = NOISE, horizon: float = 1.0, heavier: float = 0.0, **more):
     """The record's replay by the bare model, its mass so much too large."""
     engine = Engine(HeliModel(LAMA), [record])
-    values = {"mass": LAMA["mass"].value * (1.0 + heavier), "gust_memory": MEMORY}
+    values = {"mass": LAMA["mass"].value * (1.0 + heavier)}
     (run,) = replay_runs(engine, values, noise, horizon, **more)
     assert not run.diverged
     return run
@@ -193,7 +195,8 @@ def test_tables_are_root_mean_squares_of_what_is_there():
 
 def test_gusts_are_reported_by_axis():
     levels = {
-        "force_xy": 0.2, "force_z": 0.3, "moment_xy": 4e-3, "moment_z": 5e-3, "memory": 0.8,
+        "force_xy": 0.2, "force_z": 0.3, "moment_xy": 4e-3, "moment_z": 5e-3,
+        **dict.fromkeys(MEMORIES, 0.8),
     }  # fmt: skip
     assert gusts_of(Noise(levels)) == {
         "force_N": [0.2, 0.2, 0.3], "moment_Nm": [4e-3, 4e-3, 5e-3], "memory_s": 0.8,

@@ -12,7 +12,7 @@ from coax_env.env.actions import action_map
 from coax_env.kernel.random_streams import stream_key
 from coax_env.model.actuators import limit, limits
 from coax_env.model.layout import CHANNELS
-from coax_env.model.parameters import GUST_MEMORY
+from coax_env.model.parameters import MEMORY_FORCE_XY as GUST_MEMORY
 from coax_env.model.sampling import add_vibration, is_new, measured_quantities, sensor_table
 from coax_env.model.sensors import suite
 from coax_env.simulation.log import log_readings
@@ -157,12 +157,12 @@ def test_gusts_are_stationary_with_their_memory():
     """Blown and faded by the kernel's memory: std as asked, correlation exp(-dt/memory)."""
     p = LAMA.vector.copy()
     fade = math.exp(-period.DT / p[GUST_MEMORY])
-    x, own = np.zeros(26), stream(3)
+    x, own = np.zeros(29), stream(3)
     history = np.empty((60_000, 6))
     for row in history:
-        x[20:] *= fade
+        x[20:26] *= fade
         period.add_gusts(x, p, np.array([0.3, 0.02]), own)
-        row[:] = x[20:]
+        row[:] = x[20:26]
     std = history.std(axis=0)
     np.testing.assert_allclose(std, [0.3] * 3 + [0.02] * 3, rtol=0.12)
     lag = round(p[GUST_MEMORY] / period.DT)
@@ -170,17 +170,17 @@ def test_gusts_are_stationary_with_their_memory():
         found = np.corrcoef(column[lag:], column[:-lag])[0, 1]
         assert found == pytest.approx(math.exp(-1.0), abs=0.1)
     assert np.abs(np.corrcoef(history.T) - np.eye(6)).max() < 0.15
-    assert not x[:20].any()
-    still = np.zeros(26)
+    assert not x[:20].any() and not x[26:].any()
+    still = np.zeros(29)
     period.add_gusts(still, p, np.array([0.0, 0.02]), own)
-    assert not still[20:23].any() and still[23:].all()
+    assert not still[20:23].any() and still[23:26].all()
 
 
 # --- readings -------------------------------------------------------------------------------------
 
 
 def test_sensors_look_at_their_own_place():
-    readings, x, out = np.arange(18.0), 100.0 + np.arange(26.0), np.zeros(2)
+    readings, x, out = np.arange(18.0), 100.0 + np.arange(29.0), np.zeros(2)
     (height,) = (s for s in suite("state") if s.name == "z")
     measured_quantities(x, readings, sensor_table((sensor("h"), height)), out)
     assert out.tolist() == [CHANNELS.index("h"), 115.0]

@@ -16,7 +16,21 @@ import injector
 import numpy as np
 import pytest
 import study_diagnosis
-from study import baselines, judge, one_flight, plan, store, table, threshold
+from injector_air import GUSTS, GUSTY, Air
+from injector_craft import COAX, LAMA, draw
+from injector_sensors import SENSORS
+from study import (
+    arm_table,
+    arms,
+    baselines,
+    classes,
+    judge,
+    one_flight,
+    plan,
+    store,
+    table,
+    threshold,
+)
 from study.baselines import Gram, by_bic, by_f, sparse, stepwise
 from study.one_flight import catalogue_values, expected_evidence, fly_and_diagnose, hide
 from study.plan import PlannedFlight
@@ -26,7 +40,8 @@ from coax_env.diagnosis import calibration
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.model.effects import CATALOGUE
 
 # --- the plan ---------------------------------------------------------------------------------------
@@ -83,6 +98,13 @@ def test_any_part_of_the_plan_is_a_fair_sample() -> None:
         assert abs(early.count(kind) - expected) <= 1.0, kind
 
 
+def test_what_is_in_no_list_takes_every_form_in_turn() -> None:
+    flights = [f for f in plan.plan(0, 600) if f.kind == "outside"]
+    assert {e for f in flights for e in f.effects} == set(plan.OUTSIDE)
+    assert not set(plan.OUTSIDE) & set(CATALOGUE)
+    assert set(plan.FOREIGN) < set(plan.OUTSIDE), "one is a generic term"
+
+
 def test_the_plan_knows_all_that_the_generator_hides_and_the_catalogue_has() -> None:
     """An effect new to either must be given a size here."""
     assert set(plan.SIZES) == set(injector.EFFECTS)
@@ -136,7 +158,7 @@ def study(
                 raise KeyboardInterrupt
             if flight.name == fails:
                 return {"plan": flight.as_json(), "code": "abc", "error": "lost"}
-            return row_of(flight, [{"effect": e} for e in flight.effects if e != "outside"])
+            return row_of(flight, [{"effect": e} for e in flight.effects if e in CATALOGUE])
 
         monkeypatch.setattr(study_diagnosis, "fly_and_diagnose", stub)
         out = ["--out", str(tmp_path), "--jobs", "1"]
@@ -402,6 +424,192 @@ def test_an_adopted_calibration_is_void_for_another_threshold(
     assert calibration.false_alarm_rate(SETTINGS.evidence + 1.0) is None
 
 
+# --- the arms -----------------------------------------------------------------------------------------
+
+
+def test_an_arm_is_the_same_every_time_and_beside_any_others() -> None:
+    small = arms.plan_arms(["gusty", "dryden"], 4, 6, seed=3)
+    large = arms.plan_arms(list(arms.ARMS), 10, 24, seed=3)
+    assert {f.name: f for f in small}.items() <= {f.name: f for f in large}.items()
+    assert len({f.seed for f in large}) == len({f.name for f in large}) == len(large)
+    assert len(large) == 34 * len(arms.ARMS)
+    assert not {f.seed for f in large} & {f.seed for f in arms.plan_arms(["gusty"], 9, 9, seed=4)}
+
+
+def test_any_part_of_the_arms_is_a_fair_sample() -> None:
+    flights = arms.plan_arms(list(arms.ARMS), 50, 60)
+    early = [f.arm for f in flights[: len(flights) // 10]]
+    assert {early.count(arm) for arm in arms.ARMS} <= {10, 11, 12}
+
+
+def test_every_arm_hides_every_effect_that_its_sensors_can_see() -> None:
+    for name, arm in arms.ARMS.items():
+        flights = arms.plan_arms([name], 4, 200)
+        hidden = {e for f in flights if f.kind == "one" for e in f.effects}
+        if not arm.listed:
+            assert {e for f in flights for e in f.effects} == set(plan.FOREIGN)
+            continue
+        channels = set.intersection(*(set(SENSORS[s].noise) for s in arm.sensors))
+        blind = {e for e in plan.ALONE if e not in hidden}
+        assert ("gyro_bias" in blind) == ("p" not in channels)
+        assert ("accel_bias" in blind) == ("ax" not in channels)
+        assert ("sonar_delay" in blind) == ("pn" in channels)
+        assert {"swash_offset", "servo_lag", "added_mass", "ground_effect"} <= hidden
+        assert {f.sensors for f in flights} == set(arm.sensors)
+        assert {f.card_noise for f in flights} == set(arm.card)
+        assert {f.pilot for f in flights} == set(arm.pilots)
+        for flight in flights:
+            assert len(flight.effects) == {"clean": 0, "one": 1, "two": 2, "three": 3}[flight.kind]
+
+
+def test_the_arms_airs_are_what_they_are_called() -> None:
+    for flight in arms.plan_arms(["memory_short", "memory_long"], 40, 0):
+        memories = one_flight.air_of(flight).memory
+        low, high = arms.ARMS[flight.arm].memory or (math.nan, math.nan)
+        assert all(low <= m <= high for m in memories) and memories[0] != memories[1]
+    flown = {f.arm: one_flight.air_of(f) for f in arms.plan_arms(list(arms.ARMS), 1, 0)}
+    assert flown["still"].gusts == "none" and flown["gusty"] == GUSTY
+    assert {air.gusts for air in flown.values()} == {"none", *GUSTS}
+
+
+def test_sizes_are_so_many_times_the_usual() -> None:
+    for name, factor in (("sizes_small", 0.3), ("sizes_large", 3.0)):
+        for flight in arms.plan_arms([name], 0, 90):
+            for effect, sizes in flight.effects.items():
+                for parameter, value in sizes.items():
+                    least, most, _ = plan.SIZES[effect][parameter]
+                    scale = 1.0 if effect == "sonar_tilt" else factor
+                    assert abs(value) <= scale * most * (1 + 1e-12)
+                    assert value == arms.LEAST_SCALE or abs(value) >= scale * least * (1 - 1e-12)
+                    assert value >= arms.LEAST_SCALE or parameter not in ("scale", "excess")
+
+
+def test_sizes_on_another_craft_do_what_they_do_on_the_papers() -> None:
+    """The same angular or linear acceleration, in multiples of g, as on the paper's vehicle."""
+    rng = np.random.default_rng(2)
+    for craft in (LAMA, COAX, draw(rng), draw(rng)):
+        roll = plan.size_on(craft, "rate_damping.coefficient") / craft.inertia_x
+        assert roll == pytest.approx(1.0 / LAMA.inertia_x)
+        yaw = plan.size_on(craft, "yaw_damping.coefficient") / craft.inertia_z
+        assert yaw == pytest.approx(1.0 / LAMA.inertia_z)
+        assert plan.size_on(craft, "added_mass.mass") == pytest.approx(craft.mass / LAMA.mass)
+        assert plan.size_on(craft, "servo_lag.time") == 1.0
+    for parameter in plan.SCALES:
+        assert plan.size_on(LAMA, parameter) == 1.0
+        effect, _, name = parameter.partition(".")
+        assert name in plan.SIZES[effect]
+
+
+def test_the_levels_of_an_air_are_its_own() -> None:
+    levels = one_flight.gust_levels(GUSTY, LAMA)
+    known = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003}
+    for group, std in known.items():
+        assert levels[group] == pytest.approx(std, rel=0.2)
+    assert levels["memory"] == pytest.approx(0.5, rel=0.2)
+    light = one_flight.gust_levels(GUSTY, COAX)["force_z"] / levels["force_z"]
+    assert light == pytest.approx(0.302 * 9.81 / (0.8 * 9.804))
+    assert one_flight.gust_levels(Air("markov", memory=(3.0, 3.0)), LAMA)["memory"] > 1.5
+
+
+def arm_rows() -> list[dict[str, Any]]:
+    """Two arms, right and wrong in known numbers."""
+
+    def row(arm: str, kind: str, number: int, hidden: str, *named: str, **more: Any) -> dict:
+        sizes = {e: plan.sizes_of(e, np.random.default_rng(0)) for e in hidden.split()}
+        flight = PlannedFlight(kind, number, sizes, True, "full", 1, plan.RICH, arm=arm)
+        return row_of(
+            flight, [{"effect": n.strip("?")} | ({"trust": "doubtful"} if "?" in n else {})
+                     for n in named], **more,
+        )  # fmt: skip
+
+    return [
+        row("gusty", "clean", 0, ""),
+        row("gusty", "clean", 1, "", "wind"),
+        row("gusty", "clean", 2, "", "wind?"),
+        row("gusty", "one", 0, "servo_lag", "servo_delay"),
+        row("gusty", "one", 1, "gyro_bias", "gyro_bias", "motor_lag?"),
+        row("gusty", "one", 2, "gyro_bias", expected={"gyro_bias": 0.0}),
+        row("gusty", "two", 0, "gyro_bias wind", "wind", "gyro_bias"),
+        row("foreign_forms", "outside", 0, "outside_cable", "yaw_damping"),
+        row("foreign_forms", "outside", 1, "outside_wake"),
+    ]
+
+
+def test_the_arms_table_counts_what_it_says() -> None:
+    counted = arm_table.figures(arm_rows())
+    gusty = counted["gusty"]
+    assert gusty["false_clean"] == [2, 3] and gusty["false_clean_sure"] == [1, 3]
+    assert gusty["exact_one"] == [1, 2] and gusty["exact_one_strict"] == [0, 2]
+    assert gusty["exact_one_all"] == [1, 3] and gusty["exact_more"] == [1, 1]
+    assert gusty["false_beside"] == [1, 4] and gusty["false_beside_sure"] == [0, 4]
+    assert gusty["sure_false"] == [1, 5]
+    foreign = counted["foreign_forms"]
+    assert foreign["blamed"] == [1, 2] and foreign["unexplained"] == [0, 2]
+    assert counted[arm_table.ALL]["sure_false"] == [2, 6]
+    assert list(counted) == ["gusty", "foreign_forms", arm_table.ALL]
+
+
+def test_a_study_of_arms_writes_its_table(study: Callable, tmp_path: Path) -> None:
+    """The stub names the truth wherever it has a name."""
+    flown, _ = study("--arms", "gusty,foreign_forms")
+    assert len(flown) == 48 and all(name.startswith(("gusty", "foreign")) for name in flown)
+    assert study("--arms", "gusty,foreign_forms")[0] == []
+    counted = json.loads((tmp_path / "arms.json").read_text())["arms"]
+    assert counted["gusty"]["false_clean"] == [0, 8]
+    assert counted["gusty"]["exact_one_all"] == [12, 12]
+    assert counted["foreign_forms"]["blamed"] == [0, 24]
+    text = (tmp_path / "table.md").read_text()
+    assert "| gusty | 0/8 = 0 % (0-32) |" in text and "| all arms |" in text
+
+
+def test_a_class_is_what_its_flights_showed() -> None:
+    seen = [
+        {"sensors": "gyros", "rate_hz": 100.0, "gap_share": 0.0, "card_noise": True,
+         "gust_memory_s": None, "calibrated": None, "why": "nothing has been measured"},
+        {"sensors": "gyros, height", "rate_hz": 110.0, "gap_share": 0.0, "card_noise": True,
+         "gust_memory_s": 0.4, "calibrated": None, "why": "nothing has been measured"},
+    ]  # fmt: skip
+    said = classes.described("gusty", "gusts", seen)
+    assert said["name"] == "gusty" and "gusts" in said["data"]
+    assert said["sensors"] == ["gyros", "gyros, height"] and said["card_noise"] == [True]
+    low, high = said["rate_hz"]
+    assert 80.0 < low < 100.0 and 110.0 < high < 140.0
+    assert said["gap_share"][0] == 0.0 < said["gap_share"][1] < 0.01
+    assert 0.3 < said["gust_memory_s"][0] < 0.4 < said["gust_memory_s"][1] < 0.5
+    assert not set(said) & {"calibrated", "why"}
+
+
+def test_every_arm_has_its_own_rate() -> None:
+    """One arm's alarms are not another's; one with too few clean flights has no rate."""
+
+    def rows(arm: str, count: int, alarms: int) -> list[dict[str, Any]]:
+        flights = [
+            PlannedFlight("clean", i, {}, True, "full", 1, plan.RICH, arm=arm) for i in range(count)
+        ]
+        return [
+            row_of(
+                f, [{"effect": "wind"}] if f.number < alarms else [],
+                strongest={"evidence": 50.0 if f.number < alarms else 1.0, "effect": "wind"},
+                **{"class": {"rate_hz": 100.0}},
+            )
+            for f in flights
+        ]  # fmt: skip
+
+    measured = classes.calibrations(
+        [*rows("gusty", 40, 0), *rows("dryden", 40, 8), *rows("still", 10, 0)], "command"
+    )
+    rates = {m["class"]["name"]: m["false_alarm_rate"] for m in measured}
+    assert set(rates) == {"gusty", "dryden"}
+    assert rates["gusty"] == threshold.FALSE_ALARMS and rates["dryden"] >= 0.2
+    json.dumps(measured, allow_nan=False)
+
+
+def test_an_arm_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["study_diagnosis.py", "--arms", "gusty,stormy"])
+    with pytest.raises(InputError, match="no arm 'stormy'"):
+        study_diagnosis.main()
+
+
 # --- the baselines -----------------------------------------------------------------------------------
 
 GROUPS = {"thrust_scale": [1], "wind": [2, 3], "yaw_damping": [4], "rotor_drag": [5]}
@@ -467,7 +675,7 @@ def test_the_wrench_is_what_the_model_says(damped: tuple) -> None:
     vehicle = load_vehicle("lama400d").in_air(flight.air)
     model = HeliModel(vehicle)
     noise = starting_noise(flight, vehicle)
-    bare = {**model.bare_values, "gust_memory": 0.5}
+    bare = dict(model.bare_values)
     run = Engine(model, [record_of(flight.runs[0])]).filter(bare, noise)[0]
     change = baselines.wrench(model, run, {**bare, "yaw_damping.coefficient": 0.004})
     change -= baselines.wrench(model, run, bare)

@@ -327,7 +327,7 @@ def test_our_own_vibration_is_found_and_taken_out(sensors):
 
 
 def test_vibration_is_reading_noise_to_the_filter():
-    from coax_env.estimation.helicopter import starting_noise
+    from coax_env.estimation.helicopter_noise import starting_noise
 
     flight = simulate(LAMA, "hover", seed=1)
     shaking = LAMA.with_effect("vibration", amplitude=0.4)

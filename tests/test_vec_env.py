@@ -43,7 +43,7 @@ def test_each_row_gets_its_own_end():
                 assert np.array_equal(infos[i]["terminal_observation"], theirs[i])
                 assert infos[i]["TimeLimit.truncated"] == (truncated[i] and not terminated[i])
                 assert not np.array_equal(observations[i], theirs[i])
-                assert infos[i]["state"].shape == (26,)
+                assert infos[i]["state"].shape == (29,)
                 kinds.add(infos[i]["TimeLimit.truncated"])
             else:
                 assert np.array_equal(observations[i], theirs[i]) and not infos[i]

@@ -79,10 +79,6 @@ class Alternative:
             known = known + information
         return cls(name, corrected, tuple(free), known)
 
-    def values(self, noise: Noise) -> dict[str, float]:
-        """Every value of the model, gusts' memory in."""
-        return {**self.vehicle.values(), "gust_memory": noise.process["memory"]}
-
 
 class _FromHere(HeliModel):
     """The helicopter started from a known state, as uncertain as ever about it."""
@@ -125,8 +121,8 @@ def expected_information(
     noise = _for_rows(noise, rates, float(flown.t[1] - flown.t[0]))
     model = _FromHere(vehicle, flown.state[0])
     engine = Engine(model, [_as_logged(flown, rates)], threads=1)
-    values = {**vehicle.values(), "gust_memory": noise.process["memory"]}
-    _, lin = engine.linearise({**{f.name: f.value for f in free}, **values}, noise, free)
+    values = {**{f.name: f.value for f in free}, **vehicle.values()}
+    _, lin = engine.linearise(values, noise, free)
     return lin.information[0]
 
 
@@ -164,7 +160,7 @@ def distance(
     noise = _for_rows(noise, rates, float(flown.t[1] - flown.t[0]))
     model = _FromHere(other.vehicle, flown.state[0])
     engine = Engine(model, [_as_logged(flown, rates)], threads=1)
-    values = other.values(noise)
+    values = other.vehicle.values()
     passes, lin = engine.linearise(values, noise, other.free)
     at = np.array([values[f.name] for f in other.free])
     move = bounded_solve(

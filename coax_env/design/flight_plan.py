@@ -21,7 +21,13 @@ from coax_env.design.candidates import Envelope, candidates
 from coax_env.design.discrimination import ROW, expected_information
 from coax_env.design.flight_card import asked_csv, instruction
 from coax_env.errors import InputError
-from coax_env.estimation.helicopter import LEAST_READING_STD, HeliModel, starting_noise
+from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.helicopter_noise import (
+    LEAST_READING_STD,
+    MEMORIES,
+    starting_noise,
+    still_air,
+)
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.files import write_text
 from coax_env.logs.flight import Flight, Run, write_flight
@@ -188,11 +194,11 @@ def multisine_maneuvers() -> tuple[Maneuver, ...]:
 def _air(noise: Noise, gusts: Gusts | None) -> Noise:
     """Noise with the gusts of the day, and in still air what no model is without."""
     if gusts is None:
-        return replace(noise, process={**noise.process, **noise.floor})
+        return still_air(noise)
     force, moment = gusts.force_N, gusts.moment_Nm
     levels = {"force_xy": force[0], "force_z": force[2], "moment_xy": moment[0],
-              "moment_z": moment[2], "memory": gusts.memory_s}  # fmt: skip
-    return replace(noise, process={**noise.process, **noise.floor, **levels})
+              "moment_z": moment[2], **dict.fromkeys(MEMORIES, gusts.memory_s)}  # fmt: skip
+    return still_air(noise).with_levels(levels)
 
 
 def _to_learn(model: HeliModel, learn: Collection[str]) -> tuple[list[FreeParameter], list[str]]:

@@ -41,7 +41,8 @@ from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine, Progress
 from coax_env.estimation.fitted_vehicle import double_counting
-from coax_env.estimation.helicopter import HeliModel, record_of, sensor_std, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import sensor_std, starting_noise
 from coax_env.estimation.prediction import RunReplay, gusts_of, replay_runs
 from coax_env.estimation.state_space import Record
 from coax_env.estimation.whiteness import Whiteness, whiteness

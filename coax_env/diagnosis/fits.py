@@ -7,25 +7,26 @@ from dataclasses import replace
 import numpy as np
 
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation.engine import RunPass, objective
-from coax_env.estimation.helicopter import GUST_LEVELS, WHITE_LEVELS
-from coax_env.estimation.noise_levels import fit_noise
+from coax_env.estimation.engine import NoiseScore, RunPass, objective
+from coax_env.estimation.helicopter_noise import LATENT_START, fitted_levels
+from coax_env.estimation.noise_levels import fit_noise, level_slopes
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 
 
 def start(problem: Problem, noise: Noise) -> Fit:
     """The bare model with its own noise levels."""
-    values = {**problem.model.bare_values, "gust_memory": noise.process["memory"]}
+    values = dict(problem.model.bare_values)
     for f in problem.parameters:
         values.setdefault(f.name, f.value)
     chosen = problem.settings
+    levels = fitted_levels(noise)
     noise = fit_noise(
-        problem.engine, values, noise, GUST_LEVELS,
+        problem.engine, values, noise, levels,
         chosen.first_noise_evaluations, chosen.step_gain, chosen.noise_fit_seconds,
     )  # fmt: skip
-    fit = Fit((), values, noise)
-    return with_white_noise(problem, fit) or fit
+    fit = Fit((), values, noise, levels=levels)
+    return with_latent_noise(problem, fit) or fit
 
 
 def linearise(problem: Problem, fit: Fit) -> tuple[Fit, list[RunPass], Quadratic]:
@@ -137,26 +138,38 @@ def converged(problem: Problem, fit: Fit, held: Collection[str] = ()) -> Fit:
     return fit
 
 
-def with_white_noise(problem: Problem, fit: Fit) -> Fit | None:
-    """With white force and moment as process noise, where that is worth more than a tie."""
-    if fit.levels != GUST_LEVELS:
-        return None
+def with_latent_noise(problem: Problem, fit: Fit) -> Fit | None:
+    """With white process noise, or drifts of trim, where the score asks and a fit pays more than a tie.
+
+    A level at its floor has next to no slope in its logarithm, however much it wants to grow; its
+    score over the scatter of that from block to block says so all the same.
+    """
     engine, chosen = problem.engine, problem.settings
-    _, by_noise, _ = engine.noise_score(fit.values, fit.noise)
-    scores = by_noise.sum(0) / (np.sqrt(len(by_noise)) * by_noise.std(0) + 1e-300)
-    if scores[:6].max() < chosen.white_noise_score:  # velocity and rates
+    latent = [name for name in LATENT_START if name not in fit.levels]
+    if not latent:
         return None
-    first = dict(fit.noise.process)
-    for gust, white in zip(GUST_LEVELS, WHITE_LEVELS, strict=True):
-        first[white] = chosen.white_noise_start * first[gust]
-    levels = GUST_LEVELS + WHITE_LEVELS
+    score = engine.noise_score(fit.values, fit.noise)
+    asked = [n for n in latent if _score(problem, fit, score, n) > chosen.latent_noise_score]
+    if not asked:
+        return None
+    first = {}
+    for name in asked:
+        axes, share = LATENT_START[name]
+        first[name] = max(share * fit.noise.level(axes), 2.0 * fit.noise.floor[name])
+    levels = (*fit.levels, *asked)
     noise = fit_noise(
-        engine, fit.values, replace(fit.noise, process=first), levels,
+        engine, fit.values, fit.noise.with_levels(first), levels,
         chosen.first_noise_evaluations, chosen.step_gain, chosen.noise_fit_seconds,
     )  # fmt: skip
     gained = engine.log_likelihood(fit.values, noise)
     gained -= engine.log_likelihood(fit.values, fit.noise)
     if gained < chosen.tie:
         return None
-    problem.report(f"white process noise beside the gusts: {gained:.1f} nats")
+    problem.report(f"{', '.join(asked)} beside the gusts: {gained:.1f} nats")
     return replace(fit, noise=noise, levels=levels)
+
+
+def _score(problem: Problem, fit: Fit, score: NoiseScore, name: str) -> float:
+    """Slope in a level over its scatter from block to block [std]."""
+    parts, _ = level_slopes(problem.engine, fit.values, fit.noise, name, score)
+    return float(parts.sum() / (np.sqrt(parts.size) * parts.std() + 1e-300))

@@ -12,7 +12,8 @@ from typing import TypeVar
 
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.estimation.engine import Engine, Progress
-from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel
+from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.helicopter_noise import GUST_LEVELS
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.model import effects
 from coax_env.model import parameters as P
@@ -157,7 +158,7 @@ class Fit:
         values: of all parameters.
         noise: levels of process and reading noise.
         objective: minus the log-posterior at its last evaluation [nats].
-        levels: the process-noise levels that are fitted.
+        levels: the noise levels that are fitted.
         std_ratio: std of an effect's parameter by the likelihood's own curvature over that by the
             signatures; 1 where it is not known (refinement.py).
         history: (move, nats) of the search, in order.

@@ -7,7 +7,8 @@ import numpy as np
 from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.vibration import Line
-from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM, WHITE_LEVELS
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
+from coax_env.estimation.helicopter_noise import WHITE_LEVELS
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
 

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, stepped, with_white_noise
+from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, stepped, with_latent_noise
 from coax_env.diagnosis.moves import Proposal, accepted, add, drop, swaps, trials
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import Score, scores
@@ -49,7 +49,7 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
             moved = moved or _forward(problem, fit, passes, quadratic, strong, memory)
             moved = moved or _swap(problem, fit, quadratic, memory)
             moved = moved or _trial(problem, fit, quadratic, candidates, memory)
-            moved = moved or with_white_noise(problem, fit)
+            moved = moved or with_latent_noise(problem, fit)
         if moved is None:  # what is active must also stand against coloured innovations
             complete = True
             moved = drop(problem, fit, quadratic, coloured=True)

@@ -61,11 +61,9 @@ class Settings:
     clear_evidence: float = 10.0
     """Thresholds that a cause is worth after a first refit without it, to need no closer one; ours."""
 
-    # --- white process noise -----------------------------------------------------------------------
-    white_noise_score: float = 2.0
-    """std of the score by which white noise must want to be more before its levels are fitted; ours."""
-    white_noise_start: float = 0.2
-    """s^1/2: level to start from, per gust level: a gust whose memory is 20 ms."""
+    # --- white process noise and drifts of trim -------------------------------------------------------
+    latent_noise_score: float = 2.0
+    """std of the score by which such noise must want to be more before its levels are fitted; ours."""
 
     # --- generic terms -----------------------------------------------------------------------------
     term_evidence: float = 28.0

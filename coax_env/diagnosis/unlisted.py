@@ -54,7 +54,7 @@ PAIRS = tuple((a, b) for a, b in pairwise(TERMS) if a.kin and a.kin == b.kin)
 
 @compiled(makes_arrays=True)
 def _evaluate(states: np.ndarray, inputs: np.ndarray, p: np.ndarray, out: np.ndarray) -> None:
-    """Every term at every row: states (n, 26), inputs (n, 5), out (n, terms)."""
+    """Every term at every row: states (n, 29), inputs (n, 5), out (n, terms)."""
     work = np.empty(dynamics.WORK_SIZE)
     readings = np.empty(N_CHANNELS)
     for k in range(len(states)):

@@ -49,7 +49,7 @@ class Fleet:
     """Arrays of ``count`` helicopters and the calls that fly them.
 
     Attributes:
-        x: full states, shape (count, 26).
+        x: full states, shape (count, 29).
         helicopters, world, mission: all other arrays by name, arrays.py; of the first also as
             attributes: rows, azimuth, streams, params, kinds, targets, progress, held.
         trim, scale: command = trim + scale * action, each (4,), of the nominal vehicle.
@@ -159,7 +159,7 @@ class Fleet:
 
         Args:
             which: bool, shape (count,).
-            states: paper or full states to start from, (count, 16 or 26); random when None.
+            states: paper or full states to start from, (count, 16 or 29); random when None.
             observations: where to put the rows' observations, (count, n_observed).
         """
         self._draw(which)

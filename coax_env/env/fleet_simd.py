@@ -161,7 +161,7 @@ def _sense_of(own):
     """Readings, for parameters of each row's own, or for one vehicle."""
 
     def sense_rows(first, last, active, x, heli, world, observations):
-        """New readings of the active rows first..last-1, at the states `x` (n, 26)."""
+        """New readings of the active rows first..last-1, at the states `x` (n, 29)."""
         rows, streams, params = heli.rows, heli.streams, heli.params
         bias, held, sensors, flags = heli.bias, heli.held, world.sensors[0], world.flags
         which, order = np.empty(SIMD_WIDTH, np.int64), np.empty(last - first, np.int64)
@@ -222,7 +222,7 @@ def _fly_of(own):
 
         Args:
             first, last: the share of the rows. active: which of them fly, (n,) bool.
-            actions: (n, 4). x: full states, (n, 26). flown: where those after the period are put.
+            actions: (n, 4). x: full states, (n, 29). flown: where those after the period are put.
             heli, world, mission, outcome: the batch's arrays, arrays.py.
         """
         observations = outcome.observations
@@ -275,7 +275,7 @@ def fly_dynamics(x: np.ndarray, u: np.ndarray, vehicle: Vehicle, threads: int = 
     No sensors, no task, no ends: what the env's speed is measured against.
 
     Args:
-        x: full states, (count, 26). u: commands and time, (count, 5).
+        x: full states, (count, 29). u: commands and time, (count, 5).
     """
     if vehicle.vector[effects.SWITCHES].any():
         raise InputError(

@@ -73,7 +73,7 @@ def disturb_rows(first, last, active, x, heli, world):
 
     Args:
         first, last: the share of the rows. active: which of them fly, (n,) bool.
-        x: full states, (n, 26), whose gusts change. heli, world: the batch's arrays, arrays.py.
+        x: full states, (n, 29), whose gusts change. heli, world: the batch's arrays, arrays.py.
     """
     air = np.empty(3)
     many = len(heli.params) > 1
@@ -96,7 +96,7 @@ def fly_rows(first, last, active, actions, x, heli, world, mission, outcome):
 
     Args:
         first, last: the share of the rows. active: which of them fly, (n,) bool.
-        actions: (n, 4), clipped in place. x: full states, (n, 26), in place.
+        actions: (n, 4), clipped in place. x: full states, (n, 29), in place.
         heli, world, mission, outcome: the batch's arrays, arrays.py.
     """
     work = np.empty(WORK_SIZE)
@@ -132,7 +132,7 @@ def pay_waypoints(first, last, active, x, heli, mission, outcome):
 
     Args:
         first, last: the share of the rows. active: which of them fly, (n,) bool.
-        x: full states, (n, 26). heli, mission, outcome: the batch's arrays, arrays.py.
+        x: full states, (n, 29). heli, mission, outcome: the batch's arrays, arrays.py.
     """
     bonus = mission.weights[hover.N_TERMS]
     for i in range(first, last):
@@ -170,7 +170,7 @@ def restart_rows(first, last, which, keep_state, x, heli, world, mission, observ
 
     Args:
         first, last: the share of the rows. which: those of them that start anew, (n,) bool.
-        keep_state: from what stands in `x` (n, 26), not from a random start.
+        keep_state: from what stands in `x` (n, 29), not from a random start.
         heli, world, mission: the batch's arrays, arrays.py. observations: (n, n_observed).
     """
     work = np.empty(WORK_SIZE)

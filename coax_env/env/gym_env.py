@@ -100,7 +100,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ## Starting State
     Uniform: tilt +-5 deg, heading +-20 deg, rates +-10 deg/s, velocity +-0.3 m/s per axis, height
     1.5 +- 0.3 m, at the origin; rotors at the nominal trim. ``reset(options={"state": x})`` starts
-    from a state (16,) or (26,) instead. Targets that are not given are drawn, north and east of the
+    from a state (16,) or (29,) instead. Targets that are not given are drawn, north and east of the
     origin +-1 m, height 1 to 2 m, heading +-45 deg in ``position``; +-2 m, 1 to 2.5 m and any
     heading in ``waypoints``.
 
@@ -132,7 +132,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
       None: drawn.
 
     ## Info
-    ``state``, the true full state (26,), `coax_env.model.layout.FULL_STATES`; ``target``, x y z psi in
+    ``state``, the true full state (29,), `coax_env.model.layout.FULL_STATES`; ``target``, x y z psi in
     force, (4,), where the task has one; ``reached``, waypoints so far; after a reset with
     ``randomize``, ``vehicle``: the numbers drawn, by name.
 
@@ -216,7 +216,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def start_states(options: dict[str, Any] | None, count: int) -> np.ndarray | None:
-    """``options["state"]`` of a reset for so many helicopters, (count, 16 or 26); None without."""
+    """``options["state"]`` of a reset for so many helicopters, (count, 16 or 29); None without."""
     if not options or "state" not in options:
         return None
     states = np.asarray(options["state"], dtype=float)

@@ -90,11 +90,11 @@ _START_RATE, _START_VELOCITY, _START_RISE = START["rate"], START["velocity"], ST
 
 @compiled()
 def random_start(stream, command, x):
-    """A random start into the full state `x` (26,): rotors and swash settled on `command` (4,).
+    """A random start into the full state `x` (29,): rotors and swash settled on `command` (4,).
 
     Args:
         stream: key and counter, (2,) uint64. command: [rad/s, rad/s, rad, rad], (4,).
-        x: full state, (26,), is put here.
+        x: full state, (29,), is put here.
     """
     for i in range(N_FULL):
         x[i] = 0.0
@@ -114,7 +114,7 @@ def reward(x, action, target, weights, scales, terms):
     """Sum of the weighted reward terms; they are all zero where the state is not finite.
 
     Args:
-        x: full state, (26,). action: (4,). target: x y z psi, (4,).
+        x: full state, (29,). action: (4,). target: x y z psi, (4,).
         weights, scales: in REWARD_TERMS' order, (N_TERMS,) or more.
         terms: the weighted terms are put here, (N_TERMS,) or more.
     """

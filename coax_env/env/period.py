@@ -134,7 +134,7 @@ def fly_period(x, u, p, ring, row, dt, work):
     no whole number of periods, the period is split. Leaves in `u` the command in force at the end.
 
     Args:
-        x: full state, (26,). u, ring, row, dt: as in `give_command`. p: parameter vector.
+        x: full state, (29,). u, ring, row, dt: as in `give_command`. p: parameter vector.
         work: scratch, (dynamics.WORK_SIZE,).
     """
     slots = len(ring)
@@ -173,17 +173,19 @@ def add_gusts(x, p, gust, stream):
     """Move the gust states on by one period: exponential memory, stationary std `gust` (2,).
 
     Args:
-        x: full state, (26,), in place. p: parameter vector.
+        x: full state, (29,), in place. p: parameter vector.
         gust: std of force [N] and moment [N m], (2,). stream: key and counter, (2,) uint64.
     """
-    share = gust_growth(DT, p[P.GUST_MEMORY])
-    for half, first in ((FORCE, S.GUST_X), (MOMENT, S.GUST_L)):
+    for half, first, memory_xy in (
+        (FORCE, S.GUST_X, P.MEMORY_FORCE_XY), (MOMENT, S.GUST_L, P.MEMORY_MOMENT_XY),
+    ):  # fmt: skip
         if gust[half] > 0.0:
             a, b = two_normals(stream)
             c, _ = two_normals(stream)
-            x[first] += share * gust[half] * a
-            x[first + 1] += share * gust[half] * b
-            x[first + 2] += share * gust[half] * c
+            share = gust_growth(DT, p[memory_xy]) * gust[half]
+            x[first] += share * a
+            x[first + 1] += share * b
+            x[first + 2] += gust_growth(DT, p[memory_xy + 1]) * gust[half] * c
 
 
 # --- readings -----------------------------------------------------------------------------------------

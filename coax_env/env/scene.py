@@ -23,7 +23,7 @@ _TRACE_EVERY, _TRACE_LENGTH = 5, 400  # rows, points: the last 20 s
 class View:
     """What a picture shows of one helicopter.
 
-    ``state`` full, (26,); ``params`` the parameter vector; ``air`` its velocity north east down [m/s];
+    ``state`` full, (29,); ``params`` the parameter vector; ``air`` its velocity north east down [m/s];
     ``target`` x y z psi, or None; ``trace`` past positions x y z, (n, 3), oldest first.
     """
 

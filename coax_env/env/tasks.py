@@ -205,7 +205,7 @@ def reaches(x, target, dwell, progress, course):
     """Count a row at the target; whether this row completes it.
 
     Args:
-        x: full state, (26,). target: x y z psi, (4,). dwell: rows that complete it; 0: none do.
+        x: full state, (29,). target: x y z psi, (4,). dwell: rows that complete it; 0: none do.
         progress: WITHIN and REACHED, (2,), in place. course: targets given, (k, 4).
     """
     north, east, down = x[S.X] - target[NORTH], x[S.Y] - target[EAST], x[S.Z] - target[DOWN]

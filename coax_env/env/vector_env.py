@@ -31,7 +31,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     - ``threads``: at most so many; default one per 256 rows and processor.
 
     Infos are those of `CoaxEnv` with a first axis of num_envs, and masks ``_NAME`` as Gymnasium has
-    them: ``info["state"]`` is (num_envs, 26) and read-only, ``info["reward_terms"]`` and
+    them: ``info["state"]`` is (num_envs, 29) and read-only, ``info["reward_terms"]`` and
     ``info["vehicle"]`` (where rows have started anew) are dicts of (num_envs,). ``render`` gives one
     picture per row.
     """

@@ -53,17 +53,20 @@ class PassJacobians:
     """What a filter pass linearised the model at, for the signature and score passes.
 
     F: (<= n, nx, nx) Jacobians of the step, F_of: (n,) which of them a row has. predicted: (n, nx)
-    states before each row's readings.
+    states before each row's readings. decaying, P, beyond: see kalman.Path.
     """
 
     F: np.ndarray
     F_of: np.ndarray
     predicted: np.ndarray
+    decaying: np.ndarray
+    P: np.ndarray
+    beyond: np.ndarray
 
 
 def _trace(run: RunPass, at: PassJacobians) -> kalman.Trace:
     gains = kalman.Gains(run.gains, run.per_sigma, run.H)
-    path = kalman.Path(at.F, at.F_of, at.predicted)
+    path = kalman.Path(at.F, at.F_of, at.predicted, at.decaying, at.P, at.beyond)
     return kalman.Trace(run.states, run.innovations, gains, path)
 
 
@@ -99,6 +102,26 @@ class _Moves:
     steps: np.ndarray
     probed: np.ndarray
     reading_only: np.ndarray
+
+
+@dataclass(frozen=True)
+class NoiseScore:
+    """Log-likelihood [nats] (-inf where a filter diverged) and its slopes in the noise.
+
+    in_noise: (blocks, e) in the intensity of each entry of the process noise, by blocks of BLOCK
+    seconds, in_decay: (blocks, e) in its decay, in_start: (records, nx) in each variance of the first
+    state, in_reading: (blocks, m) in each channel's variance. Expected: see noise_score.Slopes; of all
+    records, (e,), by record (records, nx), of all (m,).
+    """
+
+    log_likelihood: float
+    in_noise: np.ndarray
+    in_decay: np.ndarray
+    in_start: np.ndarray
+    in_reading: np.ndarray
+    noise_expected: np.ndarray
+    start_expected: np.ndarray
+    reading_expected: np.ndarray
 
 
 class _Buffers:
@@ -169,14 +192,12 @@ class Engine:
             which: indices of records; None: all.
             start_rows: per record, rows at which to keep the filtered covariance.
         """
-        p = self.model.vector(values)
-        q = self.model.process_noise(noise)
-        R = self._reading_variances(noise)
+        p = self.model.vector(values, noise)
 
         def one(i: int) -> RunPass:
             starts = None if start_rows is None else start_rows[i]
             buffers = _Buffers() if keep else None
-            return self._filter_run(i, p, q, R, noise, buffers, start_rows=starts)[0]
+            return self._filter_run(i, p, noise, buffers, start_rows=starts)[0]
 
         return self._each(one, which)
 
@@ -187,22 +208,24 @@ class Engine:
         self,
         i: int,
         p: np.ndarray,
-        q: np.ndarray,
-        R: np.ndarray,
         noise: Noise,
         keep: _Buffers | None,
         jacobians: _Buffers | None = None,
         start_rows: np.ndarray | None = None,
+        decaying: np.ndarray | None = None,
     ) -> tuple[RunPass, PassJacobians]:
         """The filter pass of a run, and what it linearised the model at.
 
         Args:
             keep: buffers for what a mean pass needs (gains, H); nothing is stored without them.
             jacobians: buffers for the rest (F, predicted states); nothing is stored without them.
+            decaying: states whose rows of the covariance are stored with these.
         """
         record = self.records[i]
         n, m = record.z.shape
-        nx = q.size
+        q, decay = self.model.process_noise(noise, p)
+        R = self._reading_variances(noise)
+        nx = self.starts[i][0].size
         u = self.model.inputs(record, p)
         x0, P0 = self.starts[i]
         P0 = P0 + np.diag(self.model.start_noise(noise))
@@ -216,20 +239,24 @@ class Engine:
         F = buffers.array("F", (rows, nx, nx), np.float32)
         F_of = buffers.array("F_of", (rows,), np.int64)
         predicted = buffers.array("predicted", (rows, nx))
+        decaying = np.empty(0, np.int64) if decaying is None else decaying
+        rows_of_P = buffers.array("P", (rows, decaying.size, nx), np.float32)
+        beyond = buffers.array("beyond", (count if rows else 0,))
         starts = np.empty(0, np.int64) if start_rows is None else start_rows
         slots = np.full(n, -1, np.int64)
         slots[starts] = np.arange(starts.size)
         P = np.zeros((starts.size, nx, nx))
-        gains, path = kalman.Gains(K, per_sigma, H), kalman.Path(F, F_of, predicted)
+        gains = kalman.Gains(K, per_sigma, H)
+        path = kalman.Path(F, F_of, predicted, decaying, rows_of_P, beyond)
         log_likelihood, deweighted = kalman.filter_pass(
             self.compiled, kalman.RunData(self.intervals[i], u, record.z),
-            kalman.Variances(x0, P0, R, q), p, GATE, REFRESH,
+            kalman.Variances(x0, P0, R, q, decay), p, GATE, REFRESH,
             kalman.Trace(states, e, gains, path), kalman.Covariances(P, slots),
         )  # fmt: skip
         if not np.isfinite(log_likelihood):
             K[:], per_sigma[:], H[:] = 0.0, 0.0, 0.0
         run = RunPass(record, u, log_likelihood, e, states, deweighted, K, per_sigma, H, starts, P)
-        return run, PassJacobians(F, F_of, predicted)
+        return run, PassJacobians(F, F_of, predicted, decaying, rows_of_P, beyond)
 
     def log_likelihood(
         self, values: Mapping[str, float], noise: Noise, which: Sequence[int] | None = None
@@ -256,13 +283,12 @@ class Engine:
             noise: levels of process and reading noise.
             free: the parameters to differentiate in.
         """
-        p, q = self.model.vector(values), self.model.process_noise(noise)
-        R = self._reading_variances(noise)
-        moves = self._moves(values, free)
+        p = self.model.vector(values, noise)
+        moves = self._moves(values, noise, free)
 
         def one(i: int) -> tuple[Any, ...]:
             with self._borrowed_buffers() as buffers:
-                run, at = self._filter_run(i, p, q, R, noise, _Buffers(), buffers)
+                run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
                 J = buffers.array("J", (int(np.isfinite(run.innovations).sum()), len(free)))
                 by_channel = np.zeros((len(free), run.innovations.shape[1]))
                 if np.isfinite(run.log_likelihood):
@@ -285,13 +311,15 @@ class Engine:
             tuple(f.name for f in free), information, slope, by_channel, np.concatenate(blocks)
         )
 
-    def _moves(self, values: Mapping[str, float], free: Sequence[FreeParameter]) -> _Moves:
+    def _moves(
+        self, values: Mapping[str, float], noise: Noise, free: Sequence[FreeParameter]
+    ) -> _Moves:
         probed = np.array([f.probe > 0.0 and values[f.name] < 0.25 * f.probe for f in free], bool)
         steps = np.array([f.probe if probed[k] else 0.02 * f.std for k, f in enumerate(free)])
         over = np.array([values[f.name] + steps[k] > f.upper for k, f in enumerate(free)], bool)
         steps[over] *= -1.0
         vectors = [
-            self.model.vector({**values, f.name: values[f.name] + step})
+            self.model.vector({**values, f.name: values[f.name] + step}, noise)
             for f, step in zip(free, steps, strict=True)
         ]
         reading_only = np.array([f.reading_only for f in free], bool)
@@ -390,7 +418,7 @@ class Engine:
             values: of all parameters, by name.
             noise: levels of process and reading noise.
         """
-        p = self.model.vector(values)
+        p = self.model.vector(values, noise)
 
         def one(i: int) -> float:
             run = passes[i]
@@ -458,34 +486,47 @@ class Engine:
             converged=converged,
         )
 
-    def noise_score(
-        self, values: Mapping[str, float], noise: Noise
-    ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Log-likelihood and its slopes in the process noise.
+    def noise_score(self, values: Mapping[str, float], noise: Noise) -> NoiseScore:
+        """Log-likelihood and its slopes in the variances of process and reading noise.
 
-        Returns:
-            nats (-inf where a filter diverged), the slope in each state's growth of variance per
-            second, by blocks of BLOCK seconds (blocks, nx), and by record in each variance of the
-            first state, (records, nx).
+        Args:
+            values: of the parameters, by name.
+            noise: levels of process and reading noise.
         """
-        p = self.model.vector(values)
-        q = self.model.process_noise(noise)
-        R = self._reading_variances(noise)
+        p = self.model.vector(values, noise)
+        q, decay = self.model.process_noise(noise, p)
+        places = self.compiled.noise_places
+        nx, m = self.starts[0][0].size, len(self.model.channels)
+        decaying = np.flatnonzero(decay[:nx] > 0.0)
 
-        def one(i: int) -> tuple[float, np.ndarray, np.ndarray]:
+        def one(i: int) -> tuple[float, noise_score.Slopes]:
             t = self.records[i].t
             block = ((t - t[0]) / BLOCK).astype(np.int64)
-            by_noise, by_start = np.zeros((block[-1] + 1, q.size)), np.zeros(q.size)
+            shape = (int(block[-1]) + 1, q.size)
+            slopes = noise_score.Slopes(
+                np.zeros(shape), np.zeros(shape), np.zeros(nx), np.zeros((shape[0], m)),
+                np.zeros(q.size), np.zeros(nx), np.zeros(m),
+            )  # fmt: skip
             with self._borrowed_buffers() as buffers:
-                run, at = self._filter_run(i, p, q, R, noise, buffers, buffers)
+                run, at = self._filter_run(i, p, noise, buffers, buffers, decaying=decaying)
                 if np.isfinite(run.log_likelihood):
                     noise_score.score_pass(
-                        self.intervals[i], _trace(run, at), REFRESH, block, by_noise, by_start
-                    )
-            return run.log_likelihood, by_noise, by_start
+                        self.intervals[i], _trace(run, at), places, q, decay, GATE, REFRESH, block,
+                        slopes,
+                    )  # fmt: skip
+            return run.log_likelihood, slopes
 
-        log_likelihood, by_noise, by_start = zip(*self._each(one), strict=True)
-        return float(sum(log_likelihood)), np.concatenate(by_noise), np.array(by_start)
+        log_likelihood, slopes = zip(*self._each(one), strict=True)
+        return NoiseScore(
+            float(sum(log_likelihood)),
+            np.concatenate([s.in_noise for s in slopes]),
+            np.concatenate([s.in_decay for s in slopes]),
+            np.array([s.in_start for s in slopes]),
+            np.concatenate([s.in_reading for s in slopes]),
+            np.sum([s.noise_expected for s in slopes], axis=0),
+            np.array([s.start_expected for s in slopes]),
+            np.sum([s.reading_expected for s in slopes], axis=0),
+        )
 
 
 def objective(

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numba import float64, types
 
-from coax_env.estimation.state_space import FreeParameter, Noise, Record
+from coax_env.estimation import helicopter_noise
+from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
-from coax_env.logs.flight import Flight, Run
+from coax_env.logs.flight import Run
 from coax_env.model import dynamics, effects
 from coax_env.model import inputs as U
 from coax_env.model import parameters as P
@@ -25,7 +26,6 @@ from coax_env.model.layout import (
     FLYBAR,
     GUST_FORCE,
     GUST_MOMENT,
-    GUSTS,
     LOWER_FLAP,
     N_FULL,
     N_INPUTS,
@@ -45,35 +45,12 @@ MOST_USUAL_SIZES = 5.0
 UNUSUAL_FROM = 2.5
 """Usual sizes beyond which an effect's name is to be taken with care; ours."""
 
-GUST_LEVELS = ("force_xy", "force_z", "moment_xy", "moment_z")
-"""Std of the gust states [N, N m]; x and y share one level."""
-
-WHITE_LEVELS = ("white_force_xy", "white_force_z", "white_moment_xy", "white_moment_z")
-"""Intensity of the white process noise [N s^1/2, N m s^1/2]: force and moment without a memory.
-
-Without it, real flights buy damping that is not there: a damped rate driven by a gust with memory is
-how a likelihood with nothing else at hand writes a rate driven by white noise, and the gust states
-then undo the damping in every prediction.
-"""
-
 HELD = (
     "gravity", "air_density", "rotor_radius",
     "fuselage_length", "fuselage_width", "fuselage_drag_coefficient", "flybar_inertia",
     "flap_coupling_lon", "flap_coupling_lat",
 )  # fmt: skip
 """Base parameters that are never fitted: exact, or one column with others that are."""
-
-LEAST_READING_STD = {
-    "rpm_upper": 1.0, "rpm_lower": 1.0, "p": 0.01, "q": 0.01, "r": 0.01,
-    "ax": 0.05, "ay": 0.05, "az": 0.05, "phi": 0.006, "theta": 0.006, "psi": 0.008,
-    "h": 0.005, "vn": 0.02, "ve": 0.02, "vd": 0.02, "pn": 0.004, "pe": 0.004, "v": 0.02,
-}  # fmt: skip
-"""Least std taken for a reading where the card states no noise; units of CHANNEL_UNITS.
-
-A motion capture is far finer than any rigid-body model (vibration, jitter of the time stamps): with
-its true noise the likelihood would be spent on what no parameter can correct.
-"""
-
 
 _A = float64[::1]
 STEP = types.void(_A, _A, float64, _A, _A, _A)
@@ -82,7 +59,7 @@ MEASURE = types.void(_A, _A, _A, _A, _A)
 
 @compiled()
 def _take_in_innovations(u: Any, p: Any, x: Any) -> None:
-    """Correct a state (26,) in place by the innovations after the input; see input_innovations.py."""
+    """Correct a state (29,) in place by the innovations after the input; see input_innovations.py."""
     if u.size == N_INPUTS:
         return
     upper, lower = u[N_INPUTS + U.OMEGA_U], u[N_INPUTS + U.OMEGA_L]
@@ -123,11 +100,12 @@ def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) 
 
 
 def _small_changes() -> np.ndarray:
-    """Size of a small change of each state, for differences (26,)."""
+    """Size of a small change of each state, for differences (29,)."""
     size = np.empty(N_FULL)
     size[VELOCITY] = size[RATE] = size[POSITION] = size[GUST_FORCE] = 1e-4
     size[LOWER_FLAP] = size[FLYBAR] = size[ATTITUDE] = size[SWASH] = size[GUST_MOMENT] = 1e-5
     size[ROTOR_SPEED] = 1e-2
+    size[S.TRIM_Z], size[S.TRIM_N], size[S.INFLOW] = 1e-4, 1e-5, 1e-5
     return size
 
 
@@ -141,17 +119,24 @@ class HeliModel:
     drift_and_readings = _drift_and_readings
     exact = np.arange(N_FULL) >= N_STATES
     work_size = dynamics.WORK_SIZE
+    noise_places = helicopter_noise.NOISE_PLACES
     state_scale = _small_changes()
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self.bare_values = vehicle.values()
 
-    def vector(self, values: Mapping[str, float]) -> np.ndarray:
-        """Parameter vector of the vehicle with some values changed, effects included."""
+    def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
+        """Parameter vector of the vehicle with some values changed, effects included.
+
+        Args:
+            values: by name. noise: whose memories the gusts have; None: usual ones.
+        """
         vector = effects.pack({**self.bare_values, **values})
         for reference, own in P.GUST_REFERENCE.items():
             vector[reference] = self.vehicle.vector[own]
+        if noise is not None:
+            helicopter_noise.with_memories(vector, noise)
         return vector
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
@@ -197,30 +182,12 @@ class HeliModel:
         return x, np.diag(spread**2 + 1e-12)
 
     def start_noise(self, noise: Noise) -> np.ndarray:
-        """Variances of the gusts at the start of a run (26,)."""
-        variance = np.zeros(N_FULL)
-        variance[GUSTS] = _gust_levels(noise) ** 2
-        return variance
+        """Variances of gusts and trims at the start of a run (29,)."""
+        return helicopter_noise.start_noise(noise)
 
-    def process_noise(self, noise: Noise) -> np.ndarray:
-        """Growth of the states' variances per second (26,): gusts, and a little everywhere."""
-        q = np.zeros(N_FULL)
-        q[VELOCITY] = 1e-4**2
-        q[RATE] = 1e-3**2
-        q[LOWER_FLAP] = q[FLYBAR] = 1e-4**2
-        q[ATTITUDE] = q[POSITION] = 1e-5**2
-        q[ROTOR_SPEED] = 0.1**2
-        q[SWASH] = 1e-4**2
-        level = noise.process
-        p = self.vehicle
-        mass = p["mass"].value
-        q[[S.U, S.V]] += (level.get("white_force_xy", 0.0) / mass) ** 2
-        q[S.W] += (level.get("white_force_z", 0.0) / mass) ** 2
-        q[S.P] += (level.get("white_moment_xy", 0.0) / p["inertia_xx"].value) ** 2
-        q[S.Q] += (level.get("white_moment_xy", 0.0) / p["inertia_yy"].value) ** 2
-        q[S.R] += (level.get("white_moment_z", 0.0) / p["inertia_zz"].value) ** 2
-        q[GUSTS] = 2.0 * _gust_levels(noise) ** 2 / noise.process["memory"]
-        return q
+    def process_noise(self, noise: Noise, vector: np.ndarray) -> ProcessNoise:
+        """What the noise adds to the covariance; see helicopter_noise.py."""
+        return helicopter_noise.process_noise(noise, vector)
 
     # --- what may be fitted -------------------------------------------------------------------------
 
@@ -256,16 +223,6 @@ class HeliModel:
 _DELAY = effects.parameter_index("servo_delay.time")
 
 
-def _gust_levels(noise: Noise) -> np.ndarray:
-    level = noise.process
-    return np.array(
-        [level["force_xy"]] * 2
-        + [level["force_z"]]
-        + [level["moment_xy"]] * 2
-        + [level["moment_z"]]
-    )
-
-
 def _delayed_mean(t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
     """Mean over each row's interval of a held command that arrives late."""
     area = np.concatenate([[0.0], np.cumsum(command[:-1] * np.diff(t))])
@@ -286,56 +243,3 @@ def record_of(run: Run) -> Record:
     for channel, values in run.measured.items():
         z[:, CHANNELS.index(channel)] = values
     return Record(run.name, run.t, run.command, z, origin=float(run.t[0]))
-
-
-def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:
-    """Noise to start from: of readings by the card or their scatter, of gusts by guess.
-
-    A vehicle's vibration is noise to the filter, on top of the card's: its phase is not known.
-    """
-    weight = vehicle["mass"].value * vehicle["gravity"].value
-    arm = vehicle["arm_upper"].value
-    process = {
-        "force_xy": 0.01 * weight,
-        "force_z": 0.01 * weight,
-        "moment_xy": 0.005 * weight * arm,
-        "moment_z": 0.003 * weight * arm,
-        "memory": 0.5,
-    }
-    floor = {
-        "force_xy": 5e-4 * weight,
-        "force_z": 5e-4 * weight,
-        "moment_xy": 3e-4 * weight * arm,
-        "moment_z": 1e-4 * weight * arm,
-    }
-    for gust, white in zip(GUST_LEVELS, WHITE_LEVELS, strict=True):
-        floor[white] = 0.1 * floor[gust]
-        process[white] = 0.1 * floor[gust]
-    shake = vehicle.values().get("vibration.amplitude", 0.0) / np.sqrt(2.0)
-    reading = {
-        c: float(np.hypot(flight.noise[c], shake if c in ("ax", "ay", "az") else 0.0))
-        if c in flight.noise
-        else max(2.0 * sensor_std(flight, c), LEAST_READING_STD[c])
-        for c in flight.channels
-    }
-    return Noise(process, reading, floor)
-
-
-def sensor_std(flight: Flight, channel: str) -> float:
-    """Std of a sensor: the card's, else from its scatter from sample to sample.
-
-    Third differences, robustly: white noise stays, motion cancels.
-    """
-    if channel in flight.noise:
-        return flight.noise[channel]
-    parts = []
-    for run in flight.runs:
-        if channel in run.measured:
-            values = run.measured[channel][np.isfinite(run.measured[channel])]
-            if channel in ANGLES:
-                values = np.unwrap(values)
-            if values.size > 8:
-                parts.append(np.diff(values, 3))
-    if not parts:
-        return LEAST_READING_STD[channel]
-    return float(np.median(np.abs(np.concatenate(parts)))) / 0.6745 / float(np.sqrt(20.0))

@@ -1,6 +1,6 @@
 """The extended Kalman filter over one run, as the textbook has it.
 
-    predict   x = f(x, u),  P = F P F' + Q
+    predict   x = f(x, u),  P = F P F' + Q(dt)
     correct   v = z - h(x),  s^2 = H P H' + R,  K = P H' / s^2,  x = x + K v,  P = P - K H P
 
 The readings of a row are taken in one after the other (their errors are independent), each with what
@@ -61,6 +61,7 @@ class CompiledModel(NamedTuple):
     wraps: np.ndarray
     scale: np.ndarray
     work_size: int
+    noise_places: np.ndarray
 
     @classmethod
     def of(cls, model: Any) -> "CompiledModel":
@@ -73,6 +74,7 @@ class CompiledModel(NamedTuple):
             np.ascontiguousarray(model.wraps, bool),
             np.ascontiguousarray(model.state_scale, float),
             int(model.work_size),
+            np.ascontiguousarray(model.noise_places, np.int64),
         )
 
 
@@ -88,13 +90,15 @@ class Variances(NamedTuple):
     """What the filter believes at first, and how much it believes.
 
     x0: (nx,) first state. P0: (nx, nx) its covariance. R: (m,) variances of the readings.
-    q: (nx,) growth of the states' variances per second.
+    q: (e,) intensity of the process noise in each of its entries, decay: (e,) rate [1/s] at which
+    what it has added decays; see state_space.ProcessNoise.
     """
 
     x0: np.ndarray
     P0: np.ndarray
     R: np.ndarray
     q: np.ndarray
+    decay: np.ndarray
 
 
 class Gains(NamedTuple):
@@ -112,11 +116,16 @@ class Path(NamedTuple):
 
     F: (at most n, nx, nx) Jacobians of the step. F_of: (n,) which of them a row has.
     predicted: (n, nx) states before each row's readings.
+    decaying: (d,) states whose rows of the filtered covariance are kept; P: (n, d, nx) those.
+    beyond: (readings,) 1 / variance expected of a reading beyond the gate, 0 of one within it.
     """
 
     F: np.ndarray
     F_of: np.ndarray
     predicted: np.ndarray
+    decaying: np.ndarray
+    P: np.ndarray
+    beyond: np.ndarray
 
 
 class Trace(NamedTuple):
@@ -148,6 +157,8 @@ class _Filter(NamedTuple):
     h: Any  # readings expected
     v: Any  # innovations, before any reading of the row
     noise: Any  # variances of the row's readings, larger beyond the gate
+    beyond: Any  # 1 / variance expected where a reading is beyond it, else 0
+    Q: Any  # growth of the covariance over the row, by entry
     K: Any  # gain of one reading
     HP: Any
     H: Any  # Sparse (m, nx)
@@ -164,12 +175,12 @@ class _Filter(NamedTuple):
 
 
 MODEL = types.NamedTuple(
-    [STEP, MEASURE, STEP, boolean[::1], boolean[::1], _A, int64], CompiledModel
+    [STEP, MEASURE, STEP, boolean[::1], boolean[::1], _A, int64, int64[:, ::1]], CompiledModel
 )  # fmt: skip
 RUN_DATA = types.NamedTuple([_A, _M, _M], RunData)
-VARIANCES = types.NamedTuple([_A, _M, _A, _A], Variances)
+VARIANCES = types.NamedTuple([_A, _M, _A, _A, _A], Variances)
 GAINS = types.NamedTuple([float32[:, ::1], _A, float32[:, :, ::1]], Gains)
-PATH = types.NamedTuple([float32[:, :, ::1], _N, _M], Path)
+PATH = types.NamedTuple([float32[:, :, ::1], _N, _M, _N, float32[:, :, ::1], _A], Path)
 TRACE = types.NamedTuple([_M, _M, GAINS, PATH], Trace)
 COVARIANCES = types.NamedTuple([float64[:, :, ::1], _N], Covariances)
 
@@ -322,10 +333,12 @@ def _gate(z, R, gate, log_likelihood, w):
                     total += w.P[a, b] * w.H.values[i, b]
                 variance += total * w.H.values[i, a]
             w.noise[i] = R[i]
+            w.beyond[i] = 0.0
             if w.v[i] * w.v[i] > gate * gate * variance:
                 inflated = w.v[i] * w.v[i] / (gate * gate)
                 log_likelihood -= 0.5 * (gate * gate - 1.0) * math.log(inflated / variance)
                 w.noise[i] += inflated - variance
+                w.beyond[i] = 1.0 / variance
                 beyond += 1
     return log_likelihood, beyond
 
@@ -359,9 +372,27 @@ def _correct(i, w):
 # --- predict ----------------------------------------------------------------------------------------
 
 
+@compiled(forceinline=True)
+def growth(dt, decay):
+    """What noise of unit intensity has added after `dt` seconds, decaying all the while [s].
+
+    The variance of an Ornstein-Uhlenbeck process from nothing: (1 - exp(-2 decay dt)) / (2 decay).
+    """
+    if decay * dt < 1e-6:
+        return dt
+    return -math.expm1(-2.0 * decay * dt) / (2.0 * decay)
+
+
 @compiled(**REORDER)
-def _predict(q, dt, w):
-    """P = F P F' + Q as F (F P)', and the mean of the step."""
+def _grow(assumed, dt, w):
+    """Growth of the covariance over a row, by entry, into Q."""
+    for e in range(w.Q.size):
+        w.Q[e] = assumed.q[e] * growth(dt, assumed.decay[e])
+
+
+@compiled(**REORDER)
+def _predict(places, w):
+    """P = F P F' + Q as F (F P)', and the mean of the step; `places` are those of Q's entries."""
     nx = w.x.size
     multiply(w.F, w.P, w.FP)
     for i in range(nx):
@@ -371,8 +402,12 @@ def _predict(q, dt, w):
     for i in range(nx):
         for j in range(i):
             w.P[j, i] = w.P[i, j]
-        w.P[i, i] += q[i] * dt
         w.x[i] = w.x_next[i]
+    for e in range(w.Q.size):
+        i, j = places[e, 0], places[e, 1]
+        w.P[i, j] += w.Q[e]
+        if i != j:
+            w.P[j, i] += w.Q[e]
 
 
 # --- the pass ---------------------------------------------------------------------------------------
@@ -409,7 +444,7 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
     keep, follow = trace.gains.H.shape[0] > 0, trace.path.predicted.shape[0] == n
     log_likelihood = 0.0
     deweighted, reading, F_slot = 0, 0, -1
-    dt_of_F = dt_now = -1.0  # step at which F was computed, and the one it is scaled to
+    dt_of_F = dt_now = dt_of_Q = -1.0  # steps at which F and Q were computed, and F is scaled to
     for k in range(n):
         z, u, dt = run.z[k], run.u[k], run.dt[k]
         fresh = k % refresh == 0
@@ -439,12 +474,18 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
             if keep:
                 _store_row(w.K, trace.gains.K[reading])
                 trace.gains.per_sigma[reading] = per_sigma
+            if follow:
+                trace.path.beyond[reading] = w.beyond[i]
             reading += 1
         _store_row(w.x, trace.states[k])
         if not _all_finite(w.x):
             return -np.inf, deweighted
         if covariances.slots[k] >= 0:
             _store_matrix(w.P, covariances.P[covariances.slots[k]])
+        if follow:
+            for d in range(trace.path.decaying.size):
+                for j in range(w.x.size):
+                    trace.path.P[k, d, j] = w.P[trace.path.decaying[d], j]
         if k == n - 1:
             break
         model.step(w.x, u, dt, p, w.work, w.x_next)
@@ -464,7 +505,10 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
                 F_slot += 1
                 _store_matrix(w.F.values, trace.path.F[F_slot])
             trace.path.F_of[k] = F_slot
-        _predict(assumed.q, dt, w)
+        if abs(dt - dt_of_Q) > SAME_STEP * dt:
+            _grow(assumed, dt, w)
+            dt_of_Q = dt
+        _predict(model.noise_places, w)
     return log_likelihood, deweighted
 
 
@@ -497,7 +541,8 @@ def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
     AH = np.zeros((nx + m, width))
     w = _Filter(
         x=assumed.x0.copy(), P=P, predicted=np.zeros(nx), x_next=np.zeros(nx), h=np.zeros(m),
-        v=np.zeros(m), noise=np.zeros(m), K=np.zeros(nx), HP=np.zeros(width),
+        v=np.zeros(m), noise=np.zeros(m), beyond=np.zeros(m), Q=np.zeros(assumed.q.size),
+        K=np.zeros(nx), HP=np.zeros(width),
         H=with_places(np.zeros((m, nx)), nx), F=with_places(np.zeros((nx, width)), nx),
         A=with_places(AH[:nx], nx), AA=np.zeros((nx, width)), AH=AH,
         FP=np.zeros((nx, width)), PF=np.zeros((nx, width)),

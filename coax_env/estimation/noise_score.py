@@ -1,11 +1,12 @@
-"""Slope of the log-likelihood in the process noise, by the disturbance smoother."""
+"""Slopes of the log-likelihood in the noise levels, by the disturbance smoother."""
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import int64, types
+from numba import float64, int64, types
 
-from coax_env.estimation.kalman import _A, _M, _N, TRACE
+from coax_env.estimation.kalman import _A, _M, _N, TRACE, growth
 from coax_env.estimation.sparse import (
     REORDER,
     find_non_zeros,
@@ -18,27 +19,6 @@ from coax_env.kernel.compilation import compiled
 
 
 @compiled(**REORDER)
-def _row_back(F, r, N, r_next, B, NF):
-    """Across a row: r = F' r, N = F' (F' N)'.
-
-    Args:
-        F: the transposed Jacobian, Sparse. r, N: slope and its variance, in place.
-        r_next, B, NF: scratch.
-    """
-    nx = r.size
-    for i in range(nx):
-        r_next[i] = 0.0
-        for c in range(F.counts[i]):
-            r_next[i] += F.values[i, F.places[i, c]] * r[F.places[i, c]]
-    multiply(F, N, B)
-    for i in range(nx):
-        r[i] = r_next[i]
-        for j in range(nx):
-            NF[j, i] = B[i, j]
-    multiply(F, NF, N)
-
-
-@compiled(**REORDER)
 def _reading_back(b, e, per_sigma, gain, H, K, NK, r, N):
     """Across reading `b`: with A = I - K H, r = A' r + H' e / s and N = A' N A + H' H / s^2.
 
@@ -48,6 +28,10 @@ def _reading_back(b, e, per_sigma, gain, H, K, NK, r, N):
         e, per_sigma, gain: of this reading: whitened innovation, 1 / s and K.
         H: Jacobian of the readings, Sparse. K, NK: scratch.
         r, N: slope and its variance, in place.
+
+    Returns:
+        u^2 / 2 and D / 2, whose difference is the slope in the reading's variance: u is the smoothing
+        error e / s - K' r and D its variance 1 / s^2 + K' N K.
     """
     nx, width = r.size, NK.size
     pull = e * per_sigma
@@ -72,57 +56,161 @@ def _reading_back(b, e, per_sigma, gain, H, K, NK, r, N):
             N[a, j] -= weight * NK[j]
         for i in range(nx):
             N[i, a] -= weight * NK[i]
+    return 0.5 * pull * pull, 0.5 * curve
 
 
-@compiled(types.void(_A, TRACE, int64, _N, _M, _A), makes_arrays=True, **REORDER)
-def score_pass(dt, trace, refresh, block, by_noise, by_start):
-    """Slope of the log-likelihood in the process noise, backwards over a run.
+class Slopes(NamedTuple):
+    """Slopes of a run's log-likelihood, out.
+
+    in_noise: (blocks, e) in the intensity of each entry of the process noise, by blocks of time, and
+    in_decay: (blocks, e) in its decay. in_start: (nx,) in each variance of the first state.
+    in_reading: (blocks, m) in the variance of each channel's readings. Those in variances are what the
+    data show less what was expected; the latter, as shapes but for the blocks, is in
+    noise_expected: (e,), start_expected: (nx,), reading_expected: (m,).
+    """
+
+    in_noise: np.ndarray
+    in_decay: np.ndarray
+    in_start: np.ndarray
+    in_reading: np.ndarray
+    noise_expected: np.ndarray
+    start_expected: np.ndarray
+    reading_expected: np.ndarray
+
+
+SLOPES = types.NamedTuple([_M, _M, _A, _M, _A, _A, _A], Slopes)
+
+
+class _Backward(NamedTuple):
+    """The arrays that a pass works in."""
+
+    r: Any  # slope in the state
+    N: Any  # its variance
+    r_next: Any  # r of a row later
+    B: Any  # F' N
+    NF: Any
+    F: Any  # Sparse, transposed
+
+
+@compiled(**REORDER)
+def _row_back(w):
+    """Across a row: r = F' r, N = F' (F' N)'; what r was is in r_next, F' N in B."""
+    nx = w.r.size
+    for i in range(nx):
+        w.r_next[i] = w.r[i]
+    for i in range(nx):
+        w.r[i] = 0.0
+        for c in range(w.F.counts[i]):
+            w.r[i] += w.F.values[i, w.F.places[i, c]] * w.r_next[w.F.places[i, c]]
+    multiply(w.F, w.N, w.B)
+    for i in range(nx):
+        for j in range(nx):
+            w.NF[j, i] = w.B[i, j]
+    multiply(w.F, w.NF, w.N)
+
+
+@compiled(**REORDER)
+def _decay_slope(g, x, P, dt, w):
+    """Slope in the decay of state `g`, through the Jacobian of a row.
+
+    The slope in F is r x' - N F P, with x the smoothed state (that of a linear model). A decaying
+    state keeps exp(-decay dt) of itself, and moves others by its mean over the row, to first order.
+
+    Args:
+        g: the state. x: of it, filtered. P: (nx,) its row of the filtered covariance.
+        dt: of the row [s]. w: with r before the row, r_next after it, and B.
+    """
+    smoothed = x
+    for j in range(w.r.size):
+        smoothed += P[j] * w.r[j]
+    total = 0.0
+    for c in range(w.F.counts[g]):
+        i = w.F.places[g, c]
+        NFP = 0.0
+        for j in range(w.r.size):
+            NFP += w.B[j, i] * P[j]
+        share = -dt if i == g else -0.5 * dt
+        total += share * w.F.values[g, i] * (w.r_next[i] * smoothed - NFP)
+    return total
+
+
+@compiled(**REORDER)
+def _noise_slopes(places, q, decay, dt, w, in_noise, in_decay, expected):
+    """Slopes through what a row's process noise adds to the covariance."""
+    for e in range(q.size):
+        i, j = places[e, 0], places[e, 1]
+        weight = 0.5 if i == j else 1.0
+        slope = weight * (w.r[i] * w.r[j] - w.N[i, j])
+        grown = growth(dt, decay[e])
+        in_noise[e] += slope * grown
+        expected[e] += weight * w.N[i, j] * grown
+        if decay[e] > 0.0:
+            left = dt * math.exp(-2.0 * decay[e] * dt)
+            in_decay[e] += slope * q[e] * (left - grown) / decay[e]
+
+
+@compiled(
+    types.void(_A, TRACE, int64[:, ::1], _A, _A, float64, int64, _N, SLOPES),
+    makes_arrays=True, **REORDER,
+)  # fmt: skip
+def score_pass(dt, trace, places, q, decay, gate, refresh, block, out):
+    """Slopes of the log-likelihood in the noise levels, backwards over a run.
 
     With r the slope in the predicted state and N its variance, the slope in a variance added to
     state i is (r_i^2 - N_ii) / 2 (Koopman and Shephard 1992, Biometrika 79: the exact score of a
-    linear model; here of the model as linearised along the filter's path).
+    linear model; here of the model as linearised along the filter's path). A reading beyond the gate
+    has the slope of what the gate takes off the likelihood.
 
     Args:
         dt: (n,) seconds from each row to the next. trace: of the filter pass, with gains and path.
-        refresh: as in the filter pass. block: (n,) which block of time each row is in.
-        by_noise: (blocks, nx) slope in each state's growth of variance per second, out.
-        by_start: (nx,) slope in each variance of the first state, out.
+        places: (e, 2) entries of the process noise. q, decay: (e,) as in the filter pass.
+        gate, refresh: as in the filter pass. block: (n,) which block of time each row is in.
+        out: Slopes, from zero.
     """
     e, gains, path = trace.e, trace.gains, trace.path
     n, m = e.shape
-    nx = by_start.size
+    nx = out.in_start.size
     width = padded(nx)
-    r = np.zeros(nx)
-    N = np.zeros((nx, width))
-    NF = np.zeros((nx, width))
-    B = np.zeros((nx, width))
-    r_next = np.zeros(nx)
+    w = _Backward(
+        r=np.zeros(nx), N=np.zeros((nx, width)), r_next=np.zeros(nx), B=np.zeros((nx, width)),
+        NF=np.zeros((nx, width)), F=with_places(np.zeros((nx, nx)), nx),
+    )  # fmt: skip
     NK = np.zeros(width)
     K = np.zeros(width)
-    F = with_places(np.zeros((nx, nx)), nx)
     H = with_places(np.zeros((m, nx)), nx)
     F_slot = H_slot = -1
     reading = gains.per_sigma.size
-    by_noise[:, :] = 0.0
+    beyond = 0.5 * (gate * gate - 1.0)
     for k in range(n - 1, -1, -1):
         if k < n - 1:
-            for i in range(nx):
-                by_noise[block[k], i] += 0.5 * dt[k] * (r[i] * r[i] - N[i, i])
+            _noise_slopes(
+                places, q, decay, dt[k], w, out.in_noise[block[k]], out.in_decay[block[k]],
+                out.noise_expected,
+            )  # fmt: skip
             if path.F_of[k] != F_slot:
                 F_slot = path.F_of[k]
                 for i in range(nx):
                     for j in range(nx):
-                        F.values[j, i] = path.F[F_slot, i, j]
-                find_non_zeros(F)
-            _row_back(F, r, N, r_next, B, NF)
+                        w.F.values[j, i] = path.F[F_slot, i, j]
+                find_non_zeros(w.F)
+            _row_back(w)
+            for d in range(path.decaying.size):
+                g = path.decaying[d]
+                slope = _decay_slope(g, trace.states[k, g], path.P[k, d], dt[k], w)
+                out.in_decay[block[k], g] += slope
         if k // refresh != H_slot:
             H_slot = k // refresh
             unpack(gains.H, H_slot, H)
         for b in range(m - 1, -1, -1):
             if not math.isnan(e[k, b]):
                 reading -= 1
-                _reading_back(
-                    b, e[k, b], gains.per_sigma[reading], gains.K[reading], H, K, NK, r, N
+                shown, expected = _reading_back(
+                    b, e[k, b], gains.per_sigma[reading], gains.K[reading], H, K, NK, w.r, w.N
                 )  # fmt: skip
+                if path.beyond[reading] > 0.0:
+                    shown, expected = beyond * path.beyond[reading], 0.0
+                out.in_reading[block[k], b] += shown - expected
+                out.reading_expected[b] += expected
     for i in range(nx):
-        by_start[i] = 0.5 * (r[i] * r[i] - N[i, i])
+        out.in_start[i] = 0.5 * (w.r[i] * w.r[i] - w.N[i, i])
+        out.start_expected[i] = 0.5 * w.N[i, i]

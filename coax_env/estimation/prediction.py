@@ -16,13 +16,8 @@ import numpy as np
 from coax_env.errors import InputError
 from coax_env.estimation import kalman
 from coax_env.estimation.engine import Engine, Progress, RunPass
-from coax_env.estimation.helicopter import (
-    GUST_LEVELS,
-    HeliModel,
-    record_of,
-    sensor_std,
-    starting_noise,
-)
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import AXES, fitted_levels, sensor_std, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import Noise
 from coax_env.logs.flight import Flight, read_flight
@@ -85,7 +80,7 @@ def replay_runs(
     """
     starts = [_starts(r.t, horizon) for r in engine.records]
     passes = engine.filter(values, noise, start_rows=starts)
-    p = engine.model.vector(values)
+    p = engine.model.vector(values, noise)
     return [
         _replay_run(engine, run, dt, p, horizon, floor)
         for run, dt in zip(passes, engine.intervals, strict=True)
@@ -279,7 +274,7 @@ def replay(
     noise = starting_noise(flight, vehicle)
     if progress:
         progress("estimating gusts and noise")
-    noise = fit_noise(engine, model.bare_values, noise, GUST_LEVELS)
+    noise = fit_noise(engine, model.bare_values, noise, fitted_levels(noise))
     if progress:
         progress("flying the runs open loop")
     runs = replay_runs(engine, model.bare_values, noise, horizon)
@@ -294,12 +289,13 @@ def replay(
 
 
 def gusts_of(noise: Noise) -> dict[str, Any]:
-    """Gust levels as findings.json has them."""
+    """Gust levels as findings.json has them; the memory is that of the axes that move a state most."""
     level = noise.process
+    strongest = max(AXES, key=lambda axes: level[axes] / noise.floor.get(axes, 1.0))
     return {
         "force_N": [level["force_xy"], level["force_xy"], level["force_z"]],
         "moment_Nm": [level["moment_xy"], level["moment_xy"], level["moment_z"]],
-        "memory_s": level["memory"],
+        "memory_s": level[f"memory_{strongest}"],
     }
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -58,16 +58,47 @@ def part(record: Record, rows: np.ndarray) -> Record:
 
 @dataclass(frozen=True)
 class Noise:
-    """Spread of what the model does not say.
+    """Spread of what the model does not say: its levels, by name.
 
-    process: named levels of the model's process noise (for the helicopter: gust force [N] and moment
-    [N m]). reading: std of each channel, in its unit. floor: the least that a process level can be,
-    since no model is exact.
+    process: levels of the model's process noise (for the helicopter: gust force [N] and moment [N m]
+    with their memories [s], and more, see helicopter.py). reading: std of each channel, in its unit.
+    floor, ceiling: the least and the most that a level can be. prior: what is known of a level
+    beforehand, as its median and the std of its logarithm; levels without one are known by the data
+    alone.
     """
 
     process: Mapping[str, float]
     reading: Mapping[str, float] = field(default_factory=dict)
     floor: Mapping[str, float] = field(default_factory=dict)
+    ceiling: Mapping[str, float] = field(default_factory=dict)
+    prior: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def level(self, name: str) -> float:
+        """A level by its name, that of a channel for its readings."""
+        return self.process[name] if name in self.process else self.reading[name]
+
+    def with_levels(self, levels: Mapping[str, float]) -> "Noise":
+        """With some levels changed."""
+        process = {n: levels.get(n, v) for n, v in self.process.items()}
+        return replace(
+            self, process=process, reading={n: levels.get(n, v) for n, v in self.reading.items()}
+        )
+
+    def at_bound(self, name: str) -> bool:
+        """Whether a level stands at the least or most that it can be, within a hundredth."""
+        low, high = self.floor.get(name, 0.0), self.ceiling.get(name, np.inf)
+        return not 1.01 * low < self.level(name) < 0.99 * high
+
+
+class ProcessNoise(NamedTuple):
+    """Process noise as the filter takes it: what it adds to the covariance's entries `noise_places`.
+
+    intensity: (e,) growth per second, decay: (e,) rate [1/s] at which what was added decays (the state
+    of an exponential memory has that of its own decay; 0 elsewhere).
+    """
+
+    intensity: np.ndarray
+    decay: np.ndarray
 
 
 class Model(Protocol):
@@ -85,9 +116,14 @@ class Model(Protocol):
     drift_and_readings: Any  # compiled pointer: (x, u, dt, p, work, out), see above
     exact: np.ndarray  # (nx,) True where the drift is more than first order in dt
     work_size: int
+    noise_places: np.ndarray  # (e, 2) entries (i <= j) of the process noise: all (i, i), then others
 
-    def vector(self, values: Mapping[str, float]) -> np.ndarray:
-        """The compiled functions' parameter vector for named values; others as in the model."""
+    def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
+        """The compiled functions' parameter vector for named values; others as in the model.
+
+        Args:
+            values: by name. noise: whose memories the vector has; None: usual ones.
+        """
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """Inputs (n, nu) of the compiled functions, row by row."""
@@ -98,5 +134,9 @@ class Model(Protocol):
     def start_noise(self, noise: Noise) -> np.ndarray:
         """What the noise levels add to the variances of the first state (nx,)."""
 
-    def process_noise(self, noise: Noise) -> np.ndarray:
-        """Growth of each state's variance per second (nx,)."""
+    def process_noise(self, noise: Noise, vector: np.ndarray) -> ProcessNoise:
+        """What the noise adds to the covariance, entry by entry of `noise_places`.
+
+        Args:
+            noise: its levels. vector: the parameters, which noise may act through.
+        """

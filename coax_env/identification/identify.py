@@ -21,7 +21,8 @@ from coax_env.estimation.fitted_vehicle import (
     median_step,
     with_timing,
 )
-from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import RunReplay, replay_runs
 from coax_env.estimation.quadratic import Quadratic
@@ -164,7 +165,8 @@ def _by_maximum_likelihood(
         )
     report("estimating gusts and noise")
     bare = {**model.bare_values, **{f.name: f.value for f in free}}
-    first = fit_noise(engine, bare, starting_noise(flight, vehicle), GUST_LEVELS)
+    start = starting_noise(flight, vehicle)
+    first = fit_noise(engine, bare, start, fitted_levels(start))
     found = own_numbers(engine, free, bare, first, report)
     values = {**model.bare_values, **found.estimate.values}
     _, lin = engine.linearise(values, found.noise, found.free)

@@ -13,7 +13,8 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine, Estimate
-from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel
+from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.helicopter_noise import fitted_levels
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.quadratic import Linearised
 from coax_env.estimation.state_space import FreeParameter, Noise
@@ -149,7 +150,9 @@ def _by_turns(
             break
         else:
             best = estimate.objective
-        noise = fit_noise(engine, values, noise, GUST_LEVELS, NOISE_EVALUATIONS, LEAST_GAIN)
+        noise = fit_noise(
+            engine, values, noise, fitted_levels(noise), NOISE_EVALUATIONS, LEAST_GAIN
+        )
     return OwnNumbers(free, estimate, noise, widened)
 
 

@@ -14,7 +14,8 @@ from coax_env.diagnosis import vibration
 from coax_env.diagnosis.diagnose import namable
 from coax_env.diagnosis.fits import start
 from coax_env.diagnosis.problem import Problem
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.identification.undetermined import left_open
 from coax_env.logs.flight import Flight

@@ -215,7 +215,7 @@ def _rates_in_flight(x, p, f, dx):
     gust = f[F.MASS] / p[P.GUST_MASS]
     f[F.FORCE_X] = x_u + x_l + gust * x[S.GUST_X]
     f[F.FORCE_Y] = y_u + y_l + gust * x[S.GUST_Y]
-    f[F.FORCE_Z] = z_u + z_l + download + gust * x[S.GUST_Z]
+    f[F.FORCE_Z] = z_u + z_l + download + gust * (x[S.GUST_Z] + x[S.TRIM_Z])
 
     # (35)-(37): hubs at (0, 0, -d); gyroscopic moment -omega x (0, 0, H), (23)-(25)
     momentum = (
@@ -226,7 +226,7 @@ def _rates_in_flight(x, p, f, dx):
     f[F.MOMENT_Z] = f[F.TORQUE_U] - f[F.TORQUE_L]
     f[F.MOMENT_X] += x[S.GUST_L] * f[F.INERTIA_XX] / p[P.GUST_INERTIA_XX]
     f[F.MOMENT_Y] += x[S.GUST_M] * f[F.INERTIA_YY] / p[P.GUST_INERTIA_YY]
-    f[F.MOMENT_Z] += x[S.GUST_N] * f[F.INERTIA_ZZ] / p[P.GUST_INERTIA_ZZ]
+    f[F.MOMENT_Z] += (x[S.GUST_N] + x[S.TRIM_N]) * f[F.INERTIA_ZZ] / p[P.GUST_INERTIA_ZZ]
     if WITH_EFFECTS and p[effects.LOAD] != 0.0:
         _load_effects(x, f, p)
     if WITH_EFFECTS and p[effects.UNLISTED] != 0.0:
@@ -282,6 +282,34 @@ def _rates_where_on(x, p, f, dx):
 _rates: Any = Variants(_rates_bare, _rates_where_on)
 
 
+_GUST_MEMORY = (
+    P.MEMORY_FORCE_XY, P.MEMORY_FORCE_XY, P.MEMORY_FORCE_Z,
+    P.MEMORY_MOMENT_XY, P.MEMORY_MOMENT_XY, P.MEMORY_MOMENT_Z,
+)  # fmt: skip
+
+
+@compiled(forceinline=True)
+def _fade(time, p):
+    """What is left of the gusts after `time` seconds, by group of axes: force xy, z, moment xy, z."""
+    return (
+        math.exp(-time / p[P.MEMORY_FORCE_XY]),
+        math.exp(-time / p[P.MEMORY_FORCE_Z]),
+        math.exp(-time / p[P.MEMORY_MOMENT_XY]),
+        math.exp(-time / p[P.MEMORY_MOMENT_Z]),
+    )
+
+
+@compiled(forceinline=True)
+def _fade_gusts(fade, x):
+    """Let the gusts of a full state fade, in place."""
+    x[S.GUST_X] *= fade[0]
+    x[S.GUST_Y] *= fade[0]
+    x[S.GUST_Z] *= fade[1]
+    x[S.GUST_L] *= fade[2]
+    x[S.GUST_M] *= fade[2]
+    x[S.GUST_N] *= fade[3]
+
+
 @compiled(forceinline=True)
 def _copy(state, out):
     """A full state into another."""
@@ -301,14 +329,15 @@ def _step(x, u, dt, p, work, out):
     for _ in range(parts):
         if WITH_EFFECTS:
             _mean_rotor_accelerations(out, u, h, f)
-        half_gust = math.exp(-0.5 * h / p[P.GUST_MEMORY])
+        half_fade = _fade(0.5 * h, p)
+        for i in range(S.GUST_X, N_FULL):
+            stage[i] = out[i]
         for k in range(4):
             time = 0.0 if k == 0 else (h if k == 3 else 0.5 * h)
-            fade = 1.0 if k == 0 else (half_gust * half_gust if k == 3 else half_gust)
             for i in range(N_STATES):
                 stage[i] = out[i] if k == 0 else out[i] + time * slope[i]
-            for i in range(S.GUST_X, N_FULL):
-                stage[i] = fade * out[i]
+            if k == 1 or k == 3:
+                _fade_gusts(half_fade, stage)
             _actuate(out, u, time + READING_DELAY, f, stage)
             _rates(stage, p, f, slope)
             weight = 1.0 if k == 0 or k == 3 else 2.0
@@ -317,8 +346,8 @@ def _step(x, u, dt, p, work, out):
         for i in range(N_STATES):
             out[i] += h / 6.0 * total[i]
         _actuate(out, u, h, f, out)
-        for i in range(S.GUST_X, N_FULL):
-            out[i] *= half_gust * half_gust
+        for i in range(S.GUST_X, S.TRIM_Z):
+            out[i] = stage[i]
 
 
 step_bare, _step_with_effects = _step
@@ -331,10 +360,10 @@ def step(x, u, dt, p, work, out):
     """Fly one row of held input, with the effects that are on.
 
     Args:
-        x: full state (26,), see state.py. u: commands and time since the run's start (5,).
+        x: full state (29,), see state.py. u: commands and time since the run's start (5,).
         dt: length of the row [s]; rows longer than LONGEST_STEP are split.
         p: parameter vector, see parameters.py. work: scratch (WORK_SIZE,).
-        out: full state (26,) at the row's end; may be `x` itself.
+        out: full state (29,) at the row's end; may be `x` itself.
     """
     if _switched_on(p) + p[effects.PROPERTY] != 0.0:
         _step_with_effects(x, u, dt, p, work, out)
@@ -373,7 +402,7 @@ def drift_and_readings(x, u, dt, p, work, out):
 
     Args:
         x, u, dt, p, work: as in `step`.
-        out: drift (26,) and readings (18,), one after the other (44,).
+        out: drift (29,) and readings (18,), one after the other (44,).
     """
     f, now, slope = work[:_STATE], work[_STATE:_SLOPE], work[_SLOPE:_TOTAL]
     _properties(x, u, p, f)
@@ -388,9 +417,11 @@ def drift_and_readings(x, u, dt, p, work, out):
     _rates(now, p, f, slope)
     for i in range(N_STATES):
         out[i] = dt * slope[i]
-    fade = math.exp(-dt / p[P.GUST_MEMORY]) - 1.0
     for i in range(S.GUST_X, N_FULL):
-        out[i] = fade * x[i]
+        out[i] = x[i]
+    _fade_gusts(_fade(dt, p), out)
+    for i in range(S.GUST_X, N_FULL):
+        out[i] -= x[i]
     _read(x, now, slope, p, f, out[N_FULL:])
 
 
@@ -442,13 +473,14 @@ def _full_derivative(x, u, p, work, dx):
             dx[actuator] = 0.0
     f[F.OMEGA_U_DOT] = dx[S.OMEGA_U]
     f[F.OMEGA_L_DOT] = dx[S.OMEGA_L]
-    for i in range(S.GUST_X, N_FULL):
-        dx[i] = -x[i] / p[P.GUST_MEMORY]
+    dx[S.TRIM_Z :] = 0.0
+    for i, memory in enumerate(_GUST_MEMORY):
+        dx[S.GUST_X + i] = -x[S.GUST_X + i] / p[memory]
     _rates(now, p, f, dx)
 
 
 def full_state(state: np.ndarray, command: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """The full state (26,): the paper's sixteen, actuators settled on the command, no gust.
+    """The full state (29,): the paper's sixteen, actuators settled on the command, no gust.
 
     Args:
         state: the paper's states (16,). command: commands (4,). vehicle: whose state it is.
@@ -468,10 +500,10 @@ def kernel_input(command: np.ndarray, time: float = 0.0) -> np.ndarray:
 
 
 def full_derivative(x: np.ndarray, u: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """Rates of the full state (26,); actuators as first-order states.
+    """Rates of the full state (29,); actuators as first-order states.
 
     Args:
-        x: full state (26,). u: commands and time (5,). vehicle: its numbers and effects.
+        x: full state (29,). u: commands and time (5,). vehicle: its numbers and effects.
     """
     dx = np.zeros(N_FULL)
     _full_derivative(
@@ -514,7 +546,7 @@ def readings(state: Any, command: Any, vehicle: Vehicle) -> dict[str, float]:
     """Noise-free readings of every canonical channel, in its unit (layout.CHANNEL_UNITS).
 
     Args:
-        state: full state (26,), or the paper's (16,) with actuators settled on the command.
+        state: full state (29,), or the paper's (16,) with actuators settled on the command.
         command: commands (4,). vehicle: its numbers and effects.
     """
     state = np.asarray(state, float)

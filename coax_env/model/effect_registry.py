@@ -24,6 +24,9 @@ SWITCHES = slice(P.N_FIXED, P.N_FIXED + len(STAGES))
 
 INFINITY = math.inf
 
+GUST_MEMORY = 0.5
+"""Correlation time of gusts [s] where nothing else is said: the usual one at this size, ours."""
+
 
 @dataclass(frozen=True)
 class EffectParameter:
@@ -175,7 +178,7 @@ def parameter_index(name: str) -> int:
     """Place of ``"mass"`` or ``"ground_effect.gain"`` in the parameter vector."""
     group, _, own = name.rpartition(".")
     if not group:
-        return P.GUST_MEMORY if name == "gust_memory" else list(P.BASE).index(name)
+        return list(P.BASE).index(name)
     if name in P.COMMAND_GAINS:
         return P.COMMAND_GAIN + list(P.COMMAND_GAINS).index(name)
     entry = GROUPS[group]
@@ -185,7 +188,7 @@ def parameter_index(name: str) -> int:
 def off_vector() -> np.ndarray:
     """Parameter vector with every effect off and the base parameters NaN."""
     vector = np.full(n_parameters(), np.nan)
-    vector[P.GUST_MEMORY] = 0.5
+    vector[P.GUST_MEMORIES] = GUST_MEMORY
     vector[P.AIR_DOWN : P.N_FIXED] = 0.0
     vector[_FIRST:] = _offs()[0]
     set_switches(vector)

@@ -119,7 +119,7 @@ def term_value(i: int, x: np.ndarray, f: np.ndarray, p: np.ndarray) -> float:
     """Value of the term TERMS[i], in its unit.
 
     Args:
-        i: which. x: full state (26,). f: workspace (N_FLOW,). p: parameter vector.
+        i: which. x: full state (29,). f: workspace (N_FLOW,). p: parameter vector.
     """
     if i < _SQUARES:
         return x[i]

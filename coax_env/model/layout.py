@@ -26,7 +26,13 @@ GUST_STATES = (
 )  # fmt: skip
 """Force and moment in body axes that decay with an exponential memory; zero outside the estimator."""
 
-FULL_STATES = STATES + ACTUATOR_STATES + GUST_STATES
+TRIM_STATES = (("trim_Z", "N"), ("trim_N", "N m"))
+"""Force and yaw moment that drift: a random walk of thrust and torque; zero outside the estimator."""
+
+INFLOW_STATES = (("inflow", "1"),)
+"""Induced velocity over that at hover, as the rotors' mean speed has it once the inflow has settled."""
+
+FULL_STATES = STATES + ACTUATOR_STATES + GUST_STATES + TRIM_STATES + INFLOW_STATES
 N_STATES = len(STATES)
 N_FULL = len(FULL_STATES)
 
@@ -43,6 +49,7 @@ ACTUATORS = slice(16, 20)
 GUST_FORCE = slice(20, 23)
 GUST_MOMENT = slice(23, 26)
 GUSTS = slice(20, 26)
+TRIMS = slice(26, 28)
 
 # --- command --------------------------------------------------------------------------------------
 COMMANDS = (

@@ -16,6 +16,7 @@ from coax_env.model.layout import (
     ACTUATOR_STATES,
     CHANNELS,
     COMMANDS,
+    GUSTS,
     N_CHANNELS,
     N_FULL,
     N_STATES,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 FASTEST_LAG = 1e-3  # [s] what an actuator without lag is given where its lag is a state
 N_FLOWN = N_STATES + len(ACTUATOR_STATES)  # all but the gusts
+N_SAMPLED = GUSTS.stop
 _STEP = 1e-5  # of each quantity's own scale below: truncation and rounding errors both near 1e-10
 _STATE_SCALE = np.array([1.0] * N_STATES + [100.0, 100.0, 1.0, 1.0] + [1.0] * (N_FULL - N_FLOWN))
 _COMMAND_SCALE = np.array([100.0, 100.0, 1.0, 1.0])
@@ -71,8 +73,9 @@ def sampled(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """One control period of the kernel itself, linearised about hover.
 
-    The state is the full one (26,), gusts included, so lags and held commands are those of
-    `dynamics.step`, with nothing discretised a second time. A reading is taken at a row's end, with
+    The state is the full one up to the gusts (26,): drifts of trim are the estimator's, and the inflow
+    stays at hover's. Lags and held commands are those of `dynamics.step`, with nothing discretised a
+    second time. A reading is taken at a row's end, with
     the command that is in force there::
 
         x[k+1] = A x[k] + B u[k]        y[k] = C x[k] + D u[k-1]       (deviations from trim)
@@ -81,7 +84,7 @@ def sampled(
         dt: control period [s].
 
     Returns:
-        A (26, 26), B (26, 4), C (18, 26), D (18, 4), and the trim: full state (26,), command (4,).
+        A (26, 26), B (26, 4), C (18, 26), D (18, 4), and the trim: state (26,), command (4,).
     """
     state, command = hover_trim(vehicle)
     x, u = full_state(state, command, vehicle), kernel_input(command)
@@ -96,7 +99,8 @@ def sampled(
     B = slopes(lambda u_: fly(x, u_), u, _COMMAND_SCALE)
     C = slopes(lambda x_: _readings(x_, u, vehicle), x, _STATE_SCALE)
     D = slopes(lambda u_: _readings(x, u_, vehicle), u, _COMMAND_SCALE)
-    return A, B, C, D, x, command
+    n = N_SAMPLED
+    return A[:n, :n], B[:n], C[:, :n], D, x[:n], command
 
 
 def slopes(

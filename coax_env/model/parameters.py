@@ -46,10 +46,8 @@ BASE = {
 
 # Gusts act on the machine as it is in the file: fitting a mass or an inertia must not change how much
 # acceleration the gusts are allowed, or the fit would hide misfit in it.
-GUST_MASS, GUST_INERTIA_XX, GUST_INERTIA_YY, GUST_INERTIA_ZZ, GUST_MEMORY = range(
-    len(BASE), len(BASE) + 5
-)
-"""Reference mass and inertias of the gust states [kg, kg m2] and their correlation time [s]."""
+GUST_MASS, GUST_INERTIA_XX, GUST_INERTIA_YY, GUST_INERTIA_ZZ = range(len(BASE), len(BASE) + 4)
+"""Reference mass and inertias of the gust states [kg, kg m2]."""
 GUST_REFERENCE = {
     GUST_MASS: MASS,
     GUST_INERTIA_XX: INERTIA_XX,
@@ -57,7 +55,13 @@ GUST_REFERENCE = {
     GUST_INERTIA_ZZ: INERTIA_ZZ,
 }
 
-AIR_DOWN = GUST_MEMORY + 1
+(
+    MEMORY_FORCE_XY, MEMORY_FORCE_Z, MEMORY_MOMENT_XY, MEMORY_MOMENT_Z,
+) = range(GUST_INERTIA_ZZ + 1, GUST_INERTIA_ZZ + 5)  # fmt: skip
+"""Correlation times of the gust states [s], by group of axes."""
+GUST_MEMORIES = slice(MEMORY_FORCE_XY, MEMORY_MOMENT_Z + 1)
+
+AIR_DOWN = MEMORY_MOMENT_Z + 1
 """Velocity of the air downwards [m/s], beside the effect `wind`: zero but in turbulence.py's air."""
 
 COMMAND_GAINS = {

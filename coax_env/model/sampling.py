@@ -66,10 +66,10 @@ def add_vibration(readings, azimuth, amplitude):
 
 @compiled()
 def measured_quantities(x, readings, sensors, out):
-    """What each sensor measures, of the readings (18,) and the full state (26,), into `out`.
+    """What each sensor measures, of the readings (18,) and the full state (29,), into `out`.
 
     Args:
-        x: full state, (26,). readings: without errors, (18,). sensors: `sensor_table`.
+        x: full state, (29,). readings: without errors, (18,). sensors: `sensor_table`.
         out: is put here, (n_sensors,), each in its channel's unit.
     """
     for k in range(len(sensors)):

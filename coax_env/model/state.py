@@ -12,4 +12,6 @@ from coax_env.model.layout import N_FULL
     OMEGA_U, OMEGA_L, SWASH_LON, SWASH_LAT,  # actuators, where they are
     GUST_X, GUST_Y, GUST_Z,  # force
     GUST_L, GUST_M, GUST_N,  # moment
+    TRIM_Z, TRIM_N,  # drift of thrust and torque
+    INFLOW,
 ) = range(N_FULL)  # fmt: skip

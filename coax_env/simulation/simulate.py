@@ -13,6 +13,7 @@ from coax_env.model import dynamics
 from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model.actuators import limits
+from coax_env.model.effect_registry import GUST_MEMORY
 from coax_env.model.layout import (
     CHANNELS,
     GUSTS,
@@ -51,7 +52,7 @@ class Track:
     """The truth of one simulated run.
 
     Attributes:
-        t: (n,) [s]; state: (n, 26) full state; command: (n, 4); readings: (n, 18) without noise.
+        t: (n,) [s]; state: (n, 29) full state; command: (n, 4); readings: (n, 18) without noise.
         ended: why the run ended before its time, in words; empty where it did not.
     """
 
@@ -154,13 +155,14 @@ class _Machine:
         self._row, self._azimuth, self._dt = 0, 0.0, dt
         self._work = np.empty(dynamics.WORK_SIZE)
         self._gust = np.zeros(6) if gusts is None else gusts.levels()
+        self._memory = GUST_MEMORY if gusts is None else gusts.memory_s
         if gusts is not None:
-            self._p[P.GUST_MEMORY] = gusts.memory_s
+            self._p[P.GUST_MEMORIES] = gusts.memory_s
 
     def disturb(self, rng: np.random.Generator) -> None:
         """The gusts of the coming row; in the first, those of a wind that has always blown."""
         if self._gust.any():
-            growth = period.gust_growth(self._dt, self._p[P.GUST_MEMORY]) if self._row else 1.0
+            growth = period.gust_growth(self._dt, self._memory) if self._row else 1.0
             self.x[GUSTS] += growth * self._gust * rng.standard_normal(6)
 
     def give(self, command: np.ndarray, readings: np.ndarray) -> None:

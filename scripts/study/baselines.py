@@ -21,7 +21,8 @@ from scipy.signal import lfilter, savgol_filter
 
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine, RunPass
-from coax_env.estimation.helicopter import GUST_LEVELS, HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.kernel.compilation import compiled
@@ -86,9 +87,9 @@ def regression(flight: Flight) -> tuple[np.ndarray, np.ndarray, dict[str, list[i
     model = HeliModel(vehicle)
     engine = Engine(model, [record_of(run) for run in flight.runs])
     noise = starting_noise(flight, vehicle)
-    bare = {**model.bare_values, "gust_memory": noise.process["memory"]}
+    bare = model.bare_values
     noise = fit_noise(
-        engine, bare, noise, GUST_LEVELS, SETTINGS.first_noise_evaluations,
+        engine, bare, noise, fitted_levels(noise), SETTINGS.first_noise_evaluations,
         tolerance=SETTINGS.step_gain, seconds=SETTINGS.noise_fit_seconds,
     )  # fmt: skip
     passes = engine.filter(bare, noise)

@@ -32,6 +32,17 @@ def named(row: Row, method: str = OWN) -> list[str]:
     return [cause["effect"] for cause in row["methods"][method]["causes"]]
 
 
+def surely_named(row: Row) -> list[str]:
+    """Effects that the package named and called sure; findings that do not say are all sure."""
+    causes = row["methods"][OWN]["causes"]
+    return [cause["effect"] for cause in causes if cause.get("trust", "sure") == "sure"]
+
+
+def false_names(hidden: Collection[str], found: Iterable[str]) -> list[str]:
+    """Names that are neither a hidden effect nor tied to one."""
+    return [name for name in found if not any(tied(truth, name) for truth in hidden)]
+
+
 def is_exact(hidden: Collection[str], found: Collection[str]) -> bool:
     """Whether the names are the hidden effects or their ties, one for one, and nothing else."""
     if len(hidden) != len(found):
@@ -39,6 +50,11 @@ def is_exact(hidden: Collection[str], found: Collection[str]) -> bool:
     return any(
         all(tied(a, b) for a, b in zip(hidden, order, strict=True)) for order in permutations(found)
     )
+
+
+def is_strictly_exact(row: Row) -> bool:
+    """Whether the package named what is hidden by its own name, no tie counted."""
+    return sorted(row["hidden"]) == sorted(named(row))
 
 
 def is_exact_row(row: Row, method: str = OWN) -> bool:

@@ -8,11 +8,15 @@ import time
 import traceback
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import injector
 import numpy as np
+from injector_air import GUSTY, STILL, Air, disturbances
+from injector_craft import CRAFTS, LAMA, Craft, spread
+from injector_sensors import SENSORS
 
 from coax_env.diagnosis.diagnose import Diagnosis, diagnose
 from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, start
@@ -20,7 +24,8 @@ from coax_env.diagnosis.gain import gain_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
-from coax_env.estimation.helicopter import HeliModel, record_of, starting_noise
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise, still_air
 from coax_env.estimation.prediction import replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
@@ -29,11 +34,11 @@ from coax_env.model.effects import CATALOGUE
 from coax_env.model.vehicle_file import load_vehicle
 from study import baselines
 from study.judge import OWN
-from study.plan import PlannedFlight
+from study.plan import PlannedFlight, size_on
 from study.store import code_hash
 
-GUSTS = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003, "memory": 0.5}
-"""Std of the generator's gusts [N, N m] and their correlation time [s]."""
+GROUPS = {"force_xy": [0, 1], "force_z": [2], "moment_xy": [3, 4], "moment_z": [5]}
+"""Axes of the generator's gusts."""
 
 SHOWN_FROM = 3.0
 """Thresholds that an effect of a flight of kind "many" must be expected to be worth on all its runs; a
@@ -86,16 +91,17 @@ def _result(planned: PlannedFlight, folder: Path, only_own: bool) -> dict[str, A
         "methods": methods,
         "gain": findings["gain"],
         "strongest": {"evidence": evidence if math.isfinite(evidence) else None, "effect": effect},
+        "class": findings.get("class"),
         "history": result.evidence_history,
         "remarks": list(result.remarks),
         "seconds": seconds,
         "flown_s": sum(run.duration for run in flight.runs),
     }
     catalogued = [e for e in truth["hidden"] if e in CATALOGUE]
-    whole_runs = bool(held) and set(held) <= set(flight.run_names)
+    whole_runs = bool(held) and set(held) <= set(flight.run_names) and not planned.arm
     if catalogued == truth["hidden"] and truth["hidden"] and whole_runs:
         row["true_structure"] = gain_of_the_truth(result, catalogued, truth["values"], held)
-    if not only_own:
+    if not only_own and not planned.arm:
         methods |= baselines.name_causes(flight)
     return json.loads(json.dumps(row, allow_nan=False))
 
@@ -106,12 +112,18 @@ def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
     Where the pilot loses the helicopter, the effects are flown at four fifths of their size.
     """
     factor = 1.0
-    for _ in range(5):
-        sizes = {e: {p: factor * v for p, v in t.items()} for e, t in planned.effects.items()}
+    craft = craft_of(planned)
+    for _ in range(8):
+        sizes = {
+            e: {p: factor * v * size_on(craft, f"{e}.{p}") for p, v in t.items()}
+            for e, t in planned.effects.items()
+        }
         try:
             injector.fly(
-                folder, sizes, gusts=planned.gusts, sensors=planned.sensors, seed=planned.seed,
-                runs=planned.runs,
+                folder, sizes, gusts=air_of(planned), sensors=planned.sensors, seed=planned.seed,
+                runs=planned.runs, craft=craft, pilot=planned.pilot,
+                known_as=LAMA if planned.craft == "spread" else None,
+                card_noise=planned.card_noise, longest=planned.longest or math.inf,
             )  # fmt: skip
         except RuntimeError:
             factor *= 0.8
@@ -119,8 +131,37 @@ def hide(planned: PlannedFlight, folder: Path) -> dict[str, Any]:
         path = folder / "truth.json"
         truth = json.loads(path.read_text())
         path.unlink()
+        if planned.craft == "spread":
+            truth["comparable"] = _beside_the_file(truth["comparable"])
         return truth
     raise RuntimeError(f"the pilot cannot fly {planned.effects}")
+
+
+def _beside_the_file(values: Mapping[str, float]) -> dict[str, float]:
+    """Values of effects that no number of the vehicle's file is a part of."""
+    kept = {}
+    for name, value in values.items():
+        effect = CATALOGUE.get(name.partition(".")[0])
+        if effect is None or not effect.replaces:
+            kept[name] = value
+    return kept
+
+
+def craft_of(planned: PlannedFlight) -> Craft:
+    """What flies."""
+    rng = np.random.default_rng(planned.seed)
+    if planned.craft == "drawn":
+        return injector.drawn(rng)
+    if planned.craft == "spread":
+        return spread(LAMA, rng)
+    return CRAFTS[planned.craft]
+
+
+def air_of(planned: PlannedFlight) -> Air:
+    """What it flies in."""
+    if planned.air is not None:
+        return Air(**planned.air)
+    return GUSTY if planned.gusts else STILL
 
 
 def showing(planned: PlannedFlight, place: Path) -> tuple[PlannedFlight, Path, dict[str, Any]]:
@@ -176,22 +217,45 @@ def expected_evidence(
         return result
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     model = HeliModel(vehicle)
-    noise = starting_noise(flight, vehicle)
-    levels = {**noise.process, **noise.floor}
+    true_noise = SENSORS[planned.sensors].noise
+    noise = still_air(starting_noise(replace(flight, noise=dict(true_noise)), vehicle))
     if planned.gusts:
-        levels |= GUSTS  # the model's are what shakes the vehicle as its file has it
+        # the model's are what shakes the vehicle as its file has it
+        levels = dict(gust_levels(air_of(planned), craft_of(planned)))
         heavier = 1.0 + values.get("added_mass.mass", 0.0) / vehicle["mass"].value
         levels["force_xy"] /= heavier
         levels["force_z"] /= heavier
         levels["moment_z"] /= 1.0 + values.get("yaw_inertia.scale", 0.0)
-    noise = replace(noise, process=levels)
+        noise = noise.with_levels(levels)
     problem = Problem.of(model, _records(flight, held, within=False), listed)
     for effect in listed:
         own = {name: 0.5 * values[name] for name in problem.acting_names(effect)}
-        at = {**model.bare_values, "gust_memory": levels["memory"], **values, **own}
+        at = {**model.bare_values, **values, **own}
         _, _, quadratic = linearise(problem, Fit(tuple(listed), at, noise))
         result[effect] = _worth(problem, quadratic, listed, effect, values)
     return result
+
+
+@cache
+def gust_levels(air: Air, craft: Craft) -> dict[str, float]:
+    """Std [N, N m] of an air's gusts on a craft, and correlation times [s], by two minutes of it."""
+    step = 0.002
+    history = disturbances(air, craft, 12_000, 5, step, np.random.default_rng(0))
+    history[:, 0:3] += history[:, 10:13]
+    levels = {group: float(history[:, axes].std()) for group, axes in GROUPS.items()}
+    memories = {
+        f"memory_{group}": float(np.mean([_correlation_time(history[:, i], step) for i in axes]))
+        for group, axes in GROUPS.items()
+    }
+    return levels | memories
+
+
+def _correlation_time(x: np.ndarray, step: float) -> float:
+    """s after which a history is alike to 1/e."""
+    x = x - x.mean()
+    spectrum = np.abs(np.fft.rfft(x, 2 * len(x))) ** 2
+    alike = np.fft.irfft(spectrum)[: len(x)]
+    return step * max(int(np.argmax(alike < alike[0] / math.e)), 1)
 
 
 def _worth(

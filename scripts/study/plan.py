@@ -4,6 +4,7 @@ A flight is planned from the study's seed, its kind and its number within the ki
 larger study contains the smaller one and what is stored stays good.
 """
 
+import json
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +12,7 @@ from typing import Any
 
 import injector
 import numpy as np
+from injector_craft import LAMA, Craft, rotors_of
 
 from study.judge import TIES
 
@@ -73,6 +75,12 @@ SIZES: dict[str, dict[str, tuple[float, float, bool]]] = {
     "sonar_delay": {"time": (0.08, 0.15, False)},
     "vibration": {"amplitude": (0.2, 1.0, False)},
     "outside": {"heading_moment": (0.015, 0.03, False)},
+    "outside_patch": {"lift": (0.3, 0.8, True)},
+    "outside_sector": {"moment": (0.02, 0.05, True)},
+    "outside_resonance": {"moment": (0.01, 0.03, True)},
+    "outside_cable": {"moment": (0.004, 0.01, False)},
+    "outside_stall": {"moment": (0.01, 0.03, True)},
+    "outside_wake": {"moment": (0.01, 0.02, True)},
 }
 """effect -> parameter of the generator -> least, most, either sign: the catalogue's usual sizes."""
 
@@ -80,12 +88,61 @@ CARRIERS = {"wind": "rotor_drag"}
 """Effects that act only through another one, which is then hidden with them."""
 OWN_FORM = {name.partition(".")[0] for name in injector.OTHER_FORM}
 """Effects whose numbers mean something else in the generator than in the catalogue."""
-ALONE = tuple(e for e in SIZES if e not in CARRIERS and e != "outside")
+OUTSIDE = {
+    "outside": "q", "outside_patch": "az", "outside_sector": "q", "outside_resonance": "p",
+    "outside_cable": "r", "outside_stall": "q", "outside_wake": "p",
+}  # fmt: skip
+"""Effects that are in no list, and the channel that each disturbs."""
+FOREIGN = tuple(e for e in OUTSIDE if e != "outside")
+"""Those that no generic term is either."""
+ALONE = tuple(e for e in SIZES if e not in CARRIERS and e not in OUTSIDE)
+
+
+def size_on(craft: Craft, parameter: str) -> float:
+    """Size of an effect on a craft that does what size 1 does on the paper's vehicle.
+
+    Forces go with the weight, moments with the inertia of their axis, lengths with the radius, and
+    what is per airspeed with the rotors' tip speed.
+    """
+    now, paper = (_scales(c) for c in (craft, LAMA))
+    return now[SCALES[parameter]] / paper[SCALES[parameter]] if parameter in SCALES else 1.0
+
+
+def _scales(craft: Craft) -> dict[str, float]:
+    speed = rotors_of(craft).hover_upper
+    weight = craft.mass * craft.gravity
+    return {
+        "mass": craft.mass, "weight": weight, "length": craft.radius, "area": craft.radius**2,
+        "roll": craft.inertia_x, "yaw": craft.inertia_z, "stiffness": weight * craft.hub_upper,
+        "per_speed": 1.0 / (speed * craft.radius), "per_rotor_speed": weight / speed,
+    }  # fmt: skip
+
+
+SCALES = {
+    "rotor_drag.coefficient": "per_rotor_speed", "airframe_drag.area_x": "area",
+    "airframe_drag.area_y": "area", "airframe_drag.area_z": "area",
+    "axial_damping.coefficient": "per_speed", "flap_blowback.gain": "per_speed",
+    "yaw_damping.coefficient": "yaw", "rate_damping.coefficient": "roll",
+    "added_mass.mass": "mass", "cg_offset.x": "length", "cg_offset.y": "length",
+    "hub_stiffness.upper": "stiffness", "hub_stiffness.lower": "stiffness",
+    "imu_lever_arm.x": "length", "imu_lever_arm.y": "length", "imu_lever_arm.z": "length",
+    "outside.heading_moment": "roll", "outside_patch.lift": "weight",
+    "outside_sector.moment": "roll", "outside_resonance.moment": "roll",
+    "outside_cable.moment": "yaw", "outside_stall.moment": "roll", "outside_wake.moment": "roll",
+}  # fmt: skip
+"""Parameter -> what its size goes with; any other is the same on every vehicle."""
 
 
 @dataclass(frozen=True)
 class PlannedFlight:
-    """One flight of the study. effects: name -> parameter -> size."""
+    """One flight of the study.
+
+    effects: name -> parameter -> size. gusts: the generator's usual air; `air`: fields of another one.
+    arm: the class of tests that it belongs to, if any.
+    craft: a name of the generator's; or from the seed, "drawn", or "spread": the paper's vehicle, not
+        quite as its file says. pilot: a name of the generator's.
+    card_noise: factor by which the card's noise is wrong; None: the card has none. longest: s of a run.
+    """
 
     kind: str
     number: int
@@ -94,17 +151,22 @@ class PlannedFlight:
     sensors: str
     seed: int
     runs: tuple[str, ...] | None
+    arm: str = ""
+    air: dict[str, Any] | None = None
+    craft: str = "lama"
+    pilot: str = "usual"
+    card_noise: float | None = 1.0
+    longest: float | None = None
 
     @property
     def name(self) -> str:
         """Name of the flight, and of the file it is stored in."""
-        return f"{self.kind}-{self.number:04d}"
+        of_arm = f"{self.arm}-" if self.arm else ""
+        return f"{of_arm}{self.kind}-{self.number:04d}"
 
     def as_json(self) -> dict[str, Any]:
         """The plan as it is stored with the result."""
-        content = asdict(self)
-        content["runs"] = None if self.runs is None else list(self.runs)
-        return content
+        return dict(json.loads(json.dumps(asdict(self))))
 
 
 def plan(
@@ -142,7 +204,7 @@ def planned(kind: str, number: int, seed: int, runs: tuple[str, ...] | None) -> 
     return PlannedFlight(
         kind=kind,
         number=number,
-        effects={name: _sizes(name, rng) for name in names},
+        effects={name: sizes_of(name, rng) for name in names},
         gusts=_gusty(kind, number),
         sensors="full" if number % 2 == 0 else "onboard",
         seed=int(rng.integers(2**31)),
@@ -167,21 +229,27 @@ def _hidden(kind: str, number: int, rng: np.random.Generator) -> list[str]:
     if kind in ("still", "gusty"):
         return []
     if kind == "outside":
-        return ["outside"]
+        return [list(OUTSIDE)[(number // 4) % len(OUTSIDE)]]
     if kind in ("one", "hover"):  # every effect in turn, with both sets of sensors
         order = np.random.default_rng(KINDS.index(kind)).permutation(len(ALONE))
         return [ALONE[order[(number // 2) % len(ALONE)]]]
     if kind == "many":
-        return _several(MANY, rng, OWN_FORM)
-    return _several(2 if kind == "two" else 3, rng)
+        return several(MANY, rng, OWN_FORM)
+    return several(2 if kind == "two" else 3, rng)
 
 
-def _several(count: int, rng: np.random.Generator, but: Collection[str] = ()) -> list[str]:
-    """Different effects, no two of one tie group: of those one alone may be named."""
+def several(count: int, rng: np.random.Generator, but: Collection[str] = ()) -> list[str]:
+    """Different effects, no two of one tie group: of those one alone may be named.
+
+    Args:
+        count: of effects. rng: that draws them. but: effects that are not hidden.
+    """
     names: list[str] = []
     while len(names) < count:
-        name = str(rng.choice([e for e in SIZES if e != "outside" and e not in but]))
+        name = str(rng.choice([e for e in SIZES if e not in OUTSIDE and e not in but]))
         carried = [name] if name not in CARRIERS else [name, CARRIERS[name]]
+        if any(e in but for e in carried):
+            continue
         new = [e for e in carried if e not in names]
         tied = any({a, b} <= tie for tie in TIES for a in new for b in names)
         if new and not tied and len(names) + len(new) <= count:
@@ -189,7 +257,8 @@ def _several(count: int, rng: np.random.Generator, but: Collection[str] = ()) ->
     return names
 
 
-def _sizes(name: str, rng: np.random.Generator) -> dict[str, float]:
+def sizes_of(name: str, rng: np.random.Generator) -> dict[str, float]:
+    """Sizes of an effect's parameters, drawn uniformly over the usual ones."""
     sizes = {}
     for parameter, (least, most, signed) in SIZES[name].items():
         sign = rng.choice([-1.0, 1.0]) if signed else 1.0

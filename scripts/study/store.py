@@ -18,7 +18,7 @@ def code_hash() -> str:
     """Twelve hex digits over all that a result depends on, as this process found it."""
     digest = hashlib.sha256()
     sources = [*(ROOT / "coax_env").rglob("*.py"), *(ROOT / "coax_env").rglob("*.toml")]
-    sources += [ROOT / "tests" / "injector.py", *(ROOT / "scripts" / "study").glob("*.py")]
+    sources += [*(ROOT / "tests").glob("injector*.py"), *(ROOT / "scripts" / "study").glob("*.py")]
     for path in sorted(sources):
         digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:12]

@@ -11,9 +11,8 @@ from coax_env.model.effects import CATALOGUE
 from coax_env.report import figures
 from study import judge
 from study.judge import OWN, Row
+from study.plan import OUTSIDE
 
-OUTSIDE_CHANNEL = "q"
-"""Channel of the generator's effect that is in no list: a pitch moment."""
 LEAST_GAIN = 5.0  # % that the true structure removes; below it there is no share to speak of
 
 
@@ -119,10 +118,7 @@ def _split(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
 
 
 def _anything_false(row: Row, method: str) -> bool:
-    return any(
-        not any(judge.tied(truth, name) for truth in row["hidden"])
-        for name in judge.named(row, method)
-    )
+    return bool(judge.false_names(row["hidden"], judge.named(row, method)))
 
 
 def _outside(rows: Sequence[Row]) -> Figure:
@@ -130,7 +126,7 @@ def _outside(rows: Sequence[Row]) -> Figure:
     unblamed = sum(not judge.named(row) for row in part)
     return _share(
         "outside the list: unexplained, right axis", ">= 80 %", part,
-        lambda row: judge.reports_unexplained(row, OUTSIDE_CHANNEL),
+        lambda row: judge.reports_unexplained(row, OUTSIDE[row["hidden"][0]]),
         f"no effect blamed in {unblamed} of {len(part)}",
     )  # fmt: skip
 
@@ -266,7 +262,7 @@ def confusion_csv(truths: list[str], names: list[str], shares: np.ndarray) -> st
 def table_text(rows: Sequence[Row], command: str) -> str:
     """table.md."""
     done = judge.finished(rows)
-    parts = [f"# Study of the diagnosis\n\n`{command}`\n\n{_preamble(rows)}\n"]
+    parts = [f"# Study of the diagnosis\n\n`{command}`\n\n{preamble(rows)}\n"]
     methods = sorted({m for row in done for m in row["methods"]}, key=lambda m: (m != OWN, m))
     for method in methods:
         title = "This package" if method == OWN else f"Baseline: {method}"
@@ -284,7 +280,8 @@ def table_text(rows: Sequence[Row], command: str) -> str:
     return "".join(parts)
 
 
-def _preamble(rows: Sequence[Row]) -> str:
+def preamble(rows: Sequence[Row]) -> str:
+    """How many flights, of which code, and how long they took."""
     done = judge.finished(rows)
     codes = sorted({row["code"] for row in rows})
     text = f"{len(done)} flights, {len(rows) - len(done)} failed; code {', '.join(codes)}."
@@ -323,7 +320,9 @@ def _misses(rows: Sequence[Row]) -> str:
         if not judge.is_exact_row(row):
             values = ", ".join(f"{n} = {v:.3g}" for n, v in row["values"].items())
             expected = row["expected"][row["hidden"][0]]
-            found = "; ".join(_cause(cause) for cause in row["methods"][OWN]["causes"]) or "nothing"
+            found = (
+                "; ".join(cause_text(cause) for cause in row["methods"][OWN]["causes"]) or "nothing"
+            )
             lines.append(f"- {_name(row)}: {values} (expected {expected:.0f} nats): {found}")
     return "\n".join(lines) or "None."
 
@@ -332,12 +331,13 @@ def _alarms(rows: Sequence[Row]) -> str:
     lines = []
     for row in _of(rows, "still", "gusty"):
         if judge.named(row):
-            found = "; ".join(_cause(cause) for cause in row["methods"][OWN]["causes"])
+            found = "; ".join(cause_text(cause) for cause in row["methods"][OWN]["causes"])
             lines.append(f"- {_name(row)} ({row['plan']['sensors']}): {found}")
     return "\n".join(lines) or "None."
 
 
-def _cause(cause: dict[str, Any]) -> str:
+def cause_text(cause: dict[str, Any]) -> str:
+    """A cause in words."""
     alike = ", ".join(cause["confusable_with"])
     return f"{cause['effect']} {cause['evidence']:.0f} nats" + (f" (or {alike})" if alike else "")
 

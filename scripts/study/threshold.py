@@ -23,7 +23,7 @@ DRAWS = 2000
 
 def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
     """The threshold for 1 % false alarms and how it was found; None with too few clean flights."""
-    clean = [r for r in judge.finished(rows) if r["plan"]["kind"] in ("still", "gusty")]
+    clean = [r for r in judge.finished(rows) if not r["plan"]["effects"]]
     if len(clean) < FEWEST:
         return None
     evidence = np.array(

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coax_env.errors import InputError
-from coax_env.estimation.helicopter import sensor_std
+from coax_env.estimation.helicopter_noise import sensor_std
 from coax_env.identification.two_step.columns import IMU, joined, rows_of
 from coax_env.identification.two_step.modes import (
     LEAST_MOVEMENT,

@@ -1,0 +1,171 @@
+"""The injector's sensors: what a log has, how often, how exactly, and what its card says of it."""
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+NOISE = {
+    "rpm_upper": 2.0, "rpm_lower": 2.0, "p": 0.0349, "q": 0.0349, "r": 0.0349,
+    "ax": 0.1, "ay": 0.1, "az": 0.1, "phi": 0.0087, "theta": 0.0087, "psi": 0.0087,
+    "h": 0.05, "vn": 0.5, "ve": 0.5, "vd": 0.5,
+}  # fmt: skip
+"""The paper's Table V."""
+
+POSE = {"phi": 1.4e-3, "theta": 1.6e-3, "psi": 8e-4, "pn": 1e-4, "pe": 1e-4, "h": 2e-4}
+"""What third differences of the real CoaX flights show: rad and m."""
+
+TELEMETRY = {
+    "p": 0.3, "q": 0.3, "r": 0.1, "ax": 0.5, "ay": 0.5, "az": 0.8,
+    "phi": 1e-3, "theta": 1e-3, "psi": 2e-3, "h": 0.005,
+}  # fmt: skip
+"""What second differences of the second CoaX's telemetry show: gyros and accelerometers are shaken by
+the rotors."""
+
+
+class Sensors(NamedTuple):
+    """One set of sensors.
+
+    noise: channel -> std. every: channel -> logged rows between readings where more than one.
+    step: s between rows, as the pilot commands. unrest: std of a row's time, share of the step.
+    every_row: rows from one that is logged to the next, in turn. lost: share of rows lost in bursts
+        of 2 to 5. gap: s, one gap in a flight's first run.
+    outliers: share of rows on which all channels are off by up to 12 std. quanta: channel -> step
+        of its readings. formats: channel -> how it is written.
+    """
+
+    noise: Mapping[str, float]
+    every: Mapping[str, int] = {}
+    step: float = 0.01
+    unrest: float = 0.0
+    every_row: tuple[int, ...] = (1,)
+    lost: float = 0.0
+    gap: float = 0.0
+    outliers: float = 0.0
+    quanta: Mapping[str, float] = {}
+    formats: Mapping[str, str] = {}
+
+
+SENSORS = {
+    "full": Sensors(NOISE),
+    "onboard": Sensors(
+        NOISE | {"vn": 0.2, "ve": 0.2, "vd": 0.2},
+        {"h": 5, "phi": 2, "theta": 2, "psi": 2, "vn": 10, "ve": 10, "vd": 10},
+    ),
+    "pose": Sensors(
+        POSE, step=1.0 / 150.0, unrest=0.2, lost=0.01, outliers=0.002,
+        formats=dict.fromkeys(("t", "h", "pn", "pe"), "%.5f"),
+    ),
+    "telemetry": Sensors(
+        TELEMETRY, {"h": 2}, every_row=(4, 4, 4, 3), lost=0.01, gap=1.3,
+        quanta={"phi": 0.001745, "theta": 0.001745, "psi": 0.001745, "h": 0.01},
+    ),
+}  # fmt: skip
+
+
+# --- when ---------------------------------------------------------------------------------------------
+
+
+def clock(sensors: Sensors, settle: float, length: float, rng: np.random.Generator) -> np.ndarray:
+    """Times of the pilot's commands [s], the log beginning at 0, and one more.
+
+    Where the clock is even no number is drawn.
+    """
+    before, after = round(settle / sensors.step), round(length / sensors.step)
+    times = sensors.step * np.arange(-before, after + 1)
+    if sensors.unrest > 0.0:
+        late = sensors.unrest * sensors.step * rng.standard_normal(len(times))
+        times = times + np.clip(late, -0.45 * sensors.step, 0.45 * sensors.step)
+        times = times - times[before]
+    return times
+
+
+def thin(
+    columns: dict[str, np.ndarray],
+    sensors: Sensors,
+    rng: np.random.Generator,
+    *,
+    lost_echoes: bool,
+    radio_gaps: bool,
+    first: bool,
+) -> dict[str, np.ndarray]:
+    """The readings and rows that a real log would have; NaN where a reading is missing."""
+    kept = _logged(columns["t"], sensors, rng, first)
+    columns = {channel: values[kept] for channel, values in columns.items()}
+    n = len(columns["t"])
+    if lost_echoes:
+        columns["h"] = np.where(rng.random(n) < 0.005, 6.5, columns["h"])
+    for channel, step in sensors.every.items():
+        columns[channel] = np.where(np.arange(n) % step == 0, columns[channel], np.nan)
+    if radio_gaps:
+        for _ in range(2):
+            start = int(rng.integers(200, n - 100))
+            gap = slice(start, start + int(rng.integers(5, 25)))
+            for channel in sensors.noise:
+                columns[channel][gap] = np.nan
+    return columns
+
+
+def _logged(
+    t: np.ndarray, sensors: Sensors, rng: np.random.Generator, first: bool
+) -> np.ndarray | slice:
+    """Which rows are in the log."""
+    if sensors.every_row == (1,) and sensors.lost == 0.0:
+        return slice(None)
+    n = len(t)
+    kept = np.zeros(n, dtype=bool)
+    at = np.cumsum([0, *np.resize(sensors.every_row, n)])
+    kept[at[at < n]] = True
+    for _ in range(round(sensors.lost * n / 3.5)):
+        start = int(rng.integers(n))
+        kept[start : start + int(rng.integers(2, 6)) * sensors.every_row[0]] = False
+    if first and sensors.gap > 0.0:
+        start = float(rng.uniform(0.3, 0.8)) * t[-1]
+        kept[(t > start) & (t < start + sensors.gap)] = False
+    return kept
+
+
+def blunt(columns: dict[str, np.ndarray], sensors: Sensors, rng: np.random.Generator) -> None:
+    """Outliers and steps of the readings, in place."""
+    n = len(columns["t"])
+    for row in np.flatnonzero(rng.random(n) < sensors.outliers) if sensors.outliers else ():
+        for channel, std in sensors.noise.items():
+            columns[channel][row] += std * rng.uniform(-12.0, 12.0)
+    for channel, quantum in sensors.quanta.items():
+        columns[channel] = quantum * np.round(columns[channel] / quantum)
+
+
+# --- what --------------------------------------------------------------------------------------------
+
+_FORMATS = {"t": "%.2f", "h": "%.3f", "vn": "%.3f", "ve": "%.3f", "vd": "%.3f"} | dict.fromkeys(
+    ("rpm_upper_cmd", "rpm_lower_cmd", "rpm_upper", "rpm_lower"), "%.1f"
+)
+
+
+def csv_text(columns: Mapping[str, np.ndarray], sensors: Sensors) -> str:
+    """The log of a run."""
+    formats = _FORMATS | dict(sensors.formats)
+    texts = []
+    for channel, values in columns.items():
+        form = formats.get(channel, "%.5f")
+        texts.append(["" if x != x else form % x for x in values.tolist()])
+    rows = [",".join(columns), *(",".join(row) for row in zip(*texts, strict=True))]
+    return "\n".join(rows) + "\n"
+
+
+def card_text(
+    names: Iterable[str], vehicle: str, air: tuple[float, float], noise: Mapping[str, float]
+) -> str:
+    """A flight's test card.
+
+    Args:
+        names: of the runs. vehicle: name or path of its file. air: density and gravity.
+        noise: what the card says of the sensors; empty: nothing.
+    """
+    lines = ["[vehicle]", f'name = "{vehicle}"', "[air]"]
+    lines += [f"density = {air[0]}", f"gravity = {air[1]}"]
+    if noise:
+        lines += ["[noise]", *(f"{channel} = {std}" for channel, std in noise.items())]
+    for name in names:
+        lines += ["[[run]]", f'name = "{name}"', f'file = "{name}.csv"', f'maneuver = "{name}"']
+    return "\n".join(lines) + "\n"
