@@ -585,8 +585,8 @@ def test_scores_are_summed_over_blocks_of_two_seconds():
         _, alone = Engine(Pendulum(), [first]).linearise(TRUTH, NOISE, free)
         np.testing.assert_allclose(lin.blocks[:k].sum(0), alone.slope[0], rtol=1e-6)
 
-    _, by_noise, _ = Engine(Pendulum(), [record]).noise_score(TRUTH, NOISE)
-    assert by_noise.shape == (5, 2) and by_noise.any(axis=1).all()
+    in_noise = Engine(Pendulum(), [record]).noise_score(TRUTH, NOISE).in_noise
+    assert in_noise.shape == (5, 2) and in_noise.any(axis=1).all()
 
 
 def test_a_step_is_shortened_until_the_cost_falls():

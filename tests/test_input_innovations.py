@@ -24,7 +24,7 @@ from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import replay_runs
 from coax_env.model import parameters as P
-from coax_env.model.layout import CHANNELS, GUSTS
+from coax_env.model.layout import CHANNELS, GUSTS, N_FULL
 from coax_env.model.vehicle_file import load_vehicle
 
 LAMA = load_vehicle("lama400d")
@@ -79,11 +79,11 @@ def test_a_pilot_sees_ahead_and_to_the_right_whatever_his_heading():
     for k in range(2, 900):
         seen = np.array([0.0, 0.0, ahead[k], right[k]])
         u[k] = 0.8 * u[k - 1] + 0.1 * u[k - 2] - 0.02 * seen + planted[k]
-    states = 1e-9 * rng.standard_normal((900, 26))
+    states = 1e-9 * rng.standard_normal((900, N_FULL))
     states[:, 12] = heading
     states[:, 13] = np.cos(heading) * ahead - np.sin(heading) * right
     states[:, 14] = np.sin(heading) * ahead + np.cos(heading) * right
-    (e,) = _innovations([made_pass(u, states, np.zeros((1, 26, 26)))])
+    (e,) = _innovations([made_pass(u, states, np.zeros((1, N_FULL, N_FULL)))])
     assert e.shape == (900, 4) and not e[:2].any()
     for j in range(4):
         quiet = np.abs(planted[:, j]) < 0.015
@@ -96,7 +96,7 @@ def test_runs_are_regressed_together_and_each_gets_its_own_back():
     parts = []
     for n, level in ((400, 5.0), (300, -2.0)):
         u = level + 0.05 * np.cumsum(rng.standard_normal((n, 4)), axis=0)
-        parts.append(made_pass(u, rng.standard_normal((n, 26)), np.zeros((1, 26, 26))))
+        parts.append(made_pass(u, rng.standard_normal((n, N_FULL)), np.zeros((1, N_FULL, N_FULL))))
     both = _innovations(parts)
     assert [e.shape for e in both] == [(400, 4), (300, 4)]
     swapped = _innovations(parts[::-1])
@@ -107,10 +107,10 @@ def test_runs_are_regressed_together_and_each_gets_its_own_back():
 def test_a_gain_s_prior_is_what_the_filter_does_not_know_over_what_commands_show():
     """Std of the states that it corrects over that of the tilts, or the rotors' difference or sum."""
     rng = np.random.default_rng(5)
-    std = rng.uniform(0.5, 2.0, 26)
+    std = rng.uniform(0.5, 2.0, N_FULL)
     covariances = np.array([0.5, 1.5])[:, None, None] * np.diag(std**2)  # of mean 1
     e = rng.standard_normal((4000, 4)) * [1.0, 2.0, 0.01, 0.03]
-    run = made_pass(np.zeros((4000, 4)), np.zeros((4000, 26)), covariances)
+    run = made_pass(np.zeros((4000, 4)), np.zeros((4000, N_FULL)), covariances)
     gains = {f.name: f for f in _gains([run], [e])}
     assert list(gains) == list(P.COMMAND_GAINS) and all(f.value == 0.0 for f in gains.values())
     tilt, rotors = math.sqrt(0.5 * (0.01**2 + 0.03**2)), math.sqrt(5.0)

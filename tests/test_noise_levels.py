@@ -21,7 +21,9 @@ from coax_env.estimation.noise_levels import level_slopes
 from coax_env.simulation.simulate import Gusts
 
 LAMA = load_vehicle("lama400d")
-SHAKEN = LAMA.with_effect("spin_up_reaction", gain=1.0).with_effect("motor_lag", upper=0.1, lower=0.1)
+SHAKEN = LAMA.with_effect("spin_up_reaction", gain=1.0).with_effect(
+    "motor_lag", upper=0.1, lower=0.1
+)
 
 
 @pytest.fixture(scope="module")

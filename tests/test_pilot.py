@@ -11,6 +11,7 @@ import pytest
 
 from coax_env import load_vehicle
 from coax_env.model import state as S
+from coax_env.model.layout import N_FULL
 from coax_env.model.linear import N_FLOWN, sampled
 from coax_env.simulation import pilot
 from coax_env.simulation.pilot import TREMOR, TREMOR_MEMORY, Pilot, rounded
@@ -30,7 +31,7 @@ def correction(
     one: Pilot, change: dict[int, float], asked: np.ndarray = STILL, rate: np.ndarray = STILL
 ) -> np.ndarray:
     """What he does where states differ so from trim, at 2 m asked for."""
-    x = np.zeros(26)
+    x = np.zeros(N_FULL)
     x[:N_FLOWN] = one.trim_state
     for i, by in change.items():
         x[i] += by
@@ -93,7 +94,7 @@ def test_hands_tremble_with_their_std_and_memory():
     for dt in (0.01, 0.04):
         one = Pilot(LAMA, 2.0, dt, tremor=2.0)
         rng = RNG(1)
-        x = np.zeros(26)
+        x = np.zeros(N_FULL)
         x[:N_FLOWN] = one.trim_state
         asked = np.array([2.0, 0.0, 0.0, 0.0])
         hands = np.array([one.correction(x, asked, STILL, dt, rng) for _ in range(60_000)])

@@ -18,7 +18,8 @@ from coax_env.diagnosis import remarks
 from coax_env.diagnosis.confounding import channels_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import damping_gain, inflation, is_large, loss, score, scores, swap
-from coax_env.estimation.helicopter import MOST_USUAL_SIZES, WHITE_LEVELS, HeliModel
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES, HeliModel
+from coax_env.estimation.helicopter_noise import WHITE_LEVELS
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 from coax_env.model.effects import CATALOGUE

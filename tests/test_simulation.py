@@ -7,7 +7,7 @@ import pytest
 
 from coax_env import InputError, load_vehicle, read_flight, simulate, write_flight
 from coax_env.model import dynamics
-from coax_env.model.layout import CHANNELS
+from coax_env.model.layout import CHANNELS, N_FULL
 from coax_env.model.sensors import SUITES
 from coax_env.simulation import paper_doublet
 from coax_env.simulation import simulate as sim
@@ -325,7 +325,7 @@ def test_a_rotor_is_never_told_to_turn_backwards():
 
 def test_a_run_ends_upside_down_in_the_ground_or_where_numbers_end():
     """Thrust that points sideways holds nothing up: beyond some 80 degrees there is no flight."""
-    x = np.zeros(26)
+    x = np.zeros(N_FULL)
     x[15] = -1.0
     assert sim._why_it_ends(x) == ""
     for place, value, words in (
