@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from coax_env import load_vehicle
-from coax_env.diagnosis import remarks
+from coax_env.diagnosis import confounding, remarks
 from coax_env.diagnosis.confounding import channels_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import damping_gain, inflation, is_large, loss, score, scores, swap
@@ -221,6 +221,50 @@ def test_a_damping_that_the_flight_does_not_show_is_worth_nothing():
     G[k] = G[:, k] = 0.0
     nats, at = damping_gain(PROBLEM, Fit((), OFF, NOISE), replace(q, G=G), "yaw_damping")
     assert nats == -math.inf and at == {}
+
+
+# --- alternatives in a cause's place --------------------------------------------------------------
+
+
+@pytest.fixture
+def refits(monkeypatch):
+    """Refits that end so many nats above a fit of 1000, by the effect in the cause's place."""
+    above: dict[str, float] = {}
+
+    def ended(made: Problem, fit: Fit, steps: int = 3) -> Fit:
+        return replace(fit, objective=1000.0 + above[fit.active[-1]])
+
+    monkeypatch.setattr(confounding, "fitted", ended)
+    return above
+
+
+SERVO = replace(
+    PROBLEM, own={e: tuple(MODEL.effect_parameters(e)) for e in ("servo_lag", "servo_delay")}
+)
+
+
+@pytest.mark.parametrize(
+    ("inflation", "lost", "tie"),
+    [(1.0, 100.0, 6.0), (1.0, 2.0, 6.0), (5.0, 100.0, 30.0), (5.0, 40.0, 20.0), (5.0, 8.0, 6.0)],
+)
+def test_a_lags_delay_stands_for_it_within_a_tie_of_the_refit(refits, inflation, lost, tie):
+    """Ties are as many nats as the innovations' colour makes of six, but half of what is lost."""
+    names = tuple(f.name for f in SERVO.parameters)
+    k, std = len(names), np.array([f.std for f in SERVO.parameters])
+    at = np.array([f.value for f in SERVO.parameters])
+    G = np.diag(50.0 / std**2)
+    q = Quadratic(names, G, np.zeros(k), at, at, std**-2.0, np.full(k, -np.inf), np.full(k, np.inf),
+                  np.zeros((4, k)), np.ones((k, 18)))  # fmt: skip
+    fit = Fit(("servo_lag",), dict(zip(names, at.tolist(), strict=True)), NOISE, objective=1000.0)
+    for off, there in ((0.97 * tie, True), (1.03 * tie, False), (-3.0, True)):
+        refits["servo_delay"] = off
+        found = confounding._of_one(SERVO, fit, q, "servo_lag", inflation, lost)
+        assert (set(found) == {"servo_delay"}) == there, off
+    # beside the lag it is needed too: both are there, whatever one alone would do
+    slope = np.zeros(k)
+    slope[names.index("servo_delay.time")] = -50.0 / std[names.index("servo_delay.time")]
+    found = confounding._of_one(SERVO, fit, replace(q, g=slope), "servo_lag", inflation, lost)
+    assert set(found) == {"servo_delay"}
 
 
 # --- what is said beside the findings ---------------------------------------------------------------
