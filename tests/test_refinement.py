@@ -125,6 +125,21 @@ def test_the_std_is_that_of_the_likelihoods_own_curvature(share):
         assert found.std_ratio[name] == pytest.approx(expected, rel=1e-3)
 
 
+def test_steps_go_on_until_they_gain_nothing():
+    """Signatures of 1.6 times the information go 5/8 of the way: 3/8 to the fourth is left, or less.
+
+    Where the first step arrives, no second one is taken but to see that it gains nothing.
+    """
+    made, fit, optimum = problem(CURVATURE, 1.6 * CURVATURE)
+    found = refinement.refined(made, fit)
+    left = (at(found.values) - optimum) / (at(fit.values) - optimum)
+    assert np.abs(left).max() < 0.03
+    assert found.objective == pytest.approx(cost(made, found.values), abs=1e-9)
+    there, _, _ = problem(CURVATURE)
+    refinement.refined(there, fit)
+    assert there.engine.filtered < made.engine.filtered
+
+
 def test_coloured_innovations_leave_the_slope_alone(monkeypatch):
     """Then the gains are not those of the true noise: the fit with the gains held is all there is."""
     monkeypatch.setattr(refinement, "is_white", lambda passes, channels: False)
