@@ -22,12 +22,13 @@ from scipy.linalg import schur
 from coax_env.env import hover
 from coax_env.env.actions import Nominal, action_map
 from coax_env.env.hover import DOWN, EAST, HEADING, HORIZONTAL, NORTH
-from coax_env.env.period import DT
+from coax_env.env.period import DELAYS, DT
 from coax_env.errors import InputError
 from coax_env.kernel.angles import wrap_angle, wrap_angles
 from coax_env.kernel.compilation import compiled
 from coax_env.model import inputs as U
 from coax_env.model import state as S
+from coax_env.model.effects import CATALOGUE
 from coax_env.model.layout import (
     ACTUATORS,
     CHANNELS,
@@ -153,7 +154,7 @@ class EstimatorDesign:
 def design_estimator(
     vehicle: Vehicle, nominal: Nominal = None, sensors: str = "onboard"
 ) -> EstimatorDesign:
-    """The filter for a vehicle and a sensor suite. A pure servo delay is taken as a lag.
+    """The filter for a vehicle and a sensor suite. A pure delay is taken as a lag.
 
     Args:
         vehicle: the filter is designed on. sensors: name of the suite.
@@ -201,13 +202,18 @@ def design_estimator(
 
 
 def delay_as_lag(vehicle: Vehicle) -> Vehicle:
-    """The servo's pure delay, which has no finite state, added to its lag instead."""
+    """The commands' pure delays, which have no finite state, added to the actuators' lags instead."""
     values = vehicle.values()
-    delay = values.get("servo_delay.time", 0.0)
-    if delay <= 0.0:
-        return vehicle
-    lag = values.get("servo_lag.time", 0.0) + delay
-    return vehicle.with_effect("servo_delay", time=0.0).with_effect("servo_lag", time=lag)
+    late, swash_later = (max(values.get(f"{name}.time", 0.0), 0.0) for name in DELAYS)
+    for name, delay in (("motor_lag", late), ("servo_lag", late + swash_later)):
+        if delay > 0.0:
+            own = [p.name for p in CATALOGUE[name].parameters]
+            lags = {k: values.get(f"{name}.{k}", 0.0) + delay for k in own}
+            vehicle = vehicle.with_effect(name, **lags)
+    on = [name for name in DELAYS if values.get(f"{name}.time", 0.0) > 0.0]
+    for name in on:
+        vehicle = vehicle.with_effect(name, time=0.0)
+    return vehicle
 
 
 def integrated_readings(design: EstimatorDesign) -> dict[str, float]:

@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from coax_env.diagnosis.diagnose import Diagnosis
     from coax_env.report import ControllerScores
 
+TRUST = {
+    "sure": "sure",
+    "doubtful": "doubtful: they improve the model, but these flights do not settle the name",
+}
+"""How far a cause's name may be believed, and the heading of such causes."""
+
 
 def main() -> None:
     options = arguments()
@@ -108,7 +114,10 @@ def save(
 def summary(result: "Diagnosis") -> str:
     """The findings in a few lines."""
     findings = result.findings
-    lines = [f"verdict: {findings['verdict']}", *map(cause_line, findings["causes"])]
+    lines = [f"verdict: {findings['verdict']}"]
+    for trust, words in TRUST.items():
+        causes = [c for c in findings["causes"] if c["trust"] == trust]
+        lines += [f"{words}:", *map(cause_line, causes)] if causes else []
     if findings["causes"]:
         lines.append("  (nats: gain in log-likelihood by the cause; 5 nats are odds of 150 to 1)")
     for term in findings["unexplained"]:
@@ -121,6 +130,8 @@ def summary(result: "Diagnosis") -> str:
             f"gain on {', '.join(gain['held_out'])}: {gain['error_removed_percent']:.0f} % of the "
             f"{gain['horizon_s']:g} s prediction error removed{interval}"
         )
+        if gain["persistence_percent"] is not None:
+            lines.append(f"  (that nothing moves: {gain['persistence_percent']:.0f} %)")
     following = findings["next_maneuver"]
     if following:
         lines.append(f"fly next: {following['maneuver']}: {following['why']}")
@@ -128,14 +139,18 @@ def summary(result: "Diagnosis") -> str:
 
 
 def cause_line(cause: Mapping[str, Any]) -> str:
-    """A cause of findings.json in one line."""
+    """A cause of findings.json in one line, and what speaks against it in another."""
     values = ", ".join(
         f"{name.split('.')[1]} {p['value']:.4g} +- {p['std']:.2g} {p['unit']}"
+        if p["determined"]
+        else f"{name.split('.')[1]} not determined"
         for name, p in cause["parameters"].items()
     )
     line = f"  {cause['effect']}: {values}; {cause['evidence']:.0f} nats"
     if cause["confusable_with"]:
         line += f"; confounded alternatives: {', '.join(cause['confusable_with'])}"
+    if cause["doubts"]:
+        line += f"\n    {'; '.join(cause['doubts'])}"
     return line
 
 

@@ -51,7 +51,7 @@ def everything() -> Vehicle:
     """The vehicle with every effect of the catalogue at half its usual size."""
     vehicle = load_vehicle("lama400d")
     for name, effect in CATALOGUE.items():
-        sizes = {p.name: p.off if p.shape else p.off + 0.5 * p.usual for p in effect.parameters}
+        sizes = {p.name: p.off if p.shape else p.at(0.5) for p in effect.parameters}
         vehicle = vehicle.with_effect(name, **sizes)
     return vehicle.with_actuators(swash_travel=0.15, swash_rate=3.0, rotor_acceleration=600.0)
 

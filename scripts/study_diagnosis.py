@@ -1,5 +1,6 @@
 """How often is the diagnosis right? Flights whose truth is known, flown, diagnosed and counted."""
 
+import json
 import shlex
 import sys
 from collections.abc import Iterator
@@ -117,7 +118,7 @@ def adopt(out: Path) -> None:
     measured = out / "threshold.json"
     if not measured.exists():
         raise InputError(f"no calibration in {out}: it takes {threshold.FEWEST} clean flights")
-    write_text(calibration.PATH, measured.read_text(encoding="utf-8"))
+    calibration.adopt(json.loads(measured.read_text(encoding="utf-8")))
 
 
 def write_results(out: Path, rows: list[dict[str, Any]], command: str) -> None:

@@ -15,11 +15,13 @@ DETERMINED = 0.25  # of the prior's width that a std may be: a wide interval hol
 FORM = 0.1  # of a value whose effect has another form in the injector than in the catalogue
 
 _OTHER_FORM = {name.partition(".")[0] for name in injector.OTHER_FORM}
-_PRIOR = {
-    full: parameter.usual
+_PARAMETERS = {
+    full: parameter
     for entry in effects.CATALOGUE.values()
     for full, parameter in zip(entry.names(), entry.parameters, strict=True)
 }
+_PRIOR = {full: parameter.usual for full, parameter in _PARAMETERS.items()}
+_OFF = {full: parameter.off for full, parameter in _PARAMETERS.items()}
 
 
 def say_what_was_found(findings: Mapping[str, Any]) -> dict[str, Any]:
@@ -46,12 +48,16 @@ def check_causes(
     assert len(findings["causes"]) == len(found), f"named twice: {found}"
     for cause in findings["causes"]:
         for full, reported in cause["parameters"].items():
-            assert full in values, f"no truth to check {full} by"
+            assert full in _OFF, f"no truth to check {full} by"
+            truth = values.get(full, _OFF[full])  # an effect's other numbers are at their off-value
             allowed = WITHIN * reported["std"]
             if cause["effect"] in _OTHER_FORM:
-                allowed += FORM * abs(values[full])
-            assert abs(reported["value"] - values[full]) < allowed, (full, values[full], reported)
-            assert 0.0 < reported["std"] < DETERMINED * _PRIOR[full], (full, reported)
+                allowed += FORM * abs(truth)
+            assert abs(reported["value"] - truth) < allowed, (full, truth, reported)
+            determined = (
+                DETERMINED if truth != _OFF[full] else 1.0
+            )  # what is not there may be unseen
+            assert 0.0 < reported["std"] < determined * _PRIOR[full], (full, reported)
     unchecked = set(values) - {full for _, parameters in found.values() for full in parameters}
     assert not unchecked, f"values that no cause reports: {unchecked}"
     assert findings["verdict"] == ("explained" if hidden else "consistent"), (

@@ -44,10 +44,14 @@ from injector_craft import (
 )
 from injector_sensors import SENSORS, Sensors, blunt, card_text, clock, csv_text, thin
 from numba import njit
+from scipy.spatial.transform import Rotation
 
 RPM = 30.0 / math.pi
 STEP, SUBSTEPS = 0.01, 5
 SETTLE = 6.0  # s flown before the log starts
+BLADES = 1.2  # rise of thrust with rotor speed at held inflow, over the square law's
+GIVE = 0.005  # s in which a linkage's stop, or a servo near its command, gives way
+FULL = 12.3  # V of the battery as a log starts, in hover
 
 
 class Hidden(NamedTuple):
@@ -74,6 +78,15 @@ class Hidden(NamedTuple):
     swash_gain: float = 0.0
     servo_lag: float = 0.0
     servo_delay: float = 0.0
+    servo_play: float = 0.0
+    servo_deadband: float = 0.0
+    servo_rate: float = 0.0
+    command_delay: float = 0.0
+    phase_slope: float = 0.0
+    droop_upper: float = 0.0
+    droop_lower: float = 0.0
+    per_volt: float = 0.0
+    inflow_time: float = 0.0
     motor_upper: float = 0.0
     motor_lower: float = 0.0
     sag: float = 0.0
@@ -106,6 +119,22 @@ class Hidden(NamedTuple):
     sonar_tilt: float = 0.0
     sonar_delay: float = 0.0
     vibration: float = 0.0
+    upper_blowback: float = 0.0
+    coupling: float = 0.0
+    tether: float = 0.0
+    tether_north: float = 0.0
+    tether_east: float = 0.0
+    pose_delay: float = 0.0
+    attitude_delay: float = 0.0
+    marker_x: float = 0.0
+    marker_y: float = 0.0
+    marker_z: float = 0.0
+    frame_yaw: float = 0.0
+    iron_x: float = 0.0
+    iron_y: float = 0.0
+    gyro_scale_x: float = 0.0
+    gyro_scale_y: float = 0.0
+    gyro_scale_z: float = 0.0
     heading_moment: float = 0.0
     patch_lift: float = 0.0
     sector_moment: float = 0.0
@@ -131,10 +160,17 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
     "wind": {"north": ("wind_north", 1.2), "east": ("wind_east", -1.0)},
     "swash_offset": {"lon": ("swash_lon", 0.015), "lat": ("swash_lat", -0.010)},
     "cg_offset": {"x": ("cg_x", 1.5e-3), "y": ("cg_y", -1.0e-3)},
-    "swash_phase": {"angle": ("swash_phase", 0.15)},
+    "swash_phase": {"angle": ("swash_phase", 0.15), "per_rpm": ("phase_slope", 0.0)},
     "swash_gain": {"scale": ("swash_gain", -0.15)},
     "servo_lag": {"time": ("servo_lag", 0.04)},
     "servo_delay": {"time": ("servo_delay", 0.03)},
+    "servo_play": {"width": ("servo_play", 0.02)},
+    "servo_deadband": {"width": ("servo_deadband", 0.012)},
+    "servo_rate": {"limit": ("servo_rate", 0.8)},
+    "command_delay": {"time": ("command_delay", 0.04)},
+    "motor_droop": {"upper": ("droop_upper", 0.25), "lower": ("droop_lower", 0.2)},
+    "battery_voltage": {"per_volt": ("per_volt", 0.06)},
+    "dynamic_inflow": {"time": ("inflow_time", 0.05)},
     "motor_lag": {"upper": ("motor_upper", 0.08), "lower": ("motor_lower", 0.08)},
     "battery_sag": {"rate": ("sag", 0.002)},
     "added_mass": {"mass": ("added_mass", 0.06)},
@@ -158,6 +194,21 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
     "sonar_tilt": {"on": ("sonar_tilt", 1.0)},
     "sonar_delay": {"time": ("sonar_delay", 0.12)},
     "vibration": {"amplitude": ("vibration", 0.5)},
+    "upper_blowback": {"gain": ("upper_blowback", 0.0075)},
+    "gyroscopic_coupling": {"gain": ("coupling", 1.0)},
+    "position_spring": {
+        "stiffness": ("tether", 0.15), "north": ("tether_north", 0.8), "east": ("tether_east", -0.5)
+    },
+    "pose_delay": {"time": ("pose_delay", 0.04)},
+    "attitude_delay": {"time": ("attitude_delay", 0.03)},
+    "marker_offset": {
+        "x": ("marker_x", 0.04), "y": ("marker_y", -0.03), "z": ("marker_z", -0.06)
+    },
+    "frame_yaw": {"angle": ("frame_yaw", 0.15)},
+    "magnetic_field": {"x": ("iron_x", 0.08), "y": ("iron_y", -0.06)},
+    "gyro_scale": {
+        "x": ("gyro_scale_x", 0.06), "y": ("gyro_scale_y", -0.05), "z": ("gyro_scale_z", 0.08)
+    },
     # in no catalogue: M = a sin(3 psi), which a generic term is
     "outside": {"heading_moment": ("heading_moment", 0.02)},
     # and what no generic term is: pitch moment in one sector of the heading
@@ -177,6 +228,12 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
 OTHER_FORM = frozenset({"ground_effect.gain", "airframe_drag.area_x", "airframe_drag.area_y",
                         "airframe_drag.area_z", "wake_interference.gain",
                         "rate_damping.coefficient", "vibration.amplitude", "battery_sag.rate",
+                        "battery_voltage.per_volt", "dynamic_inflow.time", "command_delay.time",
+                        "servo_rate.limit",
+                        "motor_droop.upper", "motor_droop.lower",
+                        "servo_play.width", "servo_deadband.width",
+                        "position_spring.stiffness", "position_spring.north",
+                        "position_spring.east", "upper_blowback.gain",
                         "outside.heading_moment", "outside_patch.lift", "outside_sector.moment",
                         "outside_resonance.moment", "outside_cable.moment",
                         "outside_stall.moment", "outside_wake.moment"})  # fmt: skip
@@ -263,8 +320,9 @@ def _suited(pilot: Pilot, craft: Craft) -> Pilot:
 # --- physics --------------------------------------------------------------------------------------
 # State: 0-2 position, 3-5 velocity (both inertial), 6-9 quaternion body to inertial, 10-12 p q r,
 # 13-16 alpha_l beta_l alpha_f beta_f, 17-18 rotor speeds, 19-20 swash, 21-22 swash rates, 23 a cable's
-# twist in units of its greatest, 24 side speed as the wake remembers it.
-N_STATE = 25
+# twist in units of its greatest, 24 side speed as the wake remembers it, 25-26 the plate behind a
+# linkage's play, 27 induced velocity over that in hover.
+N_STATE = 28
 CABLE = 0.3  # rad of turn after which a cable slips
 WAKE = 0.8  # s that a wake lasts
 # Out: 0-2 specific force, 3-5 angular acceleration (body axes).
@@ -316,6 +374,14 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     thrust_u *= (wu / rotors.hover_upper) ** hidden.thrust_excess
     thrust_l *= (wl / rotors.hover_lower) ** hidden.thrust_excess
     thrust_l -= hidden.wake * 0.5 * math.sqrt(thrust_u * thrust_l)
+    if (
+        hidden.inflow_time > 0.0
+    ):  # blades at an inflow of its own momentum, which air's mass holds up
+        faster = 0.5 * (wu / rotors.hover_upper + wl / rotors.hover_lower)
+        stronger = 1.0 + BLADES * (1.0 - s[27] / faster)
+        thrust_u *= stronger
+        thrust_l *= stronger
+        ds[27] = (faster**2 * stronger - s[27] ** 2) / ((2.0 + BLADES) * hidden.inflow_time)
     height = max(-s[2], 0.4 * craft.radius)
     rise = 1.0 / (1.0 - hidden.ge_gain * (craft.radius / (4.0 * height)) ** 2)  # Cheeseman-Bennett
     rise *= 1.0 + hidden.axial * air[2] / math.sqrt(1.0 + (air[2] / 4.2) ** 2)
@@ -328,6 +394,9 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     # discs
     alpha_l, beta_l = s[13], s[14]
     alpha_u, beta_u = craft.bar_lon * s[15], craft.bar_lat * s[16]
+    slide = hidden.upper_blowback / math.sqrt(1.0 + (air[0] ** 2 + air[1] ** 2) / 64.0)
+    alpha_u += slide * air[0]
+    beta_u -= slide * air[1]
     F_u = _thrust_vector(thrust_u, alpha_u, beta_u)
     F_l = _thrust_vector(thrust_l, alpha_l, beta_l)
     moment = _cross(np.array([0.0, 0.0, -craft.hub_upper]), F_u)
@@ -355,6 +424,9 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     moment[1] -= hidden.rate_damping * omega[1] * (0.8 + 0.4 * abs(omega[1]))
     moment[2] -= hidden.yaw_damping * omega[2] * (0.85 + 0.15 * abs(omega[2]))
     moment[2] += torque_u - torque_l
+    cable = np.array([hidden.tether_north - s[0], hidden.tether_east - s[1], 0.0])
+    stretch = math.sqrt(1.0 + (cable[0] ** 2 + cable[1] ** 2) / 900.0)
+    force += hidden.tether / stretch * (R.T @ cable)
     force += push[:3]
     force += R.T @ push[10:13]
     moment += push[3:6]
@@ -369,6 +441,9 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     moment[2] += hidden.spin_up * (upper * ds[17] - craft.rotor_lower * ds[18])
 
     # rigid body; the paper's rotational equations have no omega x I omega
+    turned = np.array([craft.inertia_x, craft.inertia_y, craft.inertia_z])
+    turned[2] *= 1.0 + hidden.yaw_inertia
+    moment -= hidden.coupling * _cross(omega, turned * omega)
     H = craft.rotor_lower * wl - upper * wu
     moment -= _cross(omega, np.array([0.0, 0.0, H]))
     out[0:3] = force / (craft.mass + hidden.added_mass)
@@ -386,9 +461,11 @@ def _derivative(s, command, push, hidden, craft, rotors, out):
     ds[10:13] = out[3:6]
 
     # flaps
-    cos, sin = math.cos(hidden.swash_phase), math.sin(hidden.swash_phase)
-    lon = cos * s[19] - sin * s[20] + hidden.swash_lon
-    lat = sin * s[19] + cos * s[20] + hidden.swash_lat
+    phase = hidden.swash_phase + hidden.phase_slope * RPM * (wl - rotors.hover_lower)
+    cos, sin = math.cos(phase), math.sin(phase)
+    plate = s[25:27] if hidden.servo_play > 0.0 else s[19:21]
+    lon = cos * plate[0] - sin * plate[1] + hidden.swash_lon
+    lat = sin * plate[0] + cos * plate[1] + hidden.swash_lat
     gain = craft.swash_gain * (1.0 + hidden.swash_gain)
     back = hidden.blowback / math.sqrt(1.0 + (air[0] ** 2 + air[1] ** 2) / 64.0)
     ds[13] = (gain * lon - alpha_l + back * air[0]) / craft.flap_time - q
@@ -414,16 +491,28 @@ def _unlisted(s, air, heading, speed, hidden, force, moment):
 
 @njit(cache=True)
 def _actuate(s, command, hidden, ds):
-    """Motors pull towards the commanded speed by torque; servos are critically damped."""
+    """Motors pull towards the commanded speed by torque; servos are critically damped.
+
+    A plate with play is pushed by stops that give way; a servo runs at full speed or in proportion.
+    """
     if hidden.motor_upper > 0.0:
         ds[17] = (command[0] ** 2 - s[17] ** 2) / (2.0 * s[17] * hidden.motor_upper)
     if hidden.motor_lower > 0.0:
         ds[18] = (command[1] ** 2 - s[18] ** 2) / (2.0 * s[18] * hidden.motor_lower)
-    if hidden.servo_lag > 0.0:
-        n = 2.0 / hidden.servo_lag
-        for i in range(2):
+    for i in range(2):
+        wanted = command[2 + i]
+        if abs(wanted - s[19 + i]) < hidden.servo_deadband:
+            wanted = s[19 + i]
+        if hidden.servo_lag > 0.0:
+            n = 2.0 / hidden.servo_lag
             ds[19 + i] = s[21 + i]
-            ds[21 + i] = n * n * (command[2 + i] - s[19 + i]) - 2.0 * n * s[21 + i]
+            ds[21 + i] = n * n * (wanted - s[19 + i]) - 2.0 * n * s[21 + i]
+        elif hidden.servo_rate > 0.0:
+            ds[19 + i] = (wanted - s[19 + i]) / GIVE
+        if hidden.servo_rate > 0.0:
+            ds[19 + i] = min(max(ds[19 + i], -hidden.servo_rate), hidden.servo_rate)
+        error = s[19 + i] - s[25 + i]
+        ds[25 + i] = math.copysign(max(abs(error) - 0.5 * hidden.servo_play, 0.0), error) / GIVE
 
 
 @njit(cache=True)
@@ -439,8 +528,10 @@ def _follow_at_once(s, command, hidden, craft):
         lower = craft.rotor_lower
         s[12] -= hidden.spin_up * lower * jump / (craft.inertia_z * (1.0 + hidden.yaw_inertia))
         s[18] = command[1]
-    if hidden.servo_lag == 0.0:
-        s[19:21] = command[2:4]
+    if hidden.servo_lag == 0.0 and hidden.servo_rate == 0.0:
+        for i in range(2):
+            if abs(command[2 + i] - s[19 + i]) >= hidden.servo_deadband:
+                s[19 + i] = command[2 + i]
 
 
 @njit(cache=True)
@@ -516,6 +607,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden,
     s[0], s[1], s[2] = targets[0, 0], targets[0, 1], -targets[0, 2]
     s[6], s[9] = math.cos(targets[0, 3] / 2.0), math.sin(targets[0, 3] / 2.0)
     s[17], s[18] = rotors.hover_upper, rotors.hover_lower
+    s[27] = 1.0
     out = np.zeros(6)
     out2 = np.zeros(6)
     memory = np.zeros(4)
@@ -560,7 +652,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden,
         commands[k] = command
         rates = s[10:13].copy()  # a gyro does not see the jump of this very instant
         push = pushes[k * SUBSTEPS]
-        actual = _acting(commands, clock, dt, k, 0, hidden)
+        actual = _acting(commands, clock, dt, k, 0, hidden, rotors)
         _follow_at_once(s, actual, hidden, craft)
         ds = _derivative(s, actual, push, hidden, craft, rotors, out)
         readings[k, 0:2] = s[17:19] + push[8:10]
@@ -575,7 +667,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden,
         for j in range(SUBSTEPS):
             push, later = pushes[k * SUBSTEPS + j], pushes[k * SUBSTEPS + j + 1]
             if j > 0 and _is_late(hidden):
-                actual = _acting(commands, clock, dt, k, j, hidden)
+                actual = _acting(commands, clock, dt, k, j, hidden, rotors)
                 _follow_at_once(s, actual, hidden, craft)
             ds = _derivative(s, actual, push, hidden, craft, rotors, out2)
             middle = s + h * ds
@@ -591,18 +683,43 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden,
 @njit(cache=True)
 def _is_late(hidden):
     """Whether a command may begin to act between two rows."""
-    return hidden.servo_delay > 0.0
+    return hidden.servo_delay > 0.0 or hidden.command_delay > 0.0
 
 
 @njit(cache=True)
-def _acting(commands, clock, dt, k, j, hidden):
+def _acting(commands, clock, dt, k, j, hidden, rotors):
     """The command that acts in substep j of row k: delays and supply, before motors and servos."""
-    actual = commands[k].copy()
-    actual[2:4] = commands[_late_row(clock, dt, k, j, hidden.servo_delay), 2:4]
+    common = 0.0
+    if hidden.command_delay > 0.0:  # packets come sooner or later by 3 ms
+        common = hidden.command_delay + 0.003 * math.sin(2.4 * k)
+    actual = commands[_late_row(clock, dt, k, j, common)].copy()
+    actual[2:4] = commands[_late_row(clock, dt, k, j, common + hidden.servo_delay), 2:4]
+    actual[0] = _drooped(actual[0], hidden.droop_upper, rotors.hover_upper)
+    actual[1] = _drooped(actual[1], hidden.droop_lower, rotors.hover_lower)
+    if hidden.per_volt > 0.0:
+        weaker = volts(commands[k, 0] * commands[k, 1], clock[k], rotors) / FULL
+        actual[:2] *= weaker ** (FULL * hidden.per_volt)
     sag = math.exp(-hidden.sag * max(clock[k], 0.0))
     actual[0] *= sag
     actual[1] *= sag
     return actual
+
+
+@njit(cache=True)
+def _drooped(command, droop, hover):
+    """Speed at which a proportional speed control balances a torque that grows as its square."""
+    if droop == 0.0:
+        return command
+    stiff = 2.0 / hover * (1.0 - droop) / droop  # torque of hover, per rad/s of error
+    load = 4.0 * (1.0 + stiff * command) / hover**2
+    return 0.5 * hover**2 * (math.sqrt(stiff**2 + load) - stiff)
+
+
+@njit(cache=True)
+def volts(product, time, rotors):
+    """Battery voltage [V] at a product of commanded rotor speeds, by charge drawn and by load."""
+    load = product / (rotors.hover_upper * rotors.hover_lower) - 1.0
+    return FULL - 0.015 * max(time, 0.0) - 0.8 * load
 
 
 @njit(cache=True)
@@ -815,12 +932,21 @@ def _fly_run(
     columns["rpm_upper_cmd"], columns["rpm_lower_cmd"] = RPM * commands[first:, :2].T
     columns["rpm_upper"], columns["rpm_lower"] = RPM * logged[:, :2].T
     columns["delta_lon"], columns["delta_lat"] = commands[first:, 2:].T
-    for i, channel in enumerate(("p", "q", "r", "ax", "ay", "az", "phi", "theta", "psi")):
+    for i, channel in enumerate(("p", "q", "r", "ax", "ay", "az")):
         columns[channel] = logged[:, 2 + i]
-    past = _late_rows(first, rows, hidden.sonar_delay, sensors.step)
+    past = _late_rows(first, rows, hidden.attitude_delay + hidden.pose_delay, sensors.step)
+    columns["phi"], columns["theta"], columns["psi"] = readings[past, 8:11].T
+    past = _late_rows(first, rows, hidden.sonar_delay + hidden.pose_delay, sensors.step)
     columns["h"] = -readings[past, 13] * (1.0 + hidden.sonar_tilt * (1.0 / logged[:, 17] - 1.0))
     columns["vn"], columns["ve"], columns["vd"] = logged[:, 14:17].T
-    columns["pn"], columns["pe"] = logged[:, 11:13].T
+    past = _late_rows(first, rows, hidden.pose_delay, sensors.step)
+    columns["pn"], columns["pe"] = readings[past, 11:13].T
+    if hidden.per_volt > 0.0:
+        product = commands[first:, 0] * commands[first:, 1]
+        rotors = rotors_of(craft)
+        columns["battery_v"] = np.array(
+            [volts(p, t, rotors) for p, t in zip(product, times[first:-1], strict=True)]
+        )
     return columns
 
 
@@ -850,13 +976,24 @@ def _wander(white: np.ndarray, std: float, memory: float, step: float) -> np.nda
     return out
 
 
-COMMANDED = ("t", "rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat")
+COMMANDED = ("t", "rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat", "battery_v")
 
 
 def _read(
     columns: dict[str, np.ndarray], sensors: Sensors, hidden: Hidden, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
     """What the sensors make of the truth; channels that they lack are left out."""
+    _misplace(columns, hidden)
+    if (
+        hidden.iron_x or hidden.iron_y
+    ):  # a compass between magnets: level, the field it points along
+        ahead, right = (
+            np.cos(columns["psi"]) + hidden.iron_x,
+            hidden.iron_y - np.sin(columns["psi"]),
+        )
+        columns["psi"] = np.arctan2(-right, ahead)
+    for i, axis in enumerate("xyz"):
+        columns["pqr"[i]] = columns["pqr"[i]] * (1.0 + getattr(hidden, f"gyro_scale_{axis}"))
     for first, x, y in (("p", "q", "r"), ("ax", "ay", "az")):  # turned axes: Rodrigues, both triads
         turned = _turn(np.stack([columns[c] for c in (first, x, y)]), hidden.tilt_x, hidden.tilt_y)
         columns[first], columns[x], columns[y] = turned
@@ -876,6 +1013,23 @@ def _read(
     blunt(columns, sensors, rng)
     columns["psi"] = (columns["psi"] + np.pi) % (2.0 * np.pi) - np.pi
     return {c: x for c, x in columns.items() if c in COMMANDED or c in sensors.noise}
+
+
+def _misplace(columns: dict[str, np.ndarray], hidden: Hidden) -> None:
+    """Place and velocity of the markers, attitude in their axes, in place."""
+    arm = [hidden.marker_x, hidden.marker_y, hidden.marker_z]
+    if not any(arm) and not hidden.frame_yaw:
+        return
+    angles = ("psi", "theta", "phi")
+    body = Rotation.from_euler("ZYX", np.stack([columns[c] for c in angles], axis=-1))
+    shift = body.apply(arm) * [1.0, 1.0, -1.0]
+    for i, (place, speed) in enumerate((("pn", "vn"), ("pe", "ve"), ("h", "vd"))):
+        columns[place] = columns[place] + shift[:, i]
+        sign = -1.0 if place == "h" else 1.0
+        columns[speed] = columns[speed] + sign * np.gradient(shift[:, i], columns["t"])
+    seen = body * Rotation.from_euler("z", hidden.frame_yaw)
+    for channel, values in zip(angles, seen.as_euler("ZYX").T, strict=True):
+        columns[channel] = values
 
 
 def _turn(vectors: np.ndarray, tilt_x: float, tilt_y: float) -> np.ndarray:

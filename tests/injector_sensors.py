@@ -137,9 +137,14 @@ def blunt(columns: dict[str, np.ndarray], sensors: Sensors, rng: np.random.Gener
 
 # --- what --------------------------------------------------------------------------------------------
 
-_FORMATS = {"t": "%.2f", "h": "%.3f", "vn": "%.3f", "ve": "%.3f", "vd": "%.3f"} | dict.fromkeys(
-    ("rpm_upper_cmd", "rpm_lower_cmd", "rpm_upper", "rpm_lower"), "%.1f"
-)
+_FORMATS = {
+    "t": "%.2f",
+    "battery_v": "%.2f",
+    "h": "%.3f",
+    "vn": "%.3f",
+    "ve": "%.3f",
+    "vd": "%.3f",
+} | dict.fromkeys(("rpm_upper_cmd", "rpm_lower_cmd", "rpm_upper", "rpm_lower"), "%.1f")
 
 
 def csv_text(columns: Mapping[str, np.ndarray], sensors: Sensors) -> str:

@@ -306,7 +306,9 @@ LABELLED: dict[str, tuple[list[str], dict[str, float]]] = {
 @pytest.mark.parametrize("name", LABELLED)
 def test_labelled_flights(name):
     hidden, values = LABELLED[name]
-    check_causes(diagnose(shared_flight(name)).findings, hidden, values)
+    findings = diagnose(shared_flight(name)).findings
+    check_causes(findings, hidden, values)
+    check_all_sure(findings)
 
 
 @pytest.mark.slow
@@ -322,7 +324,15 @@ def test_the_bundled_flight():
         "motor_lag.upper": values["motor_tau"], "motor_lag.lower": values["motor_tau"],
         **{f"gyro_bias.{axis}": bias for axis, bias in gyro.items()},
     }  # fmt: skip
-    check_causes(diagnose(folder).findings, planted["hidden"], truth)
+    findings = diagnose(folder).findings
+    check_causes(findings, planted["hidden"], truth)
+    check_all_sure(findings)
+
+
+def check_all_sure(findings: Mapping[str, Any]) -> None:
+    """No true name is doubted, and the flight is of the calibrated class."""
+    assert {c["effect"]: c["doubts"] for c in findings["causes"] if c["trust"] != "sure"} == {}
+    assert findings["false_alarm_rate"] is not None and findings["class"]["why"] == ""
 
 
 # --- what is handed over -------------------------------------------------------------------------
@@ -334,10 +344,11 @@ def check_form(result: Diagnosis) -> None:
     assert json.loads(json.dumps(findings, allow_nan=False)) == findings
     assert set(findings) == {
         "verdict", "causes", "gusts", "unexplained", "gain", "next_maneuver", "false_alarm_rate",
+        "class", "model_check",
     }  # fmt: skip
     assert findings["verdict"] in ("consistent", "explained", "partly explained", "unexplained")
-    evidence = [cause["evidence"] for cause in findings["causes"]]
-    assert evidence == sorted(evidence, reverse=True)
+    strength = [(cause["trust"] == "sure", cause["evidence"]) for cause in findings["causes"]]
+    assert strength == sorted(strength, reverse=True), "sure ones first, each the strongest first"
     for cause in findings["causes"]:
         assert set(cause) >= {"effect", "parameters", "evidence", "confusable_with", "channels"}
         entry = effects.CATALOGUE[cause["effect"]]
@@ -346,6 +357,12 @@ def check_form(result: Diagnosis) -> None:
             said = cause["parameters"][full]
             assert said["unit"] == parameter.unit
             assert isinstance(said["value"], float) and said["std"] > 0.0
+            assert isinstance(said["determined"], bool)
+        robust = cause["robust"]
+        assert isinstance(robust["noise"], bool) and 0.0 <= robust["runs"] <= 1.0
+        assert robust["kept"] is None or 0.0 <= robust["kept"] <= 1.0
+        assert cause["trust"] == ("doubtful" if cause["doubts"] else "sure")
+        assert cause["since"] is None
         assert set(cause["confusable_with"]) <= set(effects.CATALOGUE) - {cause["effect"]}
         assert cause["channels"] and set(cause["channels"]) <= set(CHANNELS)
     gusts = findings["gusts"]
@@ -373,7 +390,8 @@ def check_gain(gain: Mapping[str, Any], flight: Flight) -> None:
         assert set(entry) >= {"before", "before_refitted", "after", "noise", "unit", "ci95"}
         low, high = entry["ci95"]
         assert 0.0 < low <= entry["after"] <= high
-    for key in ("error_removed_percent", "refitted_base_percent", "noise_floor_percent"):
+    percent = ("error_removed_percent", "refitted_base_percent", "noise_floor_percent")
+    for key in (*percent, "persistence_percent"):
         assert isinstance(gain[key], float)
     assert len(gain["ci95"]) == 2
 

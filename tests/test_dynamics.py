@@ -80,6 +80,7 @@ class Second:
         self.tilt_upper = linkage * state[8:10]
         self.swash = command[2:4].copy()
         self.force, self.moment, self.flap_rate = np.zeros(3), np.zeros(3), np.zeros(2)
+        self.hubs = np.zeros(3)  # their shift against the centre of gravity
         self.gain, self.flybar_time = v["swash_to_flap"], v["flybar_time_constant"]
         self.air = self.V.copy()
 
@@ -94,7 +95,8 @@ class Second:
         force = upper + lower + [0, 0, download] + self.force
         momentum = np.array([0, 0, v["rotor_inertia_lower"] * self.u[1]])
         momentum[2] -= (v["rotor_inertia_upper"] + v["flybar_inertia"]) * self.u[0]
-        moment = np.cross([0, 0, -v["arm_upper"]], upper) + np.cross([0, 0, -v["arm_lower"]], lower)
+        moment = np.cross(self.hubs + [0, 0, -v["arm_upper"]], upper)
+        moment += np.cross(self.hubs + [0, 0, -v["arm_lower"]], lower)
         # a hub's lateral tilt gives L > 0: r x F; the rotors' torques act about z only
         moment = moment - np.cross(self.omega, momentum)
         moment[2] += self.torque[0] - self.torque[1]
@@ -514,21 +516,25 @@ def _drag(s, e):
 
 
 def _swash_phase(s, e):
-    s.swash = Rotation.from_euler("z", e["angle"]).as_matrix()[:2, :2] @ s.swash
+    angle = e["angle"] + e["per_rpm"] * 30.0 / math.pi * (s.u[1] - _hover(s.v)[1])
+    s.swash = Rotation.from_euler("z", angle).as_matrix()[:2, :2] @ s.swash
 
 
 def _wake(s, e):
     s.thrust = s.thrust * [1, 1 - e["gain"] * s.thrust[0] / s.thrust.sum()]
 
 
-def _exponent(s, e):
-    """T = k w_h^2 (w/w_h)^(2+e) with w_h the speeds at which the bare rotors balance."""
-    v = s.v
+def _hover(v):
+    """Speeds at which the bare rotors balance."""
     k = v["air_density"] * math.pi * v["rotor_radius"] ** 4
     ratio2 = v["torque_coefficient_upper"] / v["torque_coefficient_lower"]
     lift = v["thrust_coefficient_upper"] + v["thrust_coefficient_lower"] * ratio2
-    hover = np.sqrt(v["mass"] * v["gravity"] / (k * lift) * np.array([1, ratio2]))
-    s.thrust = s.thrust * (s.u[:2] / hover) ** e["excess"]
+    return np.sqrt(v["mass"] * v["gravity"] / (k * lift) * np.array([1, ratio2]))
+
+
+def _exponent(s, e):
+    """T = k w_h^2 (w/w_h)^(2+e) with w_h the hover speeds."""
+    s.thrust = s.thrust * (s.u[:2] / _hover(s.v)) ** e["excess"]
 
 
 def _hub(s, e):
@@ -541,8 +547,16 @@ def _blowback(s, e):
 
 
 def _cg(s, e):
-    """Thrust, along -z, seen from a centre of gravity beside the mast: r x F with r = -(x, y)."""
-    s.moment += np.cross([-e["x"], -e["y"], 0], [0, 0, -s.thrust.sum()])
+    """The hubs seen from a centre of gravity beside the mast."""
+    s.hubs = np.array([-e["x"], -e["y"], 0.0])
+
+
+def _tether(s, e):
+    s.force += s.R.T @ [*(e["stiffness"] * ([e["north"], e["east"]] - s.x[13:15])), 0.0]
+
+
+def _euler(s, e):
+    s.moment -= e["gain"] * np.cross(s.omega, np.multiply(s.inertia, s.omega))
 
 
 ON_RATES = {
@@ -561,7 +575,7 @@ ON_RATES = {
         dict(scale=0.3),
         lambda s, e: setattr(s, "flybar_time", s.flybar_time * 1.3),
     ),
-    "swash_phase": (dict(angle=0.15), _swash_phase),
+    "swash_phase": (dict(angle=0.15, per_rpm=3e-4), _swash_phase),
     "swash_offset": (
         dict(lon=0.02, lat=-0.01),
         lambda s, e: setattr(s, "swash", s.swash + [e["lon"], e["lat"]]),
@@ -587,6 +601,12 @@ ON_RATES = {
         dict(coefficient=0.004),
         lambda s, e: setattr(s, "moment", -0.004 * s.omega * [1, 1, 0]),
     ),
+    "upper_blowback": (
+        dict(gain=0.009),
+        lambda s, e: setattr(s, "tilt_upper", s.tilt_upper + 0.009 * s.air[:2] * [1, -1]),
+    ),
+    "gyroscopic_coupling": (dict(gain=0.9), _euler),
+    "position_spring": (dict(stiffness=0.3, north=1.5, east=-2.0), _tether),
     "cg_offset": (dict(x=0.0015, y=-0.001), _cg),
     "hub_stiffness": (dict(upper=0.2, lower=0.3), _hub),
 }
@@ -605,7 +625,25 @@ def test_effect_on_the_rates(name, seed):
     assert np.abs(found - derivative(state, command, COUPLED)).max() > 1e-4
 
 
-@pytest.mark.parametrize("carrier", ["airframe_drag", "rotor_drag", "flap_blowback"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_bodys_own_gyroscopic_moment_does_no_work(seed):
+    """omega . (omega x I omega) = 0, and a body alone keeps its momentum in the world's axes."""
+    state, command = random_state(seed)
+    inertia = np.array([LAMA[f"inertia_{a}"].value for a in ("xx", "yy", "zz")])
+    whole = LAMA.with_effect("gyroscopic_coupling", gain=1.0)
+    moment = inertia * (derivative(state, command, whole) - derivative(state, command, LAMA))[3:6]
+    assert np.linalg.norm(moment) > 1e-3
+    assert abs(state[3:6] @ moment) < 1e-12 * np.linalg.norm(moment)
+    state[6:10] = 0.0
+    alone = whole.with_values({"mass": 1.0})
+    still = derivative(state, np.zeros(4), alone)  # rotors stand: no moment is left
+    spin = inertia * state[3:6]
+    close(inertia * still[3:6] + np.cross(state[3:6], spin), np.zeros(3), 1e-12)
+
+
+@pytest.mark.parametrize(
+    "carrier", ["airframe_drag", "rotor_drag", "flap_blowback", "upper_blowback"]
+)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_wind_acts_through_the_velocity_in_the_air(carrier, seed):
     state, command = random_state(seed)
@@ -705,6 +743,12 @@ SIGNS = [
     ("hub_stiffness", dict(lower=0.2), dict(alpha_l=0.05), "q", 1),
     ("flap_blowback", dict(gain=7e-3), dict(u=2.0), "alpha_l", 1),  # tilts back: slows
     ("flap_blowback", dict(gain=7e-3), dict(v=2.0), "beta_l", -1),  # tilts left: slows
+    ("upper_blowback", dict(gain=7e-3), dict(u=2.0), "u", -1),
+    ("upper_blowback", dict(gain=7e-3), dict(v=2.0), "v", -1),
+    ("upper_blowback", dict(gain=7e-3), dict(u=2.0), "q", 1),  # nose up
+    ("position_spring", dict(stiffness=0.1, north=2.0), {}, "u", 1),
+    ("position_spring", dict(stiffness=0.1, east=-2.0), {}, "v", -1),
+    ("cg_offset", dict(y=2e-3), dict(alpha_l=-0.2), "r", 1),  # forward force, left of the CG
     ("swash_offset", dict(lon=0.02), {}, "alpha_l", 1),
     ("swash_offset", dict(lat=0.02), {}, "beta_l", 1),
 ]
@@ -809,12 +853,91 @@ def test_sonar_effects(seed):
     assert biased["h"] == pytest.approx(bare["h"] + 0.1 * sink)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_gyro_scale(seed):
+    _, _, bare, biased = sensor_case("gyro_scale", dict(x=0.1, y=-0.05, z=0.2), seed)
+    close(vector(biased, GYRO), vector(bare, GYRO) * [1.1, 0.95, 1.2])
+    assert {c for c in CHANNELS if bare[c] != biased[c]} == set(GYRO)
+
+
+POSE = ("pn", "pe", "h", "phi", "theta", "psi")
+
+
+@pytest.mark.parametrize("name", ["pose_delay", "attitude_delay"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_late_reading_is_that_of_a_moment_ago(name, seed):
+    """To second order: half the delay leaves an eighth of the error."""
+    late = POSE if name == "pose_delay" else ANGLE
+    start, command = settled_state(seed)
+    start[12] += 6.0  # a heading that has gone round
+    end = fly(start, command, 0.04, 0.001, LAMA)
+    bare = dynamics.readings(end, command, LAMA)
+    errors = []
+    for delay in (0.02, 0.01):
+        then = dynamics.readings(fly(start, command, 0.04 - delay, 0.001, LAMA), command, LAMA)
+        found = dynamics.readings(end, command, LAMA.with_effect(name, time=delay))
+        assert {c for c in CHANNELS if bare[c] != found[c]} == set(late)
+        errors.append(np.linalg.norm(vector(found, late) - vector(then, late)))
+        assert errors[-1] < 0.1 * np.linalg.norm(vector(bare, late) - vector(then, late))
+    assert errors[0] / errors[1] == pytest.approx(8.0, rel=0.15)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_marker_offset(seed):
+    """Place and velocity of a point of the body, by rotation matrix."""
+    arm = np.array([0.03, -0.02, 0.05])
+    values = dict(x=0.03, y=-0.02, z=0.05)
+    state, _, bare, biased = sensor_case("marker_offset", values, seed)
+    R, omega = body_to_world(state), state[3:6]
+    place = vector(bare, ("pn", "pe", "h")) + (R @ arm) * [1, 1, -1]
+    close(vector(biased, ("pn", "pe", "h")), place)
+    velocity = ("vn", "ve", "vd")
+    close(vector(biased, velocity), vector(bare, velocity) + R @ np.cross(omega, arm))
+    assert {c for c in CHANNELS if bare[c] != biased[c]} == {"pn", "pe", "h", *velocity}
+
+
+@pytest.mark.parametrize("angle", [0.3, -1.2])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_frame_yaw_is_a_rotation_about_the_mast(seed, angle):
+    state, _, bare, biased = sensor_case("frame_yaw", dict(angle=angle), seed)
+    seen = Rotation.from_euler("ZYX", vector(biased, ("psi", "theta", "phi"))).as_matrix()
+    close(seen, body_to_world(state) @ Rotation.from_euler("z", angle).as_matrix())
+    assert {c for c in CHANNELS if bare[c] != biased[c]} == set(ANGLE)
+
+
+def test_headings_that_have_gone_round_stay_there():
+    state, command = random_state(0)
+    for name, values in (("frame_yaw", dict(angle=0.3)), ("magnetic_field", dict(x=0.2, y=0.3))):
+        vehicle = LAMA.with_effect(name, **values)
+        state[12] = 0.5
+        once = dynamics.readings(state, command, vehicle)["psi"]
+        state[12] += 6.0 * math.pi
+        assert dynamics.readings(state, command, vehicle)["psi"] - once == pytest.approx(
+            6 * math.pi
+        )
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_field_of_the_body_turns_the_compass(seed):
+    """The heading of earth's horizontal field and the body's own, in level axes."""
+    values = dict(x=0.2, y=-0.3)
+    state, _, bare, biased = sensor_case("magnetic_field", values, seed)
+    north = Rotation.from_euler("z", state[12]).as_matrix().T @ [1, 0, 0] + [0.2, -0.3, 0]
+    error = math.remainder(biased["psi"] + math.atan2(north[1], north[0]), 2 * math.pi)
+    assert abs(error) < 1e-12
+    assert {c for c in CHANNELS if bare[c] != biased[c]} == {"psi"}
+
+
 # --- every effect is tested here ----------------------------------------------------------------
 
 TESTED_APART = {
     "wind", "motor_lag", "servo_lag", "servo_delay", "battery_sag", "spin_up_reaction",
+    # in test_actuator_effects.py
+    "command_delay", "motor_droop", "battery_voltage", "dynamic_inflow", "servo_play",
+    "servo_deadband", "servo_rate",
     "imu_lever_arm", "imu_tilt", "accel_scale", "accel_bias", "gyro_bias", "attitude_bias",
-    "sonar_tilt", "sonar_scale", "sonar_delay", "vibration",
+    "sonar_tilt", "sonar_scale", "sonar_delay", "vibration", "gyro_scale", "pose_delay",
+    "attitude_delay", "marker_offset", "frame_yaw", "magnetic_field",
 }  # fmt: skip
 
 
@@ -955,7 +1078,7 @@ def test_paper_states_are_the_first_sixteen():
 def test_places_have_the_names_of_the_layout():
     for places, names in (
         (S, [name for name, _ in FULL_STATES]),
-        (U, [name for name, _ in COMMANDS] + ["time"]),
+        (U, [name for name, _ in COMMANDS] + ["time", "battery"]),
         (Z, CHANNELS),
     ):
         assert [getattr(places, name.upper()) for name in names] == list(range(len(names)))

@@ -126,6 +126,14 @@ def test_a_delay_becomes_a_lag_of_the_same_length():
         found = delay_as_lag(vehicle).values()
         assert found["servo_lag.time"] == pytest.approx(lag)
         assert found["servo_delay.time"] == 0.0
+    radio = both.with_effect("command_delay", time=0.01).with_effect(
+        "motor_lag", upper=0.1, lower=0.08
+    )
+    found = delay_as_lag(radio).values()
+    assert found["servo_lag.time"] == pytest.approx(0.06)
+    assert found["motor_lag.upper"] == pytest.approx(0.11)
+    assert found["motor_lag.lower"] == pytest.approx(0.09)
+    assert found["command_delay.time"] == found["servo_delay.time"] == 0.0
     lagging = LAMA.with_effect("servo_lag", time=0.02)
     assert delay_as_lag(lagging).values() == lagging.values()
     assert delay_as_lag(LAMA) is LAMA

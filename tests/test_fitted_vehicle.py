@@ -16,7 +16,7 @@ FLIGHT = Flight("lama400d", ())
 def test_values_std_and_correlation_are_those_of_the_fit():
     """Also for an effect that the vehicle did not have; the std may be wider than the covariance's."""
     free = [f for f in HeliModel(LAMA).base_parameters() if f.name in ("mass", "inertia_zz")]
-    free += HeliModel.effect_parameters("rotor_drag")
+    free += HeliModel(LAMA).effect_parameters("rotor_drag")
     spread = np.array([0.01, 2e-4, 3e-5])
     correlation = np.array([[1.0, 0.3, -0.6], [0.3, 1.0, 0.2], [-0.6, 0.2, 1.0]])
     covariance = correlation * np.outer(spread, spread)

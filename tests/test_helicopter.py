@@ -5,6 +5,7 @@ readings that were made up here.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.flight import Flight, Run
 from coax_env.model import dynamics, effects
 from coax_env.model import parameters as P
-from coax_env.model.layout import CHANNELS, FULL_STATES, N_FULL
+from coax_env.model.layout import CHANNELS, FULL_STATES, N_FULL, N_INPUTS
 
 LAMA = load_vehicle("lama400d")
 MODEL = HeliModel(LAMA)
@@ -147,24 +148,32 @@ def test_inputs_are_commands_time_and_innovations():
     u = MODEL.inputs(one, LAMA.vector)
     assert np.array_equal(u[:, :4], one.command)
     np.testing.assert_allclose(u[:, 4], one.t - 4.0)
+    assert not u[:, 5].any()
+    charged = replace(one, battery=12.0 - 0.01 * one.t)
+    at = {"battery_voltage.per_volt": 0.05, "battery_voltage.nominal": 11.5}
+    np.testing.assert_allclose(
+        MODEL.inputs(charged, MODEL.vector(at)), np.column_stack([u[:, :5], 0.5 - 0.01 * one.t])
+    )
     innovations = np.random.default_rng(0).standard_normal((one.t.size, 4))
     with_innovations = Record(one.name, one.t, one.command, one.z, one.origin, innovations)
     assert np.array_equal(MODEL.inputs(with_innovations, LAMA.vector), np.hstack([u, innovations]))
 
 
-@pytest.mark.parametrize("delay", [0.007, 0.02, 0.05, 0.063])
-def test_a_late_command_is_its_mean_over_the_row(delay):
-    """A held command that is shifted, averaged by counting a fine grid; rotors are not late."""
+@pytest.mark.parametrize(
+    ("common", "of_servos"), [(0.0, 0.007), (0.0, 0.02), (0.0, 0.063), (0.05, 0.0), (0.017, 0.02)]
+)
+def test_late_commands_are_their_mean_over_the_row(common, of_servos):
+    """Held commands that are shifted, averaged by counting a fine grid; the plate's by both delays."""
     rng = np.random.default_rng(1)
     t = 3.0 + np.cumsum(rng.uniform(0.01, 0.03, 60))
     command = rng.standard_normal((60, 4))
-    late = LAMA.with_effect("servo_delay", time=delay)
+    late = LAMA.with_effect("servo_delay", time=of_servos).with_effect("command_delay", time=common)
     u = HeliModel(late).inputs(Record("", t, command, np.empty((60, 18)), float(t[0])), late.vector)
-    assert np.array_equal(u[:, :2], command[:, :2])
     for k in range(59):
         fine = np.linspace(t[k], t[k + 1], 20001)[:-1] + 0.5 * (t[k + 1] - t[k]) / 20000
-        row = np.maximum(np.searchsorted(t, fine - delay, side="right") - 1, 0)
-        assert u[k, 2:4] == pytest.approx(command[row, 2:4].mean(axis=0), abs=2e-4), k
+        for columns, delay in ((slice(0, 2), common), (slice(2, 4), common + of_servos)):
+            row = np.maximum(np.searchsorted(t, fine - delay, side="right") - 1, 0)
+            assert u[k, columns] == pytest.approx(command[row, columns].mean(axis=0), abs=2e-4), k
 
 
 def test_a_command_that_has_long_been_held_is_itself_however_late():
@@ -211,7 +220,7 @@ def test_an_input_innovation_corrects_its_states(gain):
     np.testing.assert_allclose(drift[:N_FULL], corrected - x, rtol=1e-9, atol=1e-13)
     assert not drift[N_FULL:].any()
     # and who hears nothing flies the kernel's own step
-    MODEL.step.__wrapped__(x, u_with_innovations[:5].copy(), 0.01, vector, work, out)
+    MODEL.step.__wrapped__(x, u_with_innovations[:N_INPUTS].copy(), 0.01, vector, work, out)
     dynamics.step(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
     assert np.array_equal(out, expected)
 
@@ -291,7 +300,7 @@ def test_what_may_be_fitted_lies_within_its_bounds():
             "no other machine: neither a fifth nor five times as much"
         )
     for name, entry in effects.CATALOGUE.items():
-        for free, own in zip(MODEL.effect_parameters(name), entry.parameters, strict=True):
+        for free, own in zip(MODEL.effect_parameters(name), entry.fitted, strict=True):
             assert own.lower <= free.lower <= own.off <= free.upper <= own.upper
             assert free.reading_only == (entry.stage == effects.SENSOR)
             farthest = MOST_USUAL_SIZES * own.usual

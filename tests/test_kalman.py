@@ -94,8 +94,8 @@ def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) ->
         found["e"].append(e)
         found["x"].append(x)
         found["P"].append(P)
-        # predict; F, as H, is that of the predicted state
-        F = step_of(x_before, record.command[k, 0], dt[k], p)[1]
+        # predict; F, as H, is that of the predicted state, the first one that of the corrected state
+        F = step_of(x_before if k else x, record.command[k, 0], dt[k], p)[1]
         x = step_of(x, record.command[k, 0], dt[k], p)[0]
         grown = [(1.0 - math.exp(-2.0 * d * dt[k])) / (2.0 * d) if d else dt[k] for d in DECAY]
         P = F @ P @ F.T + np.diag(q * grown)

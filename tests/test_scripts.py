@@ -198,6 +198,13 @@ REQUESTS: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "no such log": (["import_log.py", "log.ulg"], ("log.ulg",)),
     "a log of no kind": (["import_log.py", "poor.toml"], ("poor.toml", ".ulg")),
     "a cut in words": (["import_log.py", "poor.toml", "--cut", "early"], ("early", "FROM-TO")),
+    "no such edit": (["edit_log.py", "flight", "--edit", "gian=1.2"], ("gian", "gain")),
+    "an edit in words": (["edit_log.py", "flight", "--edit", "gain=much"], ("NAME=SIZE",)),
+    "no such moment": (
+        ["edit_log.py", "flight", "--edit", "gain=1.2", "--since", "end"],
+        ("RUN:T", "end"),
+    ),
+    "no such edit to check": (["check_edits.py", "flight", "--edit", "sun=1"], ("sun", "phase")),
     "no such maneuver": (["simulate.py", "--maneuver", "looping"], ("looping",)),
     "no such sensors": (["simulate.py", "--sensors", "radar"], ("radar",)),
     "no such controller": (["evaluate.py", "--controller", "none.json"], ("none.json",)),

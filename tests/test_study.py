@@ -395,10 +395,20 @@ def test_a_calibration_says_what_made_it() -> None:
     assert threshold.calibration(rows[:10], "too few") is None
 
 
+CLEAN = {
+    "sensors": "accelerometers, attitude, gyros, heading, height, rotor speeds, velocity",
+    "rate_hz": 100.0, "gap_share": 0.0, "card_noise": True, "mass_kg": 0.8, "gust_force": 0.02,
+    "gust_moment": 0.004, "gust_memory_s": 0.5, "white_noise": False,
+}  # fmt: skip
+"""The class of the study's own flights."""
+
+
 def test_the_threshold_in_use_is_calibrated() -> None:
     """Change SETTINGS.evidence and this asks for `study_diagnosis.py --calibrate --adopt`."""
-    rate = calibration.false_alarm_rate(SETTINGS.evidence)
+    rate = calibration.calibrated(SETTINGS.evidence, CLEAN).rate
     assert rate is not None and rate <= 0.02
+    other = calibration.calibrated(SETTINGS.evidence, CLEAN | {"rate_hz": 25.0})
+    assert other.rate is None and "rate hz 25" in other.why
 
 
 def test_the_share_beyond_a_threshold() -> None:
@@ -414,14 +424,16 @@ def test_an_adopted_calibration_is_void_for_another_threshold(
     kept = tmp_path / "package" / "calibration.json"
     kept.parent.mkdir()
     monkeypatch.setattr(calibration, "PATH", kept)
-    assert calibration.false_alarm_rate(SETTINGS.evidence) is None
+    assert calibration.calibrated(SETTINGS.evidence, CLEAN).rate is None
     with pytest.raises(InputError, match="takes 20 clean flights"):
         study("--calibrate", "--adopt")
     monkeypatch.setitem(study_diagnosis.QUICK, "clean", 24)
     study("--calibrate", "--adopt")
-    rate = calibration.false_alarm_rate(SETTINGS.evidence)
+    rate = calibration.calibrated(SETTINGS.evidence, CLEAN).rate
     assert rate is not None and 0.0 <= rate <= 1.0
-    assert calibration.false_alarm_rate(SETTINGS.evidence + 1.0) is None
+    assert calibration.calibrated(SETTINGS.evidence + 1.0, CLEAN).rate is None
+    study("--calibrate", "--adopt")
+    assert len(json.loads(kept.read_text())["classes"]) == 1, "of one class there is one rate"
 
 
 # --- the arms -----------------------------------------------------------------------------------------
@@ -505,10 +517,12 @@ def test_the_levels_of_an_air_are_its_own() -> None:
     known = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003}
     for group, std in known.items():
         assert levels[group] == pytest.approx(std, rel=0.2)
-    assert levels["memory"] == pytest.approx(0.5, rel=0.2)
+    for group in known:
+        assert levels[f"memory_{group}"] == pytest.approx(0.5, rel=0.35)
     light = one_flight.gust_levels(GUSTY, COAX)["force_z"] / levels["force_z"]
     assert light == pytest.approx(0.302 * 9.81 / (0.8 * 9.804))
-    assert one_flight.gust_levels(Air("markov", memory=(3.0, 3.0)), LAMA)["memory"] > 1.5
+    lasting = one_flight.gust_levels(Air("markov", memory=(3.0, 0.1)), LAMA)
+    assert lasting["memory_force_xy"] > 1.5 and lasting["memory_moment_xy"] < 0.15
 
 
 def arm_rows() -> list[dict[str, Any]]:

@@ -16,11 +16,16 @@ import numpy as np
 import pytest
 
 from coax_env import InputError, derivative, diagnose, load_vehicle, read_flight
-from coax_env.diagnosis import vibration
+from coax_env.diagnosis import unlisted, vibration
+from coax_env.diagnosis.problem import Problem
+from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.state_space import Record
 from coax_env.model import effects
-from coax_env.model.dynamics import hover_trim
+from coax_env.model.dynamics import WORK_SIZE, full_state, hover_trim, kernel_input
+from coax_env.model.dynamics import step as dynamics_step
 from coax_env.model.generic_terms import AXES, TERMS, hover_speeds
-from coax_env.model.layout import N_STATES, STATES
+from coax_env.model.layout import CHANNELS, N_STATES, STATES
+from coax_env.model.layout import COMMANDS as COMMAND_UNITS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import vehicle_toml
 from coax_env.simulation.simulate import Gusts, simulate
@@ -28,6 +33,7 @@ from coax_env.simulation.simulate import Gusts, simulate
 ROOT = Path(__file__).resolve().parents[1]
 LAMA = load_vehicle("lama400d")
 NAMES = [name for name, _ in STATES]
+COMMANDS = [name for name, _ in COMMAND_UNITS]
 TURNING = ("lon_3211", "heading_turn")
 
 
@@ -58,6 +64,10 @@ def expected(term: str, s: dict[str, float], command: np.ndarray) -> float:
         "omega_u": command[0] - hover[0], "omega_l": command[1] - hover[1],
         "delta_lon": command[2], "delta_lat": command[3],
         "omega_u_rate": 0.0, "omega_l_rate": 0.0,  # rotors without a lag have arrived
+        "north": s["x"], "east": s["y"], "height": -s["z"] - 6.0 * LAMA["rotor_radius"].value,
+        "omega_u_2": (command[0] - hover[0]) ** 2, "omega_l_2": (command[1] - hover[1]) ** 2,
+        "omega_u_l": (command[0] - hover[0]) * (command[1] - hover[1]),
+        "lon_direction": 0.0, "lat_direction": 0.0,  # nor does the plate move on
     }  # fmt: skip
     if term in known:
         return known[term]
@@ -83,6 +93,39 @@ def test_every_term_is_its_formula(term):
         wanted = np.zeros(N_STATES)
         wanted[i] = 0.01 * expected(term, values, command) / inertia[i]
         np.testing.assert_allclose(change, wanted, atol=1e-11)
+
+
+@pytest.mark.parametrize("axis", ["lon", "lat"])
+def test_a_direction_is_that_in_which_the_row_moves_the_plate(axis):
+    """Its moment has the sign of the command's last step, whatever its size, and none without one."""
+    vehicle = with_terms(**{f"M__{axis}_direction": 0.01})
+    state, command = hover_trim(LAMA)
+    for step, sign in ((0.02, 1.0), (0.005, 1.0), (-0.004, -1.0), (0.0, 0.0)):
+        turned = []
+        for flown in (vehicle, LAMA):
+            x = full_state(state, command, LAMA)
+            u = kernel_input(command)
+            u[COMMANDS.index(f"delta_{axis}")] += step
+            work, end = np.zeros(WORK_SIZE), np.empty(x.size)
+            dynamics_step(x, u, 0.001, flown.vector, work, end)
+            turned.append(end[4])
+        wanted = sign * 0.01 / LAMA["inertia_yy"].value
+        assert (turned[0] - turned[1]) / 0.001 == pytest.approx(wanted, rel=1e-3, abs=1e-9)
+
+
+def test_terms_of_a_place_need_a_position():
+    def terms(*channels: str) -> set[str]:
+        t = np.arange(0.0, 3.0, 0.01)
+        z = np.full((t.size, len(CHANNELS)), np.nan)
+        z[::5, [CHANNELS.index(c) for c in channels]] = 1.0
+        record = Record("a", t, np.full((t.size, 4), 200.0), z)
+        problem = Problem.of(HeliModel(LAMA), [record])
+        return {t.key for t in unlisted.measured_terms(problem)}
+
+    every = {t.key for t in TERMS}
+    assert terms("phi", "h") == every - {"north", "east"}
+    assert terms("phi", "pn", "pe", "h") == every
+    assert terms("phi", "vn") == every - {"north", "east", "height"}
 
 
 def test_hover_speeds_hold_the_bare_model():

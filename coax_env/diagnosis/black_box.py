@@ -13,17 +13,19 @@ import numpy as np
 
 from coax_env.diagnosis.fits import at_optimum, linearise
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.unlisted import parameters
+from coax_env.diagnosis.unlisted import measured_terms, parameters
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
-from coax_env.model.generic_terms import AXES, TERMS
+from coax_env.model.generic_terms import AXES
 
 PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.001)  # in usual sizes
 
 
 def black_box(problem: Problem, refitted: Fit) -> Fit:
     """The model with every term on every axis, from one whose own numbers are fitted."""
-    terms = [FreeParameter(f.name, 0.0, f.std) for axis in AXES for f in parameters(axis, TERMS)]
+    known = measured_terms(problem)
+    coefficients = [f for axis in AXES for f in parameters(problem.model, axis, known)]
+    terms = [FreeParameter(f.name, 0.0, f.std) for f in coefficients]
     names = [f.name for f in terms]
     bare = replace(problem, own={}, added=())
     rest = bare.base_names(())

@@ -14,6 +14,7 @@ from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter, Record
 from coax_env.logs.flight import Flight
+from coax_env.model.effects import CATALOGUE
 from coax_env.model.vehicle import Parameter, Vehicle
 
 
@@ -57,6 +58,13 @@ def corrected_vehicle(
         source,
         flight,
     )
+    stated = {
+        f"{e}.{p.name}": Parameter(fit.values[f"{e}.{p.name}"], 0.0, p.unit, source)
+        for e in fit.active
+        for p in CATALOGUE[e].parameters
+        if p.held
+    }
+    vehicle = vehicle.with_parameters(stated)
     if line:
         amplitude = Parameter(line.amplitude, line.std, "m/s2", source)
         vehicle = vehicle.with_parameters({"vibration.amplitude": amplitude})
@@ -68,8 +76,8 @@ def with_held_out(
 ) -> tuple[dict[str, float], np.ndarray]:
     """Values of the free parameters, and their covariance, with the held-out runs taken in too.
 
-    The posterior of the other runs is the prior of one Gauss-Newton step, halved until the objective
-    of all runs falls (a one-step estimator; Le Cam 1956, van der Vaart 1998, sec. 5.7).
+    The posterior of the other runs is the prior of a first Gauss-Newton step; from there on all runs
+    are linearised anew until a step gains nothing. Noise levels stay.
 
     Args:
         problem, fit: with the causes.
@@ -78,9 +86,8 @@ def with_held_out(
     """
     free = problem.free(fit.active)
     names = [f.name for f in free]
-    values = {name: fit.values[name] for name in names}
     if not held:
-        return values, quadratic.covariance(names)
+        return {name: fit.values[name] for name in names}, quadratic.covariance(names)
     engine = Engine(problem.model, held)
     if has_command_gains(problem):
         engine = with_input_innovations(engine, fit)
@@ -88,14 +95,49 @@ def with_held_out(
     taken_in = Quadratic.of(lin, free, fit.values)
     known = quadratic.index(names)
     # where they are fitted, the other runs and the priors have no slope
-    both = replace(taken_in, G=taken_in.G + quadratic.G[np.ix_(known, known)], mean=taken_in.at)
-    _, move = both.best(names)
-    before = fit.objective - sum(p.log_likelihood for p in passes)
-    for share in (1.0, 0.5, 0.25):
-        moved = both.moved(share * move)
-        there = {**fit.values, **moved}
-        after = objective(problem.engine.filter(there, fit.noise), free, there)
-        if after - engine.log_likelihood(there, fit.noise) < before:
-            values = moved
+    beyond = _beyond_signatures(quadratic, known)
+    both = replace(
+        taken_in,
+        G=taken_in.G + quadratic.G[np.ix_(known, known)],
+        g=taken_in.g + quadratic.g[known] + beyond,
+    )
+    everything = Engine(problem.model, (*problem.engine.records, *engine.records))
+    there = replace(fit, objective=fit.objective - sum(p.log_likelihood for p in passes))
+    for _ in range(problem.settings.most_refinements):
+        _, move = both.best(names)
+        there, gained = _moved(everything, there, both, free, move)
+        if gained < problem.settings.refinement_gain:
             break
-    return values, both.covariance(names)
+        _, lin = everything.linearise(there.values, fit.noise, free)
+        both = Quadratic.of(lin, free, there.values)
+        both = replace(both, g=both.g + beyond)
+        if -both.best(names)[0] < problem.settings.refinement_gain:
+            break
+    return {name: there.values[name] for name in names}, both.covariance(names)
+
+
+def _beyond_signatures(quadratic: Quadratic, known: np.ndarray) -> np.ndarray:
+    """What the slope of the fitted runs has beyond the signatures' (refinement.py), (k,).
+
+    There they are fitted: what is left of the signatures' slope is that, but at a bound.
+    """
+    pull = (quadratic.g + quadratic.precision * (quadratic.at - quadratic.mean))[known]
+    width = quadratic.precision[known] ** -0.5
+    inside = np.minimum(quadratic.at - quadratic.lower, quadratic.upper - quadratic.at)[known]
+    return np.where(inside > 1e-6 * width, -pull, 0.0)
+
+
+def _moved(
+    engine: Engine,
+    fit: Fit,
+    quadratic: Quadratic,
+    free: Sequence[FreeParameter],
+    move: np.ndarray,
+) -> tuple[Fit, float]:
+    """The fit after a move, shortened until it gains on all runs, and the gain [nats]."""
+    for share in (1.0, 0.5, 0.25):
+        values = {**fit.values, **quadratic.moved(share * move)}
+        after = objective(engine.filter(values, fit.noise), free, values)
+        if after < fit.objective:
+            return replace(fit.at(values), objective=after), fit.objective - after
+    return fit, 0.0

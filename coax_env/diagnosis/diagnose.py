@@ -23,7 +23,7 @@ import numpy as np
 from coax_env.design import next_maneuver
 from coax_env.diagnosis import confounding, findings, unlisted, vibration
 from coax_env.diagnosis.black_box import black_box
-from coax_env.diagnosis.calibration import false_alarm_rate
+from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
 from coax_env.diagnosis.evidence import prune
 from coax_env.diagnosis.fits import fitted, noise_fitted, start
@@ -34,13 +34,16 @@ from coax_env.diagnosis.input_innovations import (
     with_command_gains,
     with_input_innovations,
 )
+from coax_env.diagnosis.model_check import model_check
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.remarks import remarks, vibration_removed
+from coax_env.diagnosis.remarks import one_step_against_a_second, remarks, vibration_removed
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
+from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine, Progress
 from coax_env.estimation.fitted_vehicle import double_counting
+from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import sensor_std, starting_noise
 from coax_env.estimation.prediction import RunReplay, gusts_of, replay_runs
@@ -51,6 +54,12 @@ from coax_env.model import effects
 from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
+
+TURN = 2.0 * math.pi
+SONAR = frozenset({"sonar_tilt", "sonar_scale", "sonar_delay"})
+"""Effects of a height that is an echo's."""
+OF_POSITION = frozenset({"frame_yaw", "marker_offset", "pose_delay", "position_spring"})
+"""Effects that only a measured position shows."""
 
 
 @dataclass(frozen=True)
@@ -114,13 +123,14 @@ def diagnose(
     """
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
-    line, calm, calm_vehicle = _without_vibration(flight, vehicle, exclude)
-    new_line = line if "vibration" not in vehicle.effects else None
-    model = HeliModel(vehicle)
-    noise = starting_noise(calm, calm_vehicle)
-    candidates = namable(exclude, vehicle, flight)
     flight.select(hold_out or ())
     check_hold_out(hold_out, flight.run_names)
+    flight = flown_parts(flight, vehicle)
+    line, calm, calm_vehicle = _without_vibration(flight, vehicle, exclude)
+    new_line = line if "vibration" not in vehicle.effects else None
+    model = HeliModel(vehicle, stated(flight))
+    noise = starting_noise(calm, calm_vehicle)
+    candidates = namable(exclude, vehicle, flight)
     report = progress or (lambda text: None)
     report("choosing the runs to hold out")
     records = [record_of(run) for run in calm.runs]
@@ -136,7 +146,7 @@ def diagnose(
     fit, quadratic = search(problem, refitted)
     problem, fit, quadratic, terms = unlisted.explain(problem, fit, quadratic)
     report("weighing the causes against their confounded alternatives")
-    problem, fit = with_command_gains(problem, fit)
+    problem, fit = with_command_gains(beside_large_axes(problem, fit), fit)
     fit, quadratic, evidence = prune(problem, fit)
     passes_after = problem.engine.filter(fit.values, fit.noise)
     white = {
@@ -144,17 +154,22 @@ def diagnose(
         "after": whiteness(passes_after, CHANNELS),
     }
     found = confounding.alternatives(problem, fit, quadratic, evidence, white["after"])
-    causes = findings.causes(problem, fit, quadratic, evidence, found, new_line)
+    report("asking left-out runs, halves and other noise whether the names hold")
+    trust = trusts(problem, fit, quadratic, evidence, found, white["after"])
+    causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_line)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)
     unexplained = described + findings.unexplained(white["after"], speaking_for)
 
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     replays, gain = _gain(problem, (bare, refitted, fit), held, sensors, ceiling)
+    report("asking whether the fitted model makes such flights")
+    check = model_check(problem, fit, passes_after)
     report("refitting the corrected model on everything")
     inflations = {e: weighed.inflation for e, weighed in evidence.items()}
     inflations |= unlisted.inflations(problem, fit, quadratic, terms)
     corrected = corrected_vehicle(problem, fit, quadratic, held, inflations, new_line, flight)
+    alarms = calibrated(settings.evidence, class_of(flight, vehicle, fit))
     by_evidence = [c["effect"] for c in causes if c["effect"] in found]
     design = confounding.separating_maneuver(problem, fit, quadratic, found, by_evidence, flight)
     return Diagnosis(
@@ -165,7 +180,9 @@ def diagnose(
             "unexplained": unexplained,
             "gain": gain,
             "next_maneuver": next_maneuver.advise(design, settings.evidence),
-            "false_alarm_rate": false_alarm_rate(settings.evidence),
+            "false_alarm_rate": alarms.rate,
+            "class": alarms.entry,
+            "model_check": check.entry,
         },
         flight=flight,
         vehicle_before=vehicle,
@@ -183,6 +200,8 @@ def diagnose(
             *double_counting(flight, vehicle),
             *([vibration_removed(line)] if line else []),
             *remarks(problem, fit, quadratic, found),
+            *one_step_against_a_second(gain, replays[1], replays[2], settings),
+            *check.remarks,
         ),
         noise=sensors,
         design=design,
@@ -191,6 +210,8 @@ def diagnose(
 
 def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:
     """Effects that may be named: not excluded, not in the vehicle yet, and with their sensor aboard.
+
+    Of sag by time and by voltage the one, of what goes by another's name the other.
 
     Args:
         exclude: effects of the catalogue.
@@ -204,10 +225,59 @@ def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple
         if name not in effects.CATALOGUE:
             known = ", ".join(effects.CATALOGUE)
             raise InputError(f"no effect {name!r} to exclude; the catalogue has {known}")
-    absent = set(exclude) | set(vehicle.effects)
-    if "pn" in flight.channels:  # height then comes with the position, not from a sonar
-        absent |= {"sonar_tilt", "sonar_scale", "sonar_delay"}
-    return tuple(e for e, entry in effects.CATALOGUE.items() if e not in absent and not entry.line)
+    absent = set(exclude) | set(vehicle.effects) | _without_sensor(flight)
+    absent.add("battery_sag" if _voltage_varies(flight) else "battery_voltage")
+    return tuple(
+        e
+        for e, entry in effects.CATALOGUE.items()
+        if e not in absent and not entry.line and not entry.named_as
+    )
+
+
+VARYING = 0.1
+"""Volts from the lowest to the highest battery voltage, more than a reading's noise; ours."""
+
+
+def _voltage_varies(flight: Flight) -> bool:
+    """Whether the flight's battery is logged and its voltage shows more than noise."""
+    logged = [run.battery for run in flight.runs if run.battery is not None]
+    return bool(logged) and float(np.ptp(np.concatenate(logged))) > VARYING
+
+
+def stated(flight: Flight) -> dict[str, float]:
+    """Values that effects take from a flight as stated: the nominal voltage is the mean, to 0.1 V.
+
+    Whatever the nominal, the thrust coefficients take it up: only its distance from the flight's own
+    voltages matters, for how well the two can be told apart.
+    """
+    logged = [run.battery for run in flight.runs if run.battery is not None]
+    if not logged:
+        return {}
+    return {"battery_voltage.nominal": round(float(np.mean(np.concatenate(logged))), 1)}
+
+
+def _without_sensor(flight: Flight) -> frozenset[str]:
+    """Effects of readings that the flight does not have, or that another effect stands for.
+
+    Where a position is aboard, the height comes with it; where no gyro is either, so does the attitude.
+    Without a position a late attitude and a late pose are one effect.
+    """
+    tracked, gyros = {"pn", "pe"} <= set(flight.channels), {"p", "q", "r"} & set(flight.channels)
+    absent = SONAR if tracked else OF_POSITION
+    if tracked and not gyros:
+        absent |= {"attitude_delay", "magnetic_field"}
+    return absent if _turns(flight) else absent | {"magnetic_field"}
+
+
+def _turns(flight: Flight) -> bool:
+    """Whether the headings of all runs together cover more than a quarter turn."""
+    headings = [run.measured["psi"] for run in flight.runs if "psi" in run.measured]
+    if not headings:
+        return False
+    around = np.sort(np.mod(np.concatenate(headings), TURN))
+    around = around[np.isfinite(around)]
+    gaps = np.diff(around, append=around[:1] + TURN)
+    return bool(gaps.size) and TURN - float(gaps.max()) > TURN / 4.0
 
 
 def _without_vibration(
@@ -249,5 +319,5 @@ def _gain(
         box = black_box(problem, refitted)
         flexible = replay_runs(engine, box.values, box.noise, horizon)
     gain = gain_of(before, own_numbers, after, sensors, horizon, flexible)
-    gain["held_out"] = [r.name for r in held]
+    gain["held_out"] = list(dict.fromkeys(r.whole for r in held))
     return [before, own_numbers, after], gain

@@ -9,6 +9,7 @@ import numpy as np
 from coax_env.diagnosis.confounding import Alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.trust import Trust, of_line
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.engine import RunPass
 from coax_env.estimation.fitted_vehicle import median_step, with_timing
@@ -25,15 +26,17 @@ def causes(
     quadratic: Quadratic,
     evidence: Mapping[str, Evidence],
     found: Alternatives,
+    trust: Mapping[str, Trust],
     line: Line | None,
 ) -> list[dict[str, Any]]:
-    """The causes, strongest first.
+    """The causes: those that are sure before those that are doubtful, each strongest first.
 
     Args:
         problem, fit: with the causes.
         quadratic: linearised at the fit.
         evidence: of each cause.
         found: the confounded alternatives of each cause.
+        trust: what speaks for and against each name.
         line: of a vibration that the vehicle file does not have.
     """
     free = problem.free_names(fit.active)
@@ -41,7 +44,7 @@ def causes(
     dt = median_step(problem.engine.records)
     entries: list[dict[str, Any]] = []
     for effect in fit.active:
-        own = zip(problem.own[effect], effects.CATALOGUE[effect].parameters, strict=True)
+        own = zip(problem.own[effect], effects.CATALOGUE[effect].fitted, strict=True)
         entries.append(
             {
                 "effect": effect,
@@ -50,18 +53,19 @@ def causes(
                         "value": float(fit.values[f.name]),
                         "std": stated_std(fit, f, std[f.name], evidence[effect].inflation, dt),
                         "unit": p.unit,
+                        "determined": trust[effect].determined[f.name],
                     }
                     for f, p in own
                 },
                 "evidence": evidence[effect].nats,
-                "confusable_with": list(found[effect]),
+                "confusable_with": [*found[effect], *effects.found_by_the_name_of(effect)],
                 "channels": channels_of(problem, fit, quadratic, effect),
+                **trust[effect].entries(),
             }
         )
-    entries.sort(key=lambda c: -c["evidence"])
     if line:
-        entries = sorted([*entries, _vibration(line)], key=lambda c: -c["evidence"])
-    return entries
+        entries.append(_vibration(line))
+    return sorted(entries, key=lambda c: (c["trust"] != "sure", -c["evidence"]))
 
 
 def stated_std(
@@ -82,13 +86,14 @@ def stated_std(
 
 def _vibration(line: Line) -> dict[str, Any]:
     """The cause that is found by its line and not by a signature."""
-    value = {"value": line.amplitude, "std": line.std, "unit": "m/s2"}
+    value = {"value": line.amplitude, "std": line.std, "unit": "m/s2", "determined": True}
     return {
         "effect": "vibration",
         "parameters": {"vibration.amplitude": value},
         "evidence": line.evidence,
         "confusable_with": [],
         "channels": list(line.channels),
+        **of_line(line).entries(),
     }
 
 

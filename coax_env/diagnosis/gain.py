@@ -40,12 +40,14 @@ def gain_of(
     draws = rng.integers(0, blocks, (DRAWS, blocks))
     noise_rms = {c: noise[c] for c in channels}
     rms = [{c: _rms(s[c]) for c in channels} for s in sums]
+    unmoved = {c: _rms(s) for c, s in _block_sums(after, still=True).items() if c in channels}
     drawn = [{c: _rms(s[c][draws].transpose(1, 0, 2)) for c in channels} for s in sums]
     table = {
         c: {
             "before": _number(rms[0][c]),
             "before_refitted": _number(rms[1][c]),
             "after": _number(rms[2][c]),
+            "persistence": _number(unmoved.get(c, np.nan)),
             "noise": float(noise_rms[c]),
             "unit": CHANNEL_UNITS[c],
             "ci95": _interval(drawn[2][c]),
@@ -62,7 +64,6 @@ def gain_of(
         boxed = _block_sums(black_box)
         flexible = removed(rms[0], {c: _rms(boxed[c]) for c in channels}, noise_rms)
         ceiling = {"black_box_percent": _number(flexible)}
-    # the floor is an expectation, the gain a sample: luck can lift the sample above it
     return {
         "held_out": [],
         "horizon_s": horizon,
@@ -70,7 +71,11 @@ def gain_of(
         "error_removed_percent": _number(gained),
         "ci95": _interval(removed(drawn[0], drawn[2], noise_rms)),
         "refitted_base_percent": _number(removed(rms[0], rms[1], noise_rms)),
-        "noise_floor_percent": _number(np.fmax(removed(rms[0], floor, noise_rms), gained)),
+        # an expectation beside a sample: a lucky gain may be above it, and is reported as it is
+        "noise_floor_percent": _number(removed(rms[0], floor, noise_rms)),
+        "persistence_percent": _number(
+            removed(rms[0], unmoved, {c: noise_rms[c] for c in unmoved})
+        ),
         **ceiling,
     }
 
@@ -102,12 +107,17 @@ def _nanmean(table: np.ndarray) -> Any:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _block_sums(runs: Sequence[RunReplay]) -> dict[str, np.ndarray]:
-    """Per channel: (blocks, 2) of summed squared error and count, over all runs that flew."""
+def _block_sums(runs: Sequence[RunReplay], still: bool = False) -> dict[str, np.ndarray]:
+    """Per channel: (blocks, 2) of summed squared error and count, over all runs that flew.
+
+    Args:
+        runs: flown open loop.
+        still: the errors of the prediction that nothing changes.
+    """
     sums: dict[str, list[tuple[float, float]]] = {}
     for run in runs:
-        for channel, replayed in run.channels.items():
-            error = replayed.error
+        errors = run.still if still else {c: flown.error for c, flown in run.channels.items()}
+        for channel, error in errors.items():
             for first in range(0, error.size, BLOCK):
                 block = error[first : first + BLOCK]
                 block = block[np.isfinite(block)]

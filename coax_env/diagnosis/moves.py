@@ -11,6 +11,8 @@ from coax_env.estimation.engine import RunPass
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.model import effects
 
+TOO_SMALL = "too small to matter in prediction"
+
 
 @dataclass(frozen=True)
 class Proposal:
@@ -41,6 +43,9 @@ def accepted(problem: Problem, fit: Fit, proposal: Proposal) -> Fit | None:
         proposal: the model.
     """
     trial = fitted(problem, proposal.begin)
+    if not math.isfinite(trial.objective):
+        problem.report(f"refused {proposal.move}: with it the filter diverges")
+        return None
     gained = fit.objective - trial.objective - proposal.occam
     if gained > proposal.needed and is_large(problem, proposal.effect, trial.values):
         problem.report(proposal.words.format(gained))
@@ -191,7 +196,8 @@ def drop(problem: Problem, fit: Fit, quadratic: Quadratic, coloured: bool) -> Fi
         if not math.isfinite(worth[effect]) or _is_worthless(
             problem, fit, quadratic, effect, inflations[effect]
         ):
-            problem.report(f"dropped {effect}: worth {worth[effect]:.1f} nats")
+            why = f"worth {worth[effect]:.1f} nats" if math.isfinite(worth[effect]) else TOO_SMALL
+            problem.report(f"dropped {effect}: {why}")
             rest = at_optimum(problem, fit, quadratic, fit.rest(effect), problem.off_values(effect))
             return rest.noted(f"- {effect}", max(worth[effect], 0.0))
     return None

@@ -18,8 +18,16 @@ from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.model import effects
 from coax_env.model import parameters as P
 
-EXCLUSIVE = (frozenset({"servo_lag", "servo_delay"}),)
-"""Effects of which one at most is named: a real servo is a mixture of both."""
+EXCLUSIVE = (
+    frozenset({"servo_lag", "servo_delay"}),
+    frozenset({"battery_sag", "battery_voltage"}),
+    frozenset({"swash_phase", "frame_yaw"}),
+    frozenset({"pose_delay", "attitude_delay"}),
+    frozenset({"pose_delay", "command_delay"}),
+)
+"""Effects of which one at most is named, and the others always tried in its place: a real servo is a
+mixture of both; the same rotors slow down; on a log of poses alone the others are one column, and far
+from each other."""
 
 T = TypeVar("T")
 

@@ -1,16 +1,19 @@
-"""What a reader should know beside the findings: white process noise, unusual sizes, unseen effects."""
+"""What a reader should know beside the findings: white process noise, moved numbers, unseen effects."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.vibration import Line
-from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
 from coax_env.estimation.helicopter_noise import WHITE_LEVELS
+from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
+from coax_env.plain_words import and_list, channel_name
 
 
 def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternatives) -> list[str]:
@@ -23,7 +26,6 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
     """
     return [
         *_white_noise(problem, fit),
-        *_unusual_sizes(problem, fit),
         *_moved_base(problem, fit),
         *_resting_on_unseen(problem, fit, quadratic, found),
     ]
@@ -37,6 +39,38 @@ def vibration_removed(line: Line) -> str:
     )
 
 
+def one_step_against_a_second(
+    gain: Mapping[str, Any] | None,
+    refitted: Sequence[RunReplay],
+    corrected: Sequence[RunReplay],
+    chosen: Settings,
+) -> list[str]:
+    """That the likelihood of one step prefers what predicts a second ahead worse, where it does.
+
+    Args:
+        gain: of the corrected model on the held-out runs.
+        refitted, corrected: those runs flown by the bare model, refitted, and by the corrected one.
+        chosen: what decides.
+    """
+    if not gain:
+        return []
+    nats = [sum(run.log_likelihood for run in runs) for runs in (refitted, corrected)]
+    worse = [
+        channel_name(c)
+        for c, e in gain["channels"].items()
+        if e["before_refitted"] is not None
+        and e["ci95"][0] is not None
+        and e["ci95"][0] > e["before_refitted"]
+    ]
+    if not worse or not nats[1] - nats[0] > chosen.tie:
+        return []
+    return [
+        f"on the held-out runs the likelihood of one step prefers the corrected model by"
+        f" {nats[1] - nats[0]:.0f} nats, but a second ahead it predicts {and_list(worse)} worse:"
+        " the noise model is wrong"
+    ]
+
+
 def _white_noise(problem: Problem, fit: Fit) -> list[str]:
     """The levels of white process noise, where they are well above their floor."""
     process, floor = fit.noise.process, fit.noise.floor
@@ -48,24 +82,6 @@ def _white_noise(problem: Problem, fit: Fit) -> list[str]:
         "white process noise beside the gusts, x and y, z:"
         f" force {xy:.2g}, {z:.2g} N s^1/2, moment {moment_xy:.2g}, {moment_z:.2g} N m s^1/2"
     ]
-
-
-def _unusual_sizes(problem: Problem, fit: Fit) -> list[str]:
-    texts = []
-    for f in (f for effect in fit.active for f in problem.own[effect]):
-        value = fit.values[f.name]
-        size = abs(value - f.value)
-        if size > 0.99 * MOST_USUAL_SIZES * f.std:
-            texts.append(
-                f"{f.name} stands at the limit of what is believed, {value:.3g}:"
-                " something else hides behind this name"
-            )
-        elif size > UNUSUAL_FROM * f.std:
-            texts.append(
-                f"{f.name} = {value:.3g} is outside its usual range"
-                f" ({f.value:g} +- {f.std:g}): take the name with care"
-            )
-    return texts
 
 
 def _moved_base(problem: Problem, fit: Fit) -> list[str]:

@@ -96,7 +96,7 @@ def is_large(problem: Problem, effect: str, values: Mapping[str, float]) -> bool
     entry = effects.CATALOGUE[effect]
     sizes = [
         abs(values[full] - p.off) / p.smallest
-        for full, p in zip(entry.names(), entry.parameters, strict=True)
+        for full, p in zip(entry.names(), problem.model.sized(effect), strict=True)
         if p.smallest > 0.0
     ]
     for base in entry.replaces:
@@ -106,6 +106,23 @@ def is_large(problem: Problem, effect: str, values: Mapping[str, float]) -> bool
         if relative < 2.0 * old.std / old.value:
             return False
     return max(sizes) >= 1.0
+
+
+def lost(problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str) -> float:
+    """Nats lost when an active effect leaves and the rest is refitted.
+
+    Args:
+        problem: what may be free.
+        quadratic: linearised at the fit.
+        active: effects in the model.
+        effect: that leaves.
+    """
+    free = problem.free_names(active)
+    now, _ = quadratic.best(free)
+    rest = [n for n in free if not n.startswith(effect + ".")]
+    fixed = problem.off_values(effect) | problem.file_values(effect)
+    then, _ = quadratic.best(rest, fixed)
+    return then - now
 
 
 def loss(
@@ -120,12 +137,9 @@ def loss(
         effect: that leaves.
         inflation: variance inflation by which the loss is divided; 1 for white innovations.
     """
-    free = problem.free_names(active)
-    now, _ = quadratic.best(free)
-    rest = [n for n in free if not n.startswith(effect + ".")]
-    fixed = problem.off_values(effect) | problem.file_values(effect)
-    then, _ = quadratic.best(rest, fixed)
-    return (then - now) / inflation - quadratic.occam(problem.acting_names(effect), rest)
+    rest = [n for n in problem.free_names(active) if not n.startswith(effect + ".")]
+    gone = lost(problem, quadratic, active, effect)
+    return gone / inflation - quadratic.occam(problem.acting_names(effect), rest)
 
 
 def inflation(problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str) -> float:

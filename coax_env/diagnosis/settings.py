@@ -79,6 +79,32 @@ class Settings:
     most_terms: int = 4
     """Taken in all; ours."""
 
+    # --- when a name may be believed ---------------------------------------------------------------
+    return_quantile: float = 1.645
+    """std: a cause that is spread evenly returns in 95 % of the parts of the flights."""
+    return_least: float = 2.0
+    """std by which a name must stand on a part at least: by chance, and the same way, 2 % do."""
+    least_runs: float = 0.75
+    """Share of left-out runs without which a name must return: it may rest on one of four runs, as a
+    ground effect on the only low one, and not on one of two or three."""
+    least_kept: float = 0.8
+    """Share of the halves in which a name must return. Of 20 halves a cause at the threshold, spread
+    evenly, misses so many once in 400; what one run alone made is in half of them."""
+    splits: int = 10
+    """Random splits of the runs, two halves each; ours."""
+    piece_seconds: float = 5.0
+    """s of the pieces that a few runs are cut into; each loses a second to its filter's start; ours."""
+    noise_factor: float = 2.0
+    """Times which, and part of which, every noise level must leave a name standing (contract)."""
+    noise_share: float = 0.35
+    """Share of the information on each cause that the runs flown again with other noise have; ours."""
+    felt_change: float = 1.0
+    """Sum of squared changes of whitened innovations under which no score moves by a std: such a
+    level, one at its floor above all, is not felt and not varied."""
+    undetermined: float = 0.7
+    """Posterior std over the prior's beyond which a number is not determined: the flights have then
+    told less than the prior knew."""
+
     # --- hold-out, gain and report -----------------------------------------------------------------
     horizon: float = 1.0
     """s flown open loop for the gain (contract)."""

@@ -26,14 +26,15 @@ from coax_env.diagnosis.fits import fitted, linearise, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.estimation.engine import RunPass
-from coax_env.estimation.helicopter import MOST_USUAL_SIZES
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES, HeliModel
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import whiteness
 from coax_env.kernel.compilation import compiled
 from coax_env.model import dynamics, effects
-from coax_env.model.generic_terms import AXES, SMALLEST, TERMS, Term, term_value
+from coax_env.model.generic_terms import AXES, SCALES, SMALLEST, TERMS, Term, term_value
 from coax_env.model.layout import CHANNELS, GUSTS, N_CHANNELS
+from coax_env.model.usual_sizes import factor
 
 CHANNELS_OF = {
     "unlisted_X": ("ax", ("ax",)),
@@ -143,6 +144,8 @@ def _screened(
     coloured = _coloured_axes(passes)
     history = TermHistory.of(problem, fit, passes)
     known = {name(axis, t) for axis, terms in taken for t in terms} | set(problem.model.bare_values)
+    unseen = set(TERMS) - set(measured_terms(problem))
+    known |= {name(axis, t) for axis in AXES for t in unseen}
     return {
         c: chosen.term_evidence if axis in coloured else chosen.term_evidence_white
         for axis in AXES
@@ -251,10 +254,45 @@ def name(axis: str, term: Term) -> str:
     return f"{axis}.{term.key}"
 
 
-def excitations() -> list[FreeParameter]:
-    """Terms that stand for the rest when runs are chosen: no effect needs the heading to turn."""
-    turning = [term for term in TERMS if term.key in ("sin_psi", "sin_3psi")]
-    return parameters("unlisted_M", turning)
+def excitation(
+    model: HeliModel, values: Mapping[str, float], passes: Sequence[RunPass]
+) -> dict[str, np.ndarray]:
+    """How much each run moves every state and command, whatever may follow them.
+
+    Args:
+        model: with the vehicle.
+        values: of its parameters.
+        passes: of a filter over the runs.
+
+    Returns:
+        what generic terms follow -> (runs, terms) the time integral of each term squared about its
+        mean over all runs.
+    """
+    p = model.vector(values)
+    tables = []
+    for run in passes:
+        table = np.empty((run.record.t.size, len(TERMS)))
+        _evaluate(run.states, run.inputs, p, table)
+        tables.append(table)
+    mean = np.mean(np.concatenate(tables), axis=0)
+    moved = np.array(
+        [
+            np.gradient(run.record.t) @ (table - mean) ** 2
+            for run, table in zip(passes, tables, strict=True)
+        ]
+    )
+    alone = [(k, term.follows[0]) for k, term in enumerate(TERMS) if len(term.follows) == 1]
+    return {
+        followed: moved[:, [k for k, name in alone if name == followed]]
+        for followed in dict.fromkeys(name for _, name in alone)
+    }
+
+
+def measured_terms(problem: Problem) -> list[Term]:
+    """The terms that need no channel that no run has."""
+    records = problem.engine.records
+    aboard = np.any([np.isfinite(r.z).any(0) for r in records], axis=0)
+    return [t for t in TERMS if all(aboard[CHANNELS.index(c)] for c in t.needs)]
 
 
 # --- the search -----------------------------------------------------------------------------------
@@ -298,7 +336,7 @@ def _best(
     """The candidate whose signature gains most beyond the evidence it needs, if any does."""
     if not needed:
         return None
-    own = {f.name: f for axis, terms in needed for f in parameters(axis, terms)}
+    own = {f.name: f for axis, terms in needed for f in parameters(problem.model, axis, terms)}
     rest = problem.free_names(fit.active)
     _, _, quadratic = linearise(problem.with_free(own.values()), fit.at(dict.fromkeys(own, 0.0)))
     now, _ = quadratic.best(rest)
@@ -316,7 +354,7 @@ def _with(
     problem: Problem, fit: Fit, candidate: Candidate, needed: float
 ) -> tuple[Problem, Fit] | None:
     """Problem and fit with a candidate's terms free; None where they do not hold or are too small."""
-    own = parameters(*candidate)
+    own = parameters(problem.model, *candidate)
     names = [f.name for f in own]
     wider = problem.with_free(own)
     trial = fitted(wider, fit.at(dict.fromkeys(names, 0.0)), steps=1)
@@ -326,15 +364,18 @@ def _with(
     gain = (fit.objective - trial.objective) / quadratic.variance_inflation(names, free)
     gain -= quadratic.occam(names, [n for n in free if n not in names])
     history = TermHistory.of(wider, trial, passes)
-    if gain > needed and _matters(history, candidate, trial.values):
+    if gain > needed and _matters(problem.model, history, candidate, trial.values):
         return wider, trial.noted(f"+ {_words(candidate)}", gain)
     return None
 
 
-def _matters(history: TermHistory, candidate: Candidate, values: Mapping[str, float]) -> bool:
+def _matters(
+    model: HeliModel, history: TermHistory, candidate: Candidate, values: Mapping[str, float]
+) -> bool:
     axis, terms = candidate
     load = history.columns(terms) @ [values[name(axis, t)] for t in terms]
-    return float(load.std()) > SMALLEST[AXES[axis][0]]
+    smallest = SMALLEST[AXES[axis][0]] * factor(SCALES[axis], model.size_ratios)
+    return float(load.std()) > smallest
 
 
 def _pruned(
@@ -359,9 +400,13 @@ def _pruned(
     return problem, fit, quadratic, kept
 
 
-def parameters(axis: str, terms: Sequence[Term]) -> list[FreeParameter]:
-    """Coefficients of terms on an axis under their priors."""
-    known = dict(zip(effects.GROUPS[axis].names(), effects.GROUPS[axis].parameters, strict=True))
+def parameters(model: HeliModel, axis: str, terms: Sequence[Term]) -> list[FreeParameter]:
+    """Coefficients of terms on an axis under their priors.
+
+    Args:
+        model: whose sizes the priors have. axis: its group. terms: which.
+    """
+    known = dict(zip(effects.GROUPS[axis].names(), model.sized(axis), strict=True))
     return [
         FreeParameter(full, 0.0, p.usual, -MOST_USUAL_SIZES * p.usual, MOST_USUAL_SIZES * p.usual)
         for full, p in ((name(axis, t), known[name(axis, t)]) for t in terms)

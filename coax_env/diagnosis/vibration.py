@@ -13,7 +13,7 @@ sigmas off, and something else would be blamed for it; so it is taken out of the
 segment by segment, and the search sees what is left.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,7 +40,7 @@ class Line:
     """A line found in the accelerometers.
 
     amplitude: [m/s2], root mean square over the axes, with its std. evidence: nats. channels: where it
-    shows, strongest first.
+    shows, strongest first. ratios: run -> power over its neighbours', segment by segment.
     """
 
     rotor: str
@@ -48,6 +48,11 @@ class Line:
     std: float
     evidence: float
     channels: tuple[str, ...]
+    ratios: Mapping[str, Sequence[float]]
+
+    def evidence_of(self, ratios: Sequence[float]) -> float:
+        """Evidence [nats] of some of the segments alone."""
+        return _evidence(ratios) if ratios else 0.0
 
 
 def find(flight: Flight) -> Line | None:
@@ -151,6 +156,7 @@ def _line(flight: Flight, rotor: str) -> Line | None:
         c: [] for c in ACCELEROMETERS
     }  # power over the neighbours' mean
     squares: list[float] = []  # amplitude squared, by segment and axis
+    by_run: dict[str, list[float]] = {run.name: [] for run in flight.runs}
     for run in flight.runs:
         for channel in (c for c in ACCELEROMETERS if c in run.measured):
             segments = list(_segments(run, channel, rotor))
@@ -167,6 +173,7 @@ def _line(flight: Flight, rotor: str) -> Line | None:
             level = float(np.mean(beside)) if beside else 0.0
             if level > 0.0:
                 ratio[channel] += [p / level for p in powers]
+                by_run[run.name] += [p / level for p in powers]
                 squares += [
                     2.0 * (p - level) / s.t.size for p, s in zip(powers, segments, strict=True)
                 ]
@@ -184,6 +191,7 @@ def _line(flight: Flight, rotor: str) -> Line | None:
         evidence=_evidence([r for own in ratio.values() for r in own]),
         channels=tuple(sorted((c for c in shown if shown[c] > SHOWS), key=lambda c: -shown[c]))
         or tuple(shown),
+        ratios=by_run,
     )
 
 

@@ -19,7 +19,7 @@ class Helicopters(NamedTuple):
     params: np.ndarray  # (n or 1, n_parameters)
     kinds: np.ndarray  # (n,) int64, which row of World.sensors and World.limits
     last_commands: np.ndarray  # (n, 4) after their limits
-    swash_ring: np.ndarray  # (n, slots, 2) of swash commands given
+    command_ring: np.ndarray  # (n, slots, 4) of commands given
     bias: np.ndarray  # (n, n_sensors) of this flight
     past: np.ndarray  # (n, slots, n_sensors) ring of what delayed sensors measured
     filters: np.ndarray  # (n or 1, N_FILTERS) states of the turbulence's forming filters

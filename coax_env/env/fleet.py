@@ -19,7 +19,7 @@ from coax_env.env import flight_loop, tasks
 from coax_env.env.actions import Nominal, action_map
 from coax_env.env.arrays import Helicopters, Mission, Outcome, World
 from coax_env.env.flight_loop import WIND_EAST, WIND_NORTH
-from coax_env.env.period import delay_slots
+from coax_env.env.period import DELAYS, delay_slots
 from coax_env.env.randomisation import Draws, Randomize
 from coax_env.env.threads import in_threads
 from coax_env.env.turbulence import N_FILTERS, wind_at_6m
@@ -111,7 +111,7 @@ class Fleet:
         self._fit_for_simd = (
             count >= SIMD_FROM
             and len(self.world.sensors) == 1
-            and self.helicopters.swash_ring.shape[1] == 1
+            and self.helicopters.command_ring.shape[1] == 1
             and self.helicopters.past.shape[1] == 0
             and not self.world.turbulence
         )
@@ -122,6 +122,7 @@ class Fleet:
         self._vector = self._in_wind(self.vehicle.vector)
         windy = n if self.world.turbulence > 0.0 else 1
         readings_kept = sampling.delay_slots(self.world.sensors[:, :, sampling.DELAY].max())
+        longest = sum(self.draws.most(name) for name in DELAYS)
         self.x = np.zeros((n, N_FULL))
         self.drawn = np.zeros((n, len(self.draws.names)))
         self.helicopters = Helicopters(
@@ -132,7 +133,7 @@ class Fleet:
             params=np.tile(self._vector, (n if self._own else 1, 1)),
             kinds=np.zeros(n, dtype=np.int64),
             last_commands=np.zeros((n, N_COMMANDS)),
-            swash_ring=np.zeros((n, delay_slots(self.draws.most("servo_delay.time")), 2)),
+            command_ring=np.zeros((n, delay_slots(longest), N_COMMANDS)),
             bias=np.zeros((n, width)),
             past=np.zeros((n, readings_kept, width)),
             filters=np.zeros((windy, N_FILTERS)),

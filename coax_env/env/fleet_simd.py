@@ -95,7 +95,7 @@ def _step_of(own):
         weights, scales = mission.weights, mission.scales
         rewards, terms, over = outcome.rewards, outcome.terms, outcome.over
         which = np.empty(SIMD_WIDTH, np.int64)
-        x_block, u_block = np.empty((N_FULL, SIMD_WIDTH)), np.empty((N_INPUTS, SIMD_WIDTH))
+        x_block, u_block = np.empty((N_FULL, SIMD_WIDTH)), np.zeros((N_INPUTS, SIMD_WIDTH))
         action_block, last_block = np.empty((4, SIMD_WIDTH)), np.empty((4, SIMD_WIDTH))
         target_block = np.empty((4, SIMD_WIDTH))
         term_block = np.zeros((len(weights), SIMD_WIDTH))
@@ -255,7 +255,7 @@ fly_own = _fly_of(True)
 @compiled(makes_arrays=True)
 def _dynamics_rows(first, last, x, u, p):
     which, active = np.empty(SIMD_WIDTH, np.int64), np.ones(len(x), np.bool_)
-    x_block, u_block = np.empty((N_FULL, SIMD_WIDTH)), np.empty((N_INPUTS, SIMD_WIDTH))
+    x_block, u_block = np.empty((N_FULL, SIMD_WIDTH)), np.zeros((N_INPUTS, SIMD_WIDTH))
     x_, u_ = simd_view(x_block), simd_view(u_block)
     work, flown_ = simd_scratch(WORK_SIZE), simd_scratch(N_FULL)
     n, after = _next_group(first, last, active, which)

@@ -13,8 +13,6 @@ from coax_env.env.hover import EAST, NORTH
 from coax_env.env.period import (
     DT,
     FORCE,
-    LAT,
-    LON,
     MOMENT,
     add_gusts,
     command,
@@ -112,7 +110,7 @@ def fly_rows(first, last, active, actions, x, heli, world, mission, outcome):
             over[i] = False
             continue
         p = heli.params[i if many else 0]
-        u, ring, row = heli.u[i], heli.swash_ring[i], heli.rows[i]
+        u, ring, row = heli.u[i], heli.command_ring[i], heli.rows[i]
         command(actions[i], world.trim, world.scale, u)
         give_command(u, heli.last_commands[i], world.limits[heli.kinds[i]], ring, row, DT)
         fly_period(x[i], u, p, ring, row, DT, work)
@@ -196,7 +194,7 @@ def restart_rows(first, last, which, keep_state, x, heli, world, mission, observ
         progress = heli.progress[i]
         progress[tasks.WITHIN] = progress[tasks.REACHED] = 0
         tasks.next_target(stream, mission.course, mission.box, 0, heli.targets[i])
-        u, ring = heli.u[i], heli.swash_ring[i]
+        u, ring = heli.u[i], heli.command_ring[i]
         for k in range(N_COMMANDS):
             u[k] = heli.last_commands[i, k] = trim[k]
         limit(u, heli.last_commands[i], world.limits[heli.kinds[i]], DT)
@@ -204,7 +202,7 @@ def restart_rows(first, last, which, keep_state, x, heli, world, mission, observ
         heli.rows[i] = 0
         heli.azimuth[i] = 0.0
         for k in range(len(ring)):
-            ring[k, LON], ring[k, LAT] = u[U.DELTA_LON], u[U.DELTA_LAT]
+            copy_row(u[:N_COMMANDS], ring[k])
         for k in range(heli.held.shape[1]):
             heli.held[i, k] = 0.0
         _sense(i, x[i], p, heli, world, readings, values, work, observations[i])

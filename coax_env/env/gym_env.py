@@ -46,8 +46,9 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     | 3 | delta_lat | swash tilt, positive tilts the thrust right | trim -+ 0.2 rad |
 
     Rotors and swash plate follow at once but for what the vehicle file has: the effects
-    `motor_lag`, `servo_lag`, `servo_delay` and `battery_sag`, and ``[actuators]``, limits of
-    travel, speed and rates.
+    `motor_lag`, `motor_droop`, `servo_lag`, `servo_play`, `servo_deadband`, `servo_rate`,
+    `servo_delay`, `command_delay` and `battery_sag`, and ``[actuators]``, limits of travel, speed
+    and rates.
 
     ## Observation Space
     ``Box(low, high, (n,), float32)``; ``observation_names`` and ``observation_units`` say what

@@ -1,6 +1,6 @@
 """One control period of one helicopter, in parts::
 
-    command -> give_command (limits, the servos' delay) -> add_gusts -> fly_period (dynamics.step)
+    command -> give_command (limits; on its way) -> add_gusts -> fly_period (dynamics.step)
             -> true_readings (dynamics.measure, vibration) -> take_samples (sampling.py)
 
 The batch (flight_loop.py), the SIMD batch (fleet_simd.py) and simulated maneuvers (simulation/) put the
@@ -29,6 +29,7 @@ from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model.actuators import limit
 from coax_env.model.dynamics import measure, step
+from coax_env.model.layout import N_COMMANDS
 from coax_env.model.sampling import (
     DROPOUT,
     FLAG,
@@ -46,12 +47,13 @@ from coax_env.model.sampling import (
 
 DT = hover.CONTROL_PERIOD
 
-_DELAY = effects.parameter_index("servo_delay.time")
+DELAYS = ("command_delay.time", "servo_delay.time")
+"""Pure delays of the commands [s]: of all four, and of the swash plate's on top."""
+_COMMAND_DELAY, _SERVO_DELAY = (effects.parameter_index(name) for name in DELAYS)
 _VIBRATION = effects.parameter_index("vibration.amplitude")
-LON, LAT = range(2)
-"""Columns of the ring of swash commands."""
 FORCE, MOMENT = range(2)
 """Places of the gusts' std."""
+SHORTEST_PART = 1e-9  # [s] of a period that is flown by itself
 
 
 # --- commands -----------------------------------------------------------------------------------------
@@ -73,7 +75,7 @@ def command(action, trim, scale, u):
 
 
 def delay_slots(delay: float, dt: float = DT) -> int:
-    """Slots of the ring of swash commands for a servo delay of up to so many seconds."""
+    """Slots of the ring of commands for delays that sum up to so many seconds."""
     return 2 + math.ceil(delay / dt) if delay > 0.0 else 1
 
 
@@ -85,42 +87,52 @@ def give_command(u, last, limits, ring, row, dt):
         u: commands and time since the flight's start, (5,), in place.
         last: the command given in the row before, (4,); this one afterwards.
         limits: `actuators.limits`, (3, 4).
-        ring: swash commands given in the last rows, (slots, 2), see `delay_slots`.
+        ring: commands given in the last rows, (slots, 4), see `delay_slots`.
         row: control periods flown so far. dt: seconds per row.
     """
     limit(u, last, limits, dt)
     slot = row % len(ring)
-    ring[slot, LON], ring[slot, LAT] = u[U.DELTA_LON], u[U.DELTA_LAT]
+    for k in range(N_COMMANDS):
+        ring[slot, k] = u[k]
     u[U.TIME] = row * dt
 
 
 @compiled()
 def _split(delay, slots, dt):
-    """A servo delay [s] as whole rows, and the seconds of a row for which the command before holds."""
+    """A delay [s] as whole rows, and the seconds of a row for which the command before holds."""
     whole = min(int(delay / dt + 1e-9), slots - 2)
     rest = min(max(delay - whole * dt, 0.0), dt)
-    return whole, rest if rest > 1e-9 else 0.0
+    return whole, rest if rest > SHORTEST_PART else 0.0
 
 
 @compiled()
-def apply_servo_delay(u, p, ring, row, dt):
-    """Put into `u` the swash command that is in force as a row begins; arguments as `give_command`.
+def _delays(p):
+    """Delays [s] of the rotors' commands and of the swash plate's."""
+    rotors = max(p[_COMMAND_DELAY], 0.0)
+    return rotors, rotors + max(p[_SERVO_DELAY], 0.0)
+
+
+@compiled()
+def apply_delays(u, p, ring, row, dt):
+    """Put into `u` the commands that are in force as a row begins; arguments as `give_command`.
 
     Args:
         u, ring, row, dt: as in `give_command`. p: parameter vector.
     """
+    rotors, swash = _delays(p)
     slots = len(ring)
-    if p[_DELAY] <= 0.0 or slots == 1:
+    if swash <= 0.0 or slots == 1:
         return
-    whole, rest = _split(p[_DELAY], slots, dt)
-    _take_swash(ring, row - whole - (1 if rest > 0.0 else 0), u)
+    _take(ring, row, _split(rotors, slots, dt), 0.0, U.OMEGA_U, u)
+    _take(ring, row, _split(swash, slots, dt), 0.0, U.DELTA_LON, u)
 
 
 @compiled()
-def _take_swash(ring, row, u):
-    """The swash command that was given in a row, into `u`."""
-    slot = row % len(ring)
-    u[U.DELTA_LON], u[U.DELTA_LAT] = ring[slot, LON], ring[slot, LAT]
+def _take(ring, row, late, since, first, u):
+    """Two commands from the `first` on, as in force `since` seconds after a row began, into `u`."""
+    whole, rest = late
+    slot = (row - whole - (1 if since < rest else 0)) % len(ring)
+    u[first], u[first + 1] = ring[slot, first], ring[slot, first + 1]
 
 
 # --- flight -------------------------------------------------------------------------------------------
@@ -130,25 +142,30 @@ def _take_swash(ring, row, u):
 def fly_period(x, u, p, ring, row, dt, work):
     """Fly one control period in place, after `give_command`.
 
-    A pure delay of the servos is a look-up of the command that was given that long ago; where it is
-    no whole number of periods, the period is split. Leaves in `u` the command in force at the end.
+    A pure delay is a look-up of the command that was given that long ago; where it is no whole number
+    of periods, the period is split. Leaves in `u` the commands in force at the end.
 
     Args:
         x: full state, (29,). u, ring, row, dt: as in `give_command`. p: parameter vector.
         work: scratch, (dynamics.WORK_SIZE,).
     """
+    rotors, swash = _delays(p)
     slots = len(ring)
-    if p[_DELAY] <= 0.0 or slots == 1:
+    if swash <= 0.0 or slots == 1:
         step(x, u, dt, p, work, x)
         return
-    whole, rest = _split(p[_DELAY], slots, dt)
-    if rest > 0.0:
-        _take_swash(ring, row - whole - 1, u)
-        step(x, u, rest, p, work, x)
-        u[U.TIME] += rest
-    _take_swash(ring, row - whole, u)
-    if dt - rest > 1e-9:
-        step(x, u, dt - rest, p, work, x)
+    late_rotors, late_swash = _split(rotors, slots, dt), _split(swash, slots, dt)
+    first = min(late_rotors[1], late_swash[1])
+    second = max(late_rotors[1], late_swash[1])
+    since, begin = 0.0, u[U.TIME]
+    for k in range(3):
+        until = first if k == 0 else (second if k == 1 else dt)
+        if until - since > SHORTEST_PART:
+            _take(ring, row, late_rotors, since, U.OMEGA_U, u)
+            _take(ring, row, late_swash, since, U.DELTA_LON, u)
+            u[U.TIME] = begin + since
+            step(x, u, until - since, p, work, x)
+            since = until
 
 
 @compiled()

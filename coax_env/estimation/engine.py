@@ -314,7 +314,7 @@ class Engine:
     def _moves(
         self, values: Mapping[str, float], noise: Noise, free: Sequence[FreeParameter]
     ) -> _Moves:
-        probed = np.array([f.probe > 0.0 and values[f.name] < 0.25 * f.probe for f in free], bool)
+        probed = np.array([abs(values[f.name] - f.value) < 0.25 * abs(f.probe) for f in free], bool)
         steps = np.array([f.probe if probed[k] else 0.02 * f.std for k, f in enumerate(free)])
         over = np.array([values[f.name] + steps[k] > f.upper for k, f in enumerate(free)], bool)
         steps[over] *= -1.0

@@ -1,7 +1,8 @@
 """The helicopter as the engine sees it: the compiled kernel, its parameters with priors, its noise.
 
-Command delay enters here: with servo_delay the swash commands are looked up late and, where a row's
-interval holds two commands, replaced by their mean over it (the step is split to second order).
+Delays of the commands enter here: with command_delay, and for the swash plate servo_delay on top, they
+are looked up late and, where a row's interval holds two of them, replaced by their mean over it (the
+step is split to second order).
 """
 
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ from coax_env.estimation import helicopter_noise
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
 from coax_env.logs.flight import Run
-from coax_env.model import dynamics, effects
+from coax_env.model import dynamics, effects, usual_sizes
 from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
@@ -122,9 +123,11 @@ class HeliModel:
     noise_places = helicopter_noise.NOISE_PLACES
     state_scale = _small_changes()
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, held: Mapping[str, float] | None = None) -> None:
+        """Of a vehicle; ``held``: values that effects which it does not have would take as stated."""
         self.vehicle = vehicle
-        self.bare_values = vehicle.values()
+        self.bare_values = {**(held or {}), **vehicle.values()}
+        self.size_ratios = usual_sizes.ratios(vehicle)
 
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """Parameter vector of the vehicle with some values changed, effects included.
@@ -140,14 +143,17 @@ class HeliModel:
         return vector
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
-        """Commands and time since the run's start, (n, 5), or with input innovations, (n, 9)."""
-        u = np.empty((record.t.size, N_INPUTS))
+        """The kernel's inputs, inputs.py, (n, 6), or with input innovations, (n, 10)."""
+        u = np.zeros((record.t.size, N_INPUTS))
         u[:, :TIME] = record.command
-        u[:, TIME] = record.t - record.origin
-        delay = vector[_DELAY]
-        if delay > 0.0:
-            for column in (U.DELTA_LON, U.DELTA_LAT):
-                u[:, column] = _delayed_mean(record.t, record.command[:, column], delay)
+        u[:, U.TIME] = record.t - record.origin
+        if record.battery is not None:
+            u[:, U.BATTERY] = record.battery - vector[_NOMINAL_VOLTAGE]
+        late, swash_later = max(vector[_COMMAND_DELAY], 0.0), max(vector[_SERVO_DELAY], 0.0)
+        for columns, delay in ((ROTORS, late), (SWASH_PLATE, late + swash_later)):
+            if delay > 0.0:
+                for column in columns:
+                    u[:, column] = _delayed_mean(record.t, record.command[:, column], delay)
         if record.input_innovations is None:
             return u
         return np.hstack([u, record.input_innovations])
@@ -178,7 +184,7 @@ class HeliModel:
         spread[LOWER_FLAP] = spread[FLYBAR] = 0.06
         x[ACTUATORS] = record.command[0]
         spread[ROTOR_SPEED] = 4.0
-        spread[SWASH] = 0.03
+        spread[SWASH] = spread[S.INFLOW] = 0.03
         return x, np.diag(spread**2 + 1e-12)
 
     def start_noise(self, noise: Noise) -> np.ndarray:
@@ -199,16 +205,19 @@ class HeliModel:
             if p.std > 0.0 and name not in HELD
         ]
 
-    @staticmethod
-    def effect_parameters(effect: str) -> list[FreeParameter]:
-        """An effect's parameters; the prior is centred on its off-value.
+    def sized(self, effect: str) -> tuple[effects.EffectParameter, ...]:
+        """An effect's parameters with their sizes on this vehicle, generic groups' too."""
+        return usual_sizes.scaled(effects.GROUPS[effect].parameters, self.size_ratios)
+
+    def effect_parameters(self, effect: str) -> list[FreeParameter]:
+        """An effect's parameters that may be fitted; the prior is centred on its off-value.
 
         Nothing is taken to be more than MOST_USUAL_SIZES usual sizes: beyond that it is another effect.
         """
         entry = effects.CATALOGUE[effect]
         return [
             FreeParameter(
-                full,
+                f"{effect}.{p.name}",
                 p.off,
                 p.usual,
                 max(p.lower, p.off - MOST_USUAL_SIZES * p.usual),
@@ -216,11 +225,16 @@ class HeliModel:
                 p.probe,
                 entry.stage == effects.SENSOR,
             )
-            for full, p in zip(entry.names(), entry.parameters, strict=True)
+            for p in self.sized(effect)
+            if not p.held
         ]
 
 
-_DELAY = effects.parameter_index("servo_delay.time")
+_COMMAND_DELAY = effects.parameter_index("command_delay.time")
+_SERVO_DELAY = effects.parameter_index("servo_delay.time")
+_NOMINAL_VOLTAGE = effects.parameter_index("battery_voltage.nominal")
+ROTORS, SWASH_PLATE = (U.OMEGA_U, U.OMEGA_L), (U.DELTA_LON, U.DELTA_LAT)
+"""Columns of the input that command_delay alone and that servo_delay too make late."""
 
 
 def _delayed_mean(t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
@@ -242,4 +256,6 @@ def record_of(run: Run) -> Record:
     z = np.full((run.t.size, len(CHANNELS)), np.nan)
     for channel, values in run.measured.items():
         z[:, CHANNELS.index(channel)] = values
-    return Record(run.name, run.t, run.command, z, origin=float(run.t[0]))
+    return Record(
+        run.name, run.t, run.command, z, origin=run.beginning, run=run.whole, battery=run.battery
+    )

@@ -152,9 +152,7 @@ def start_noise(noise: Noise) -> np.ndarray:
     """Variances of gusts and trims at the start of a run (29,)."""
     variance = np.zeros(N_FULL)
     variance[GUSTS] = gust_levels(noise) ** 2
-    variance[TRIMS] = [
-        TRIM_KNOWN_AFTER * noise.process.get(name, 0.0) ** 2 for name in TRIM_LEVELS
-    ]
+    variance[TRIMS] = [TRIM_KNOWN_AFTER * noise.process.get(name, 0.0) ** 2 for name in TRIM_LEVELS]
     return variance
 
 

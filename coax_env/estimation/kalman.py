@@ -11,7 +11,8 @@ e = v / s, and so the likelihood is
 
 F and H are mostly zero, and only what is not is multiplied (sparse.py); tests/test_kalman.py holds the
 pass against the same filter with dense matrices. One departure from the book: both Jacobians are those
-at the predicted state, from one look at the rates, and serve some rows (`refresh`). What it stores, its
+at the predicted state, from one look at the rates, and serve some rows (`refresh`); that of the first
+step is taken where the first readings have put the state. What it stores, its
 gains K, 1 / s and Jacobians, is what the passes of frozen_gains.py and noise_score.py work with.
 
 Bar-Shalom, Li and Kirubarajan 2001, ch. 5 and 10; Durbin and Koopman 2012, sec. 6.4 (one reading at a
@@ -491,7 +492,7 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
         model.step(w.x, u, dt, p, w.work, w.x_next)
         changed = True
         if fresh or abs(dt - dt_of_F) > 0.5 * dt_of_F:
-            if not fresh:
+            if not fresh or k == 0:  # the first readings move the mean far
                 _linearise(model, u, dt, p, w)
             _transition(model, u, dt, p, w)
             dt_of_F = dt_now = dt

@@ -6,8 +6,9 @@ set to zero; the version in which they decay is computed beside it. Where a chan
 the end itself, its last one within the final TAIL seconds is used, at its own time.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from coax_env.errors import InputError
 from coax_env.estimation import kalman
 from coax_env.estimation.engine import Engine, Progress, RunPass
+from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import AXES, fitted_levels, sensor_std, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
@@ -60,6 +62,10 @@ class RunReplay:
     diverged: bool
     floor: Mapping[str, float]
     """Std by channel that the uncertainty of the start alone gives at the end; empty unless asked."""
+    still: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Errors by channel, (s,), of the prediction that nothing changes from the start on."""
+    log_likelihood: float = math.nan
+    """Of the run's readings, each predicted from those before it [nats]."""
 
 
 def replay_runs(
@@ -81,10 +87,29 @@ def replay_runs(
     starts = [_starts(r.t, horizon) for r in engine.records]
     passes = engine.filter(values, noise, start_rows=starts)
     p = engine.model.vector(values, noise)
-    return [
-        _replay_run(engine, run, dt, p, horizon, floor)
-        for run, dt in zip(passes, engine.intervals, strict=True)
-    ]
+    parts: dict[str, list[RunReplay]] = {}
+    for run, dt in zip(passes, engine.intervals, strict=True):
+        parts.setdefault(run.record.whole, []).append(
+            _replay_run(engine, run, dt, p, horizon, floor)
+        )
+    return [_joined(name, of_run) for name, of_run in parts.items()]
+
+
+def _joined(name: str, parts: Sequence[RunReplay]) -> RunReplay:
+    """The parts of a run as one."""
+    if len(parts) == 1:
+        return replace(parts[0], name=name)
+    columns = [f.name for f in fields(ChannelReplay)]
+    channels, floor = {}, {}
+    for channel in dict.fromkeys(c for part in parts for c in part.channels):
+        there = [part for part in parts if channel in part.channels]
+        channels[channel] = ChannelReplay(
+            *(np.concatenate([getattr(p.channels[channel], c) for p in there]) for c in columns)
+        )
+        floors = [p.floor[channel] for p in there if channel in p.floor]
+        if floors:
+            floor[channel] = float(np.sqrt(np.mean(np.square(floors))))
+    return RunReplay(name, channels, any(part.diverged for part in parts), floor)
 
 
 def _replay_run(
@@ -96,6 +121,7 @@ def _replay_run(
     used = np.flatnonzero(np.isfinite(run.record.z).any(axis=0))
     t, measured = _readings_at(run, targets)
     predicted, decaying, finite = _fly_all(engine, run, inputs, dt, p, targets)
+    unmoved = _unmoved(engine, run, inputs, dt, p)
     diverged = not (finite and np.isfinite(run.log_likelihood))
     return RunReplay(
         run.record.name,
@@ -107,7 +133,21 @@ def _replay_run(
         },
         diverged,
         _floor(engine, run, inputs, dt, p, targets, used) if floor and not diverged else {},
+        {CHANNELS[i]: _error(CHANNELS[i], unmoved[:, i] - measured[:, i]) for i in used},
+        run.log_likelihood,
     )
+
+
+def _unmoved(
+    engine: Engine, run: RunPass, inputs: np.ndarray, dt: np.ndarray, p: np.ndarray
+) -> np.ndarray:
+    """Readings of the filtered state at every start itself, (s, 18)."""
+    readings = np.full((run.start_rows.size, len(CHANNELS)), np.nan)
+    for row, first in zip(readings, run.start_rows, strict=True):
+        here = np.full(len(CHANNELS), first)
+        x = run.states[first].copy()
+        kalman.fly_open_loop(engine.compiled, dt, inputs, x, p, first, here, row)
+    return readings
 
 
 def _fly_all(
@@ -185,7 +225,7 @@ def _targets(run: RunPass, horizon: float) -> np.ndarray:
     """Row of each channel's last reading within TAIL of each start's horizon, (s, 18); -1 for none."""
     t, present = run.record.t, np.isfinite(run.record.z)
     ends = np.searchsorted(t, t[run.start_rows] + horizon + 1e-6) - 1
-    begins = np.searchsorted(t, t[ends] - TAIL)
+    begins = np.searchsorted(t, t[run.start_rows] + horizon - TAIL - 1e-6)
     latest = np.maximum.accumulate(np.where(present, np.arange(t.size)[:, None], -1), axis=0)
     found = latest[ends]
     return np.ascontiguousarray(np.where(found >= begins[:, None], found, -1), dtype=np.int64)
@@ -194,12 +234,15 @@ def _targets(run: RunPass, horizon: float) -> np.ndarray:
 def _channel(
     name: str, t: np.ndarray, measured: np.ndarray, predicted: np.ndarray, decaying: np.ndarray
 ) -> ChannelReplay:
-    error, error_decaying = predicted - measured, decaying - measured
-    if name in ("phi", "theta"):
-        error, error_decaying = (
-            np.mod(e + np.pi, 2.0 * np.pi) - np.pi for e in (error, error_decaying)
-        )
+    error, error_decaying = (_error(name, flown - measured) for flown in (predicted, decaying))
     return ChannelReplay(t, measured, predicted, error, error_decaying)
+
+
+def _error(name: str, difference: np.ndarray) -> np.ndarray:
+    """Prediction less measurement, wrapped for roll and pitch."""
+    if name in ("phi", "theta"):
+        return np.asarray(np.mod(difference + np.pi, 2.0 * np.pi) - np.pi)
+    return difference
 
 
 def _spread(
@@ -263,6 +306,7 @@ def replay(
     """
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    flight = flown_parts(flight, vehicle)
     longest = max(run.duration for run in flight.runs)
     if longest < WARM_UP + horizon:
         raise InputError(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -42,6 +42,7 @@ class Quadratic:
         lower, upper: bounds, (k,).
         blocks: g by blocks of time, (blocks, k).
         by_channel: squared signatures summed per channel, (k, m).
+        parts: the linearisation that it sums, run by run.
     """
 
     names: tuple[str, ...]
@@ -54,6 +55,7 @@ class Quadratic:
     upper: np.ndarray
     blocks: np.ndarray
     by_channel: np.ndarray
+    parts: Linearised | None = None
 
     @classmethod
     def of(
@@ -77,6 +79,24 @@ class Quadratic:
             np.array([f.upper for f in free]),
             lin.blocks,
             lin.by_channel.sum(0),
+            lin,
+        )
+
+    def of_parts(self, which: Sequence[int]) -> "Quadratic":
+        """That of some runs alone, about the same point and under the same priors.
+
+        The blocks stay those of all runs: a few runs are too few to tell their scatter.
+
+        Args:
+            which: indices of the runs.
+        """
+        assert self.parts is not None, "the quadratic was not made of a linearisation"
+        chosen = list(which)
+        return replace(
+            self,
+            G=self.parts.information[chosen].sum(0),
+            g=self.parts.slope[chosen].sum(0),
+            by_channel=self.parts.by_channel[chosen].sum(0),
         )
 
     def index(self, names: Collection[str]) -> np.ndarray:

@@ -12,7 +12,8 @@ class FreeParameter:
     """A number the engine may change.
 
     ``value`` is the prior's mean and ``std`` its width; ``probe`` the finite step used for its
-    signature (0: a small one, for the derivative). ``reading_only``: it never moves the state.
+    signature near that mean (0: a small one, for the derivative). ``reading_only``: it never moves the
+    state.
     """
 
     name: str
@@ -31,8 +32,9 @@ class Record:
     t: (n,) seconds, increasing. command: (n, k), held from each row to the next.
     z: (n, m) readings in the order of the model's channels, NaN where there is no new sample.
     origin: time at which the run began, also where the record is a part of it.
+    run: name of the run of which it is a part; empty where it is a run itself.
     input_innovations: (n, k) what each command shows beyond the readings before it, or None
-    (input_innovations.py).
+    (input_innovations.py). battery: (n,) its voltage [V], or None.
     """
 
     name: str
@@ -41,18 +43,28 @@ class Record:
     z: np.ndarray
     origin: float = 0.0
     input_innovations: np.ndarray | None = None
+    run: str = ""
+    battery: np.ndarray | None = None
+
+    @property
+    def whole(self) -> str:
+        """Name of the run that it is, or is a part of."""
+        return self.run or self.name
 
 
 def part(record: Record, rows: np.ndarray) -> Record:
     """Some rows of a record, its clock kept."""
+
+    def of(values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None else values[rows]
+
     return replace(
         record,
         t=record.t[rows],
         command=record.command[rows],
         z=record.z[rows],
-        input_innovations=None
-        if record.input_innovations is None
-        else record.input_innovations[rows],
+        input_innovations=of(record.input_innovations),
+        battery=of(record.battery),
     )
 
 
@@ -116,7 +128,9 @@ class Model(Protocol):
     drift_and_readings: Any  # compiled pointer: (x, u, dt, p, work, out), see above
     exact: np.ndarray  # (nx,) True where the drift is more than first order in dt
     work_size: int
-    noise_places: np.ndarray  # (e, 2) entries (i <= j) of the process noise: all (i, i), then others
+    noise_places: (
+        np.ndarray
+    )  # (e, 2) entries (i <= j) of the process noise: all (i, i), then others
 
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """The compiled functions' parameter vector for named values; others as in the model.

@@ -21,6 +21,7 @@ from coax_env.estimation.fitted_vehicle import (
     median_step,
     with_timing,
 )
+from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
@@ -139,8 +140,8 @@ def identify(
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     if channels is not None:
         flight = with_channels(flight, channels)
-    flight, held = _split(flight, hold_out)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    flight, held = _split(flown_parts(flight, vehicle), hold_out)
     known = (*flight.notes, *double_counting(flight, vehicle))
     if method == "paper":
         result = two_step(flight, vehicle, progress=report)
@@ -216,7 +217,7 @@ def _split(flight: Flight, hold_out: Collection[str]) -> tuple[Flight, Flight]:
     if not hold_out:
         return flight, flight
     held = flight.select(hold_out)
-    used = [name for name in flight.run_names if name not in hold_out]
+    used = [run.name for run in flight.runs if not {run.name, run.whole} & set(hold_out)]
     if not used:
         raise InputError("all runs are held out: nothing is left to identify from")
     return flight.select(used), held

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from coax_env.estimation.flown import flown_parts
 from coax_env.inspection.learnable import EffectCheck, OwnNumber, learnable
 from coax_env.inspection.readings import (
     ChannelCheck,
@@ -90,6 +91,7 @@ def check_flight(
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     label = str(flight.vehicle if vehicle is None else getattr(vehicle, "name", vehicle))
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    flight = flown_parts(flight, vehicle)
     channels = channel_checks(flight)
     suspicions = [*unit_and_sign_faults(flight, vehicle), *sensor_faults(channels)]
     if progress:

@@ -113,7 +113,9 @@ def _effect_checks(
     found = []
     for effect, nats in expected.items():
         own = problem.acting_names(effect)
-        known = {f"{effect}.{p.name}": p for p in effects.CATALOGUE[effect].parameters}
+        known = dict(
+            zip(effects.CATALOGUE[effect].names(), problem.model.sized(effect), strict=True)
+        )
         squares = [known[n].usual ** 2 for n in own]
         places = quadratic.index(own)
         found.append(

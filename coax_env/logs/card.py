@@ -28,6 +28,8 @@ class Column:
 
     name: str
     factor: float
+    hold: bool | None = None
+    """Whether a repeat is no new reading; None: as the pattern of repeats says (held.py)."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,11 @@ class Card:
     columns: Mapping[str, Column]
     runs: tuple[RunEntry, ...]
     counts: Mapping[str, int]
+
+    @property
+    def holds(self) -> dict[str, bool]:
+        """Channels of which the card says whether their repeats are new readings."""
+        return {c: column.hold for c, column in self.columns.items() if column.hold is not None}
 
 
 def read_card(path: Path) -> Card:
@@ -138,7 +145,12 @@ def _columns(table: _Table) -> dict[str, Column]:
             factor = factor_to_canonical(channel, unit)
         except InputError as error:
             raise table.fault(f"[columns] {error}") from error
-        columns[channel] = Column(name.strip(), factor * _scale(table, channel, entry))
+        hold = entry.get("hold")
+        if hold is not None and not isinstance(hold, bool):
+            raise table.fault(
+                f"[columns] {channel} hold should be true or false, found {shown(hold)}"
+            )
+        columns[channel] = Column(name.strip(), factor * _scale(table, channel, entry), hold)
     return columns
 
 

@@ -27,6 +27,7 @@ USUAL_NAMES: Mapping[str, str] = {
     "rpm_lower": "rpmlower lowerrpm rpml omegal wl rotorlower lowerrotor motor2 rpm2",
     "delta_lon": "deltalon dlon swashlon cycliclon longitudinalcyclic swashpitch elevator",
     "delta_lat": "deltalat dlat swashlat cycliclat lateralcyclic swashroll aileron",
+    "battery_v": "batteryv batteryvoltage vbat vbatt battv voltage battery",
     "p": "p gyrox gyrx gx omegax wx rollrate rollspeed angularvelocityx",
     "q": "q gyroy gyry gy omegay wy pitchrate pitchspeed angularvelocityy",
     "r": "r gyroz gyrz gz omegaz wz yawrate yawspeed angularvelocityz",

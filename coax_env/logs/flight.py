@@ -21,7 +21,7 @@ from coax_env.files import read_bytes, staged_folder, write_text
 from coax_env.logs.card import CARD, Card, read_card
 from coax_env.logs.csv_log import read_csv
 from coax_env.logs.repairs import repaired
-from coax_env.logs.units import ROTOR_COMMANDS, SWASH_COMMANDS
+from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
 
@@ -35,6 +35,9 @@ class Run:
         t: (n,) time, strictly increasing [s].
         command: (n, 4) omega_u, omega_l [rad/s], delta_lon, delta_lat [rad], without holes.
         measured: channel -> (n,) readings in the contract's units, NaN where there is no new one.
+        part_of: the card's run of which it is a part (estimation/flown.py); empty where it is whole.
+        began: time at which that one began [s]; None: with the first row.
+        battery: (n,) voltage, the last sample held [V]; None where none was logged.
     """
 
     name: str
@@ -43,6 +46,19 @@ class Run:
     measured: Mapping[str, np.ndarray]
     maneuver: str = ""
     note: str = ""
+    part_of: str = ""
+    began: float | None = None
+    battery: np.ndarray | None = None
+
+    @property
+    def whole(self) -> str:
+        """Name of the card's run."""
+        return self.part_of or self.name
+
+    @property
+    def beginning(self) -> float:
+        """Time at which the card's run began [s]."""
+        return float(self.t[0]) if self.began is None else self.began
 
     @property
     def duration(self) -> float:
@@ -85,16 +101,16 @@ class Flight:
         return tuple(c for c in CHANNELS if any(c in run.measured for run in self.runs))
 
     def run(self, name: str) -> Run:
-        """The run of that name."""
+        """The run of that name, or its first part."""
         for run in self.runs:
-            if run.name == name:
+            if name in (run.name, run.whole):
                 return run
         raise InputError(f"no run {name!r} in this flight; it has {', '.join(self.run_names)}")
 
     def select(self, names: Iterable[str]) -> "Flight":
-        """The same flight with these runs only, in the flight's own order."""
-        wanted = {self.run(name).name for name in names}
-        return replace(self, runs=tuple(run for run in self.runs if run.name in wanted))
+        """The same flight with these runs only, all parts of each, in the flight's own order."""
+        wanted = {self.run(name) and name for name in names}
+        return replace(self, runs=tuple(run for run in self.runs if wanted & {run.name, run.whole}))
 
 
 # --- reading ---------------------------------------------------------------------------------
@@ -122,9 +138,17 @@ def read_flight(path: str | Path) -> Flight:
         hashes[entry.file] = _hash(file)
         renamed |= log.renamed
         unread |= dict.fromkeys(log.unknown)
-        data = repaired(log, card.noise, counts)
+        data = repaired(log, card.noise, counts, card.holds)
         runs.append(
-            Run(entry.name, data.t, data.command, data.measured, entry.maneuver, entry.note)
+            Run(
+                entry.name,
+                data.t,
+                data.command,
+                data.measured,
+                entry.maneuver,
+                entry.note,
+                battery=data.battery,
+            )
         )
     _check_columns(folder, card, renamed, unread)
     return Flight(
@@ -201,6 +225,9 @@ def _csv_text(run: Run) -> str:
     header = ["t", *ROTOR_COMMANDS, *SWASH_COMMANDS]
     to_log = (RPM_PER_RAD_S, RPM_PER_RAD_S, 1.0, 1.0)
     columns += [[f"{x:.12g}" for x in run.command[:, i] * to_log[i]] for i in range(4)]
+    if run.battery is not None:
+        header.append(BATTERY)
+        columns.append([f"{x:.9g}" for x in run.battery.tolist()])
     for channel in CHANNELS:
         if channel in run.measured:
             header.append(channel)

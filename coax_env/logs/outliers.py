@@ -15,6 +15,18 @@ THRESHOLD = 8.0
 LONGEST_BURST = 4
 """More outliers in a row than this are something else, and stay."""
 
+LEAP_TIME = 0.1
+"""Time [s] from the last reading before a leap to the first one behind it; ours."""
+LEAP_NOISE = 20.0
+"""Standard deviations of the noise that a leap has at least; ours."""
+LEAP_REST = 0.3
+"""Share of a leap by which what was before and what comes behind may differ; ours."""
+FASTEST = {
+    **dict.fromkeys(("h", "pn", "pe"), 30.0),
+    **dict.fromkeys(("phi", "theta", "psi"), 35.0),
+}  # fmt: skip
+"""What no such machine exceeds: 30 m/s, and 35 rad/s, the range of usual gyros; ours."""
+
 _NORMAL = 1.4826  # std of a normal variable per median absolute deviation
 
 
@@ -43,6 +55,42 @@ def find_outliers(channel: str, values: np.ndarray, noise: float | None = None) 
     scale = np.maximum(spread, noise if noise is not None else _noise_level(y))
     outlier = _short_bursts(np.abs(y - centre) > THRESHOLD * scale)
     flagged[present[outlier]] = True
+    return flagged
+
+
+def find_leaps(channel: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Where a channel leaps out in one step and back in one step, within LEAP_TIME.
+
+    For bursts that are too long for the running median: 40 ms of nonsense are four rows at 100 Hz and
+    sixteen at 400 Hz. Each leap is beyond the noise and beyond the range of the whole run, or the speed
+    of any such machine; a step that stays is no leap.
+
+    Args:
+        channel: name; angles are unwrapped first.
+        t: (n,) time [s].
+        values: (n,) readings, NaN where there is none.
+
+    Returns:
+        (n,) bool.
+    """
+    flagged = np.zeros(len(values), dtype=bool)
+    present = np.flatnonzero(~np.isnan(values))
+    if len(present) < 2 * HALF_WINDOW + 1:
+        return flagged
+    y, at = values[present], t[present]
+    if channel in ANGLES:
+        y = np.unwrap(y)
+    low, high = np.quantile(y, [0.01, 0.99])
+    step = np.diff(y)
+    allowed = np.minimum(high - low, FASTEST.get(channel, np.inf) * np.diff(at))
+    leaps = np.flatnonzero(np.abs(step) > LEAP_NOISE * _noise_level(y) + allowed)
+    for k, out in enumerate(leaps):
+        for back in leaps[k + 1 :]:
+            if at[back + 1] - at[out] > LEAP_TIME:
+                break
+            least = min(abs(step[out]), abs(step[back]))
+            if abs(y[back + 1] - y[out]) < LEAP_REST * least:
+                flagged[present[out + 1 : back + 1]] = True
     return flagged
 
 

@@ -12,8 +12,10 @@ import numpy as np
 from coax_env.errors import InputError
 from coax_env.logs.columns import advice, time_advice
 from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
-from coax_env.logs.outliers import find_outliers
-from coax_env.logs.units import ROTOR_COMMANDS, SWASH_COMMANDS
+from coax_env.logs.held import repeats
+from coax_env.logs.outliers import find_leaps, find_outliers
+from coax_env.logs.packets import broken_packets
+from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
 SHORTEST_RUN = 2.0
@@ -33,20 +35,27 @@ _MEASURED_ROTOR = ("rpm_upper", "rpm_lower")
 
 @dataclass(frozen=True)
 class Repaired:
-    """A run's data as a flight has them: `Run.t`, `Run.command` and `Run.measured` (flight.py)."""
+    """A run's data as a flight has them: the fields of `Run` (flight.py)."""
 
     t: np.ndarray
     command: np.ndarray
     measured: Mapping[str, np.ndarray]
+    battery: np.ndarray | None
 
 
-def repaired(log: CsvLog, noise: Mapping[str, float], counts: Counter[str]) -> Repaired:
+def repaired(
+    log: CsvLog,
+    noise: Mapping[str, float],
+    counts: Counter[str],
+    holds: Mapping[str, bool] | None = None,
+) -> Repaired:
     """A log's data without what no sensor measured.
 
     Args:
         log: one run's CSV.
         noise: channel -> std of its sensor, in the channel's unit, where it is known.
         counts: what was repaired -> how often; this log's repairs are added.
+        holds: channel -> whether its repeats are no new readings, where the card says so.
 
     Raises:
         InputError: time that cannot be a run's, or no rotor speed.
@@ -59,6 +68,9 @@ def repaired(log: CsvLog, noise: Mapping[str, float], counts: Counter[str]) -> R
     data, repeated = merge_repeated_times(log.data)
     if repeated:
         counts["rows with a repeated time stamp merged"] += repeated
+    data = _without_blank_rows(data, counts)
+    data = _without_broken_packets(data, counts)
+    data = _without_repeats(data, holds or {}, counts)
     t = data["t"]
     measured = _without_outliers(data, noise, counts)
     stalled = beside_stalls(t)
@@ -68,7 +80,7 @@ def repaired(log: CsvLog, noise: Mapping[str, float], counts: Counter[str]) -> R
     command, driving = _commands(log, data, measured, counts)
     measured = {c: values for c, values in measured.items() if c not in driving}
     _count_gaps(t, measured, counts)
-    return Repaired(t, command, measured)
+    return Repaired(t, command, measured, _battery(data))
 
 
 # --- time ------------------------------------------------------------------------------------
@@ -154,6 +166,50 @@ def _count_gaps(t: np.ndarray, measured: Mapping[str, np.ndarray], counts: Count
         counts[f"gaps of more than {GAP:g} s without any reading"] += silent
 
 
+# --- rows and cells that say nothing ---------------------------------------------------------
+
+
+def _without_blank_rows(
+    data: Mapping[str, np.ndarray], counts: Counter[str]
+) -> Mapping[str, np.ndarray]:
+    """Without rows that hold nothing but a time: a gap of the log, filled in by whoever wrote it."""
+    given = [~np.isnan(values) for channel, values in data.items() if channel != "t"]
+    if not given:
+        return data
+    blank = ~np.logical_or.reduce(given)
+    if not blank.any() or blank.all():
+        return data
+    counts["rows with nothing but a time, left out"] += int(np.count_nonzero(blank))
+    return {channel: values[~blank] for channel, values in data.items()}
+
+
+def _without_broken_packets(
+    data: Mapping[str, np.ndarray], counts: Counter[str]
+) -> Mapping[str, np.ndarray]:
+    """With holes in place of everything that came in a broken packet."""
+    broken = broken_packets(data)
+    if not broken.any():
+        return data
+    counts["rows of broken packets, nothing in them believed"] += int(np.count_nonzero(broken))
+    return {
+        c: values if c == "t" else np.where(broken, np.nan, values) for c, values in data.items()
+    }
+
+
+def _without_repeats(
+    data: Mapping[str, np.ndarray], holds: Mapping[str, bool], counts: Counter[str]
+) -> Mapping[str, np.ndarray]:
+    """With holes where a sensor's last reading was written again."""
+    found = dict(data)
+    for channel in CHANNELS:
+        if channel in data:
+            again = repeats(data[channel], holds.get(channel))
+            if again.any():
+                counts[f"held samples of {channel}, no new readings"] += int(again.sum())
+                found[channel] = np.where(again, np.nan, data[channel])
+    return found
+
+
 # --- readings and commands -------------------------------------------------------------------
 
 
@@ -170,6 +226,7 @@ def _without_outliers(
             counts[f"empty columns {channel} dropped"] += 1
             continue
         outlier = find_outliers(channel, values, noise.get(channel))
+        outlier |= find_leaps(channel, data["t"], values)
         if outlier.any():
             values = np.where(outlier, np.nan, values)
             counts[f"outliers in {channel} removed"] += int(np.count_nonzero(outlier))
@@ -210,6 +267,14 @@ def _commands(
             tilt = np.zeros(len(data["t"]))
         columns.append(hold_last(tilt))
     return np.column_stack(columns), driving
+
+
+def _battery(data: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Battery voltage (n,) [V], the last sample held; None where none was logged."""
+    voltage = data.get(BATTERY)
+    if voltage is None or np.isnan(voltage).all():
+        return None
+    return hold_last(voltage)
 
 
 def hold_last(values: np.ndarray) -> np.ndarray:

@@ -14,10 +14,14 @@ STANDARD_GRAVITY = 9.80665
 ROTOR_COMMANDS = ("rpm_upper_cmd", "rpm_lower_cmd")
 SWASH_COMMANDS = ("delta_lon", "delta_lat")
 
+BATTERY = "battery_v"
+"""Battery voltage: no reading of the model's, but what drives the rotors."""
+
 LOG_UNITS: dict[str, str] = {
     "t": "s",
     **dict.fromkeys(ROTOR_COMMANDS, "rev/min"),
     **dict.fromkeys(SWASH_COMMANDS, "rad"),
+    BATTERY: "V",
     **CHANNEL_UNITS,
 }
 """Canonical unit of every column a flight can have."""
@@ -45,6 +49,7 @@ _FACTORS: dict[str, dict[str, float]] = {
         "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY,
     },
     "m": _LENGTH,
+    "V": {"v": 1.0, "mv": 1e-3, "volt": 1.0, "volts": 1.0},
     "m/s": {
         **{f"{unit}/s": factor for unit, factor in _LENGTH.items()},
         "km/h": 1.0 / 3.6, "kph": 1.0 / 3.6, "kmh": 1.0 / 3.6, "mph": 0.44704, "ft/min": 0.00508,

@@ -32,6 +32,7 @@ from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model import workspace as F
+from coax_env.model.generic_terms import hover_speeds
 from coax_env.model.layout import (
     CHANNELS,
     LOWER_FLAP,
@@ -47,6 +48,7 @@ from coax_env.model.vehicle_file import load_vehicle
 READING_DELAY = 1e-4  # [s] after the command of the same row
 LONGEST_STEP = 0.02  # [s] a longer row is split
 NEWTON_STEPS = 12
+_INFLOW_TIME = effects.parameter_index("dynamic_inflow.time")
 BALANCED = 1e-11  # [m/s2, rad/s2] left over at a hover
 SHORTEST_LAG = 1e-9  # [s] below it exp(-READING_DELAY/lag) is zero: the command itself
 
@@ -100,11 +102,20 @@ def _properties(x, u, p, f):
     f[F.MOTOR_LAG_U] = 0.0
     f[F.MOTOR_LAG_L] = 0.0
     f[F.SERVO_LAG] = 0.0
-    f[F.SPEED_SCALE] = 1.0
     f[F.OMEGA_U_DOT] = 0.0
     f[F.OMEGA_L_DOT] = 0.0
-    if WITH_EFFECTS and p[effects.PROPERTY] != 0.0:
-        _property_effects(x, f, p)
+    if WITH_EFFECTS:
+        f[F.LON_STEP] = u[U.DELTA_LON] - x[S.SWASH_LON]
+        f[F.LAT_STEP] = u[U.DELTA_LAT] - x[S.SWASH_LAT]
+        f[F.BATTERY] = u[U.BATTERY]
+        f[F.SPEED_SHARE_U] = f[F.SPEED_SHARE_L] = f[F.SPEED_SCALE] = 1.0
+        f[F.SPEED_REST_U] = f[F.SPEED_REST_L] = 0.0
+        f[F.SERVO_PLAY] = f[F.SERVO_DEADBAND] = f[F.SERVO_RATE] = 0.0
+        f[F.INFLOW_TIME] = p[_INFLOW_TIME]
+        if p[_INFLOW_TIME] > 0.0:
+            f[F.HOVER_U], f[F.HOVER_L] = hover_speeds(p)
+        if p[effects.PROPERTY] != 0.0:
+            _property_effects(x, f, p)
 
 
 @compiled()
@@ -115,18 +126,82 @@ def _follow(start, command, time, lag):
     return command + (start - command) * math.exp(-time / lag)
 
 
+@compiled()
+def _speeds_asked_for(u, f):
+    """Rotor speeds [rad/s] at which the rotors would settle under the commands."""
+    upper = f[F.SPEED_SHARE_U] * u[U.OMEGA_U] + f[F.SPEED_REST_U]
+    lower = f[F.SPEED_SHARE_L] * u[U.OMEGA_L] + f[F.SPEED_REST_L]
+    return f[F.SPEED_SCALE] * upper, f[F.SPEED_SCALE] * lower
+
+
+@compiled()
+def _servo(start, command, time, f):
+    """Exact response of the plate's tilt to a held command; only effects make it another.
+
+    With play the plate stands still until the command is half of it away, and follows at that
+    distance. A servo with a limited rate runs at it until its lag is the slower. One with a deadband
+    stands still within it; if it takes time on its way, it stops where the deadband begins.
+    """
+    half, dead, rate = 0.5 * f[F.SERVO_PLAY], f[F.SERVO_DEADBAND], f[F.SERVO_RATE]
+    lag = f[F.SERVO_LAG]
+    if abs(start - command) <= dead:
+        return start
+    end = command if half == 0.0 else min(max(start, command - half), command + half)
+    if rate > 0.0:
+        way = start - end
+        knee = min(abs(way), rate * lag)  # what is left when the lag is the slower
+        running = (abs(way) - knee) / rate
+        if time <= running:
+            reached = start - math.copysign(rate * time, way)
+        else:
+            reached = _follow(end + math.copysign(knee, way), end, time - running, lag)
+    else:
+        reached = _follow(start, end, time, lag)
+    if dead > 0.0 and (rate > 0.0 or lag > SHORTEST_LAG) and abs(reached - command) < dead:
+        return command + math.copysign(dead, start - command)
+    return reached
+
+
+@compiled()
+def _lag_of_lag(time, lag, inflow_time):
+    """What is left, through a lag of `inflow_time`, of one that decays with another `lag`."""
+    if lag <= SHORTEST_LAG:
+        return 0.0
+    if abs(lag - inflow_time) < 1e-6 * inflow_time:
+        return time / inflow_time * math.exp(-time / inflow_time)
+    left = math.exp(-time / lag) - math.exp(-time / inflow_time)
+    return lag / (lag - inflow_time) * left
+
+
+@compiled()
+def _inflow(x, u, time, f):
+    """Exact inflow `time` after the row's command: it follows the rotors, which follow theirs."""
+    lag = f[F.INFLOW_TIME]
+    upper, lower = _speeds_asked_for(u, f)
+    settled = 0.5 * (upper / f[F.HOVER_U] + lower / f[F.HOVER_L]) - 1.0
+    rest_u = 0.5 * (x[S.OMEGA_U] - upper) / f[F.HOVER_U]
+    rest_l = 0.5 * (x[S.OMEGA_L] - lower) / f[F.HOVER_L]
+    return (
+        _follow(x[S.INFLOW], settled, time, lag)
+        + rest_u * _lag_of_lag(time, f[F.MOTOR_LAG_U], lag)
+        + rest_l * _lag_of_lag(time, f[F.MOTOR_LAG_L], lag)
+    )
+
+
 @bare_and_with_effects()
 def _actuate(x, u, time, f, out):
     """Rotor speeds and swash tilt at `time` after the row's command, into the state `out`.
 
-    Only effects give an actuator a lag.
+    Only effects part an actuator from its command.
     """
     if WITH_EFFECTS:
-        scale = f[F.SPEED_SCALE]
-        out[S.OMEGA_U] = _follow(x[S.OMEGA_U], u[U.OMEGA_U] * scale, time, f[F.MOTOR_LAG_U])
-        out[S.OMEGA_L] = _follow(x[S.OMEGA_L], u[U.OMEGA_L] * scale, time, f[F.MOTOR_LAG_L])
-        out[S.SWASH_LON] = _follow(x[S.SWASH_LON], u[U.DELTA_LON], time, f[F.SERVO_LAG])
-        out[S.SWASH_LAT] = _follow(x[S.SWASH_LAT], u[U.DELTA_LAT], time, f[F.SERVO_LAG])
+        if f[F.INFLOW_TIME] > 0.0:
+            out[S.INFLOW] = _inflow(x, u, time, f)
+        upper, lower = _speeds_asked_for(u, f)
+        out[S.OMEGA_U] = _follow(x[S.OMEGA_U], upper, time, f[F.MOTOR_LAG_U])
+        out[S.OMEGA_L] = _follow(x[S.OMEGA_L], lower, time, f[F.MOTOR_LAG_L])
+        out[S.SWASH_LON] = _servo(x[S.SWASH_LON], u[U.DELTA_LON], time, f)
+        out[S.SWASH_LAT] = _servo(x[S.SWASH_LAT], u[U.DELTA_LAT], time, f)
     else:
         out[S.OMEGA_U], out[S.OMEGA_L] = u[U.OMEGA_U], u[U.OMEGA_L]
         out[S.SWASH_LON], out[S.SWASH_LAT] = u[U.DELTA_LON], u[U.DELTA_LAT]
@@ -135,20 +210,20 @@ def _actuate(x, u, time, f, out):
 @compiled()
 def _mean_rotor_accelerations(x, u, h, f):
     """The rotors' mean accelerations over `h` seconds: angular momentum is kept exactly."""
-    omega_u, omega_l, scale = x[S.OMEGA_U], x[S.OMEGA_L], f[F.SPEED_SCALE]
-    f[F.OMEGA_U_DOT] = (_follow(omega_u, u[U.OMEGA_U] * scale, h, f[F.MOTOR_LAG_U]) - omega_u) / h
-    f[F.OMEGA_L_DOT] = (_follow(omega_l, u[U.OMEGA_L] * scale, h, f[F.MOTOR_LAG_L]) - omega_l) / h
+    omega_u, omega_l = x[S.OMEGA_U], x[S.OMEGA_L]
+    upper, lower = _speeds_asked_for(u, f)
+    f[F.OMEGA_U_DOT] = (_follow(omega_u, upper, h, f[F.MOTOR_LAG_U]) - omega_u) / h
+    f[F.OMEGA_L_DOT] = (_follow(omega_l, lower, h, f[F.MOTOR_LAG_L]) - omega_l) / h
 
 
 @compiled()
 def _rotor_accelerations(x, u, f):
     """The rotors' accelerations now: a lagging rotor still speeds up, one without lag has arrived."""
+    upper, lower = _speeds_asked_for(u, f)
     if f[F.MOTOR_LAG_U] > 10.0 * READING_DELAY:
-        target = u[U.OMEGA_U] * f[F.SPEED_SCALE]
-        f[F.OMEGA_U_DOT] = (target - x[S.OMEGA_U]) / f[F.MOTOR_LAG_U]
+        f[F.OMEGA_U_DOT] = (upper - x[S.OMEGA_U]) / f[F.MOTOR_LAG_U]
     if f[F.MOTOR_LAG_L] > 10.0 * READING_DELAY:
-        target = u[U.OMEGA_L] * f[F.SPEED_SCALE]
-        f[F.OMEGA_L_DOT] = (target - x[S.OMEGA_L]) / f[F.MOTOR_LAG_L]
+        f[F.OMEGA_L_DOT] = (lower - x[S.OMEGA_L]) / f[F.MOTOR_LAG_L]
 
 
 @compiled(forceinline=True)
@@ -212,6 +287,8 @@ def _rates_in_flight(x, p, f, dx):
     radius = p[P.ROTOR_RADIUS]
     download = f[F.THRUST_U] * area / (4.0 * math.pi * radius * radius)
 
+    if WITH_EFFECTS:
+        f[F.ROTOR_X], f[F.ROTOR_Y], f[F.ROTOR_Z] = x_u + x_l, y_u + y_l, z_u + z_l
     gust = f[F.MASS] / p[P.GUST_MASS]
     f[F.FORCE_X] = x_u + x_l + gust * x[S.GUST_X]
     f[F.FORCE_Y] = y_u + y_l + gust * x[S.GUST_Y]
@@ -360,7 +437,7 @@ def step(x, u, dt, p, work, out):
     """Fly one row of held input, with the effects that are on.
 
     Args:
-        x: full state (29,), see state.py. u: commands and time since the run's start (5,).
+        x: full state (29,), see state.py. u: commands, time and battery (6,), see inputs.py.
         dt: length of the row [s]; rows longer than LONGEST_STEP are split.
         p: parameter vector, see parameters.py. work: scratch (WORK_SIZE,).
         out: full state (29,) at the row's end; may be `x` itself.
@@ -408,6 +485,7 @@ def drift_and_readings(x, u, dt, p, work, out):
     _properties(x, u, p, f)
     _copy(x, now)
     _actuate(x, u, dt, f, now)
+    inflow = now[S.INFLOW] - x[S.INFLOW]
     for i in range(N_STATES, S.GUST_X):
         out[i] = now[i] - x[i]
     if dt > 0.0:
@@ -422,6 +500,7 @@ def drift_and_readings(x, u, dt, p, work, out):
     _fade_gusts(_fade(dt, p), out)
     for i in range(S.GUST_X, N_FULL):
         out[i] -= x[i]
+    out[S.INFLOW] = inflow
     _read(x, now, slope, p, f, out[N_FULL:])
 
 
@@ -457,11 +536,14 @@ def measure(x, u, p, work, out):
 
 @with_effects
 def _full_derivative(x, u, p, work, dx):
-    """Rates of the full state at held input, lags as first-order states."""
+    """Rates of the full state at held input, lags as first-order states.
+
+    Play, deadband and rate limit of the servos, which have no rate at a held command, are left out.
+    """
     f, now = work[:_STATE], work[_STATE:_SLOPE]
     _properties(x, u, p, f)
-    scale = f[F.SPEED_SCALE]
-    targets = (u[U.OMEGA_U] * scale, u[U.OMEGA_L] * scale, u[U.DELTA_LON], u[U.DELTA_LAT])
+    upper, lower = _speeds_asked_for(u, f)
+    targets = (upper, lower, u[U.DELTA_LON], u[U.DELTA_LAT])
     lags = (f[F.MOTOR_LAG_U], f[F.MOTOR_LAG_L], f[F.SERVO_LAG], f[F.SERVO_LAG])
     _copy(x, now)
     for i in range(N_COMMANDS):
@@ -474,13 +556,16 @@ def _full_derivative(x, u, p, work, dx):
     f[F.OMEGA_U_DOT] = dx[S.OMEGA_U]
     f[F.OMEGA_L_DOT] = dx[S.OMEGA_L]
     dx[S.TRIM_Z :] = 0.0
+    if f[F.INFLOW_TIME] > 0.0:
+        speed = 0.5 * (now[S.OMEGA_U] / f[F.HOVER_U] + now[S.OMEGA_L] / f[F.HOVER_L])
+        dx[S.INFLOW] = (speed - 1.0 - x[S.INFLOW]) / f[F.INFLOW_TIME]
     for i, memory in enumerate(_GUST_MEMORY):
         dx[S.GUST_X + i] = -x[S.GUST_X + i] / p[memory]
     _rates(now, p, f, dx)
 
 
 def full_state(state: np.ndarray, command: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """The full state (29,): the paper's sixteen, actuators settled on the command, no gust.
+    """The full state (29,): the paper's sixteen, actuators and inflow settled on the command, no gust.
 
     Args:
         state: the paper's states (16,). command: commands (4,). vehicle: whose state it is.
@@ -488,22 +573,25 @@ def full_state(state: np.ndarray, command: np.ndarray, vehicle: Vehicle) -> np.n
     x = np.zeros(N_FULL)
     x[:N_STATES] = state
     x[S.OMEGA_U : S.GUST_X] = command
+    if "dynamic_inflow" in vehicle.effects:
+        x[S.INFLOW] = np.mean(np.asarray(command)[:2] / hover_speeds(vehicle.vector)) - 1.0
     return x
 
 
 def kernel_input(command: np.ndarray, time: float = 0.0) -> np.ndarray:
-    """Commands (4,) and time [s] as the kernel's input (5,)."""
-    u = np.empty(N_INPUTS)
+    """Commands (4,) and time [s] as the kernel's input (6,), the battery at its nominal voltage."""
+    u = np.zeros(N_INPUTS)
     u[:N_COMMANDS] = command
     u[U.TIME] = time
     return u
 
 
 def full_derivative(x: np.ndarray, u: np.ndarray, vehicle: Vehicle) -> np.ndarray:
-    """Rates of the full state (29,); actuators as first-order states.
+    """Rates of the full state (29,); actuators as first-order states, the servos' play, deadband and
+    rate limit left out.
 
     Args:
-        x: full state (29,). u: commands and time (5,). vehicle: its numbers and effects.
+        x: full state (29,). u: commands, time and battery (6,). vehicle: its numbers and effects.
     """
     dx = np.zeros(N_FULL)
     _full_derivative(

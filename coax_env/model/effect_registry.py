@@ -35,7 +35,11 @@ class EffectParameter:
     ``usual`` is the usual size and the std of the prior about ``off``; ``smallest`` the size under
     which it does not matter in prediction and is never named; a ``shape`` parameter (a decay, say)
     acts only once the effect itself does; ``timing``: a lag or delay of the command; ``probe``: finite
-    step for the signature where the effect has no slope at its off-value.
+    step for the signature where the effect has no slope at its off-value; ``held``: is stated, never
+    fitted, and does not act alone.
+
+    Sizes, bounds and probe are lama400d's. ``scale`` says with what of the vehicle they grow on
+    another machine, ``"weight * arm / rotor_speed"`` say (usual_sizes.py); empty: they do not.
     """
 
     name: str
@@ -48,6 +52,13 @@ class EffectParameter:
     shape: bool = False
     timing: bool = False
     probe: float = 0.0
+    held: bool = False
+    scale: str = ""
+
+    def at(self, share: float) -> float:
+        """The value so many usual sizes from the off-value, on the side that the bounds leave."""
+        step = share * self.usual
+        return self.off + step if self.off + step <= self.upper else self.off - step
 
 
 @dataclass(frozen=True)
@@ -57,7 +68,8 @@ class Effect:
     ``replaces`` names base parameters that are the same column. ``input_shift``: acts on the input,
     not in the kernel. ``line``: found by its line in the spectrum (vibration.py), not by a signature.
     ``generic``: unlisted terms, of which a vehicle file holds those that are not zero. ``damps``: its
-    one parameter damps the motion, and so changes what a filter makes of gusts.
+    one parameter damps the motion, and so changes what a filter makes of gusts. ``named_as``: the
+    effect by whose name it is found, where it acts in jumps that no filter can follow.
     """
 
     name: str
@@ -72,11 +84,17 @@ class Effect:
     line: bool = False
     generic: bool = False
     damps: bool = False
+    named_as: str = ""
     index: int = -1
 
     def names(self) -> tuple[str, ...]:
         """Full names of the parameters, ``effect.parameter``."""
         return tuple(f"{self.name}.{p.name}" for p in self.parameters)
+
+    @property
+    def fitted(self) -> tuple[EffectParameter, ...]:
+        """The parameters that a fit may move: all that are not held."""
+        return tuple(p for p in self.parameters if not p.held)
 
 
 CATALOGUE: dict[str, Effect] = {}
@@ -96,6 +114,7 @@ def effect(
     line: bool = False,
     generic: bool = False,
     damps: bool = False,
+    named_as: str = "",
     name: str = "",
 ) -> Callable[[Callable], Callable]:
     """Enter a function into the catalogue; its docstring is the effect's summary.
@@ -103,7 +122,7 @@ def effect(
     Args:
         stage: where in the kernel it runs. parameters: in the order of the parameter vector.
         channels: names, with spaces, of those that show it most. source: book or paper, and equation.
-        replaces, input_shift, line, generic, damps: see Effect.
+        replaces, input_shift, line, generic, damps, named_as: see Effect.
         name: in the catalogue; that of the function where empty.
 
     Raises:
@@ -116,7 +135,7 @@ def effect(
             raise InputError(f"effect {own!r}: @effect(stage, EffectParameter(...), ...) is wanted")
         if own in GROUPS:
             raise InputError(f"the catalogue of effects has {own!r} already")
-        if damps and sum(not p.shape for p in parameters) != 1:
+        if damps and sum(not (p.shape or p.held) for p in parameters) != 1:
             raise InputError(f"effect {own!r}: damps=True is for an effect of one parameter")
         for channel in channels.split():
             if channel not in CHANNELS:
@@ -136,6 +155,7 @@ def effect(
             line=line,
             generic=generic,
             damps=damps,
+            named_as=named_as,
             index=n_parameters(),
         )
         GROUPS[own] = entry
@@ -145,6 +165,11 @@ def effect(
         return function_compiled
 
     return enter
+
+
+def found_by_the_name_of(name: str) -> list[str]:
+    """Effects that are found by another one's name."""
+    return [own for own, entry in CATALOGUE.items() if entry.named_as == name]
 
 
 def forget(names: Collection[str]) -> None:
@@ -165,7 +190,7 @@ def _offs() -> tuple[np.ndarray, np.ndarray]:
     """Off-values of all effects' parameters, (k,), and which switch each one throws, (k, stages)."""
     every = [(p, e.stage) for e in GROUPS.values() for p in e.parameters]
     throws = [
-        [not p.shape and stage == switch for switch in range(P.N_FIXED, _FIRST)]
+        [not (p.shape or p.held) and stage == switch for switch in range(P.N_FIXED, _FIRST)]
         for p, stage in every
     ]
     return np.array([p.off for p, _ in every]), np.array(throws, dtype=float)

@@ -6,8 +6,9 @@ any other to the kernel and to the vehicle files; they have no name of their own
 the catalogue's search never proposes them. unlisted.py does, for what the catalogue leaves.
 
 Speeds are those of the body, not of the air; rotor speeds count from the bare model's hover, whose
-torques balance and whose thrust carries the weight (15)-(20). Swash rates are left out: without a
-servo lag the plate jumps and has none.
+torques balance and whose thrust carries the weight (15)-(20), the height from six rotor radii, where
+the ground is no longer felt. A swash plate without a servo lag jumps and has no rate; what has one is
+the direction in which this row moves it on, which is what play in its linkage answers to.
 """
 
 import math
@@ -40,10 +41,19 @@ USUAL = {"N": 0.4, "N m": 0.02}
 machine, and that times a quarter of the lower hub's arm, ours."""
 SMALLEST = {"N": 0.04, "N m": 1.5e-3}
 """RMS on a flight under which a force or moment does not matter in prediction."""
+SCALES = dict.fromkeys(("unlisted_X", "unlisted_Y", "unlisted_Z"), "weight")
+SCALES |= dict.fromkeys(("unlisted_L", "unlisted_M"), "weight * arm")
+SCALES["unlisted_N"] = "inertia_zz / time / time"
+"""Group -> what both grow with on another machine (usual_sizes.py)."""
+REFERENCE_HEIGHT = 6.0  # rotor radii from which the height counts
+DIRECTION_STEP = 1e-3  # [rad] of a row that is surely a motion: well under a pilot's tremor; ours
 
-_SPEEDS = (("u", "m/s", 1.0), ("v", "m/s", 1.0), ("w", "m/s", 0.5),
-           ("p", "rad/s", 0.5), ("q", "rad/s", 0.5), ("r", "rad/s", 0.5))  # fmt: skip
+_SPEEDS = (("u", "m/s", 1.0, " / speed"), ("v", "m/s", 1.0, " / speed"),
+           ("w", "m/s", 0.5, " / speed"),
+           ("p", "rad/s", 0.5, " * time"), ("q", "rad/s", 0.5, " * time"),
+           ("r", "rad/s", 0.5, " * time"))  # fmt: skip
 _PAIRS = tuple(combinations(range(6), 2))
+_SPIN = " / rotor_speed"
 
 
 @dataclass(frozen=True)
@@ -51,7 +61,9 @@ class Term:
     """One term. ``key`` names it in a vehicle file, ``form`` in a formula; ``usual`` is its usual size.
 
     ``follows``: the states or commands it depends on. ``kin``: terms that share it are one physical
-    term in two columns (sine and cosine of one angle) and may be taken together.
+    term in two columns (sine and cosine of one angle) and may be taken together. ``per``: with what
+    its coefficient's usual size falls and grows beside the axis' (usual_sizes.py). ``needs``: channels
+    without which the term is not known.
     """
 
     key: str
@@ -60,6 +72,8 @@ class Term:
     usual: float
     follows: tuple[str, ...]
     kin: str = ""
+    per: str = ""
+    needs: tuple[str, ...] = ()
 
 
 def _heading(k: int) -> tuple[Term, Term]:
@@ -71,8 +85,11 @@ def _heading(k: int) -> tuple[Term, Term]:
 
 
 TERMS: tuple[Term, ...] = (
-    *(Term(n, n, unit, size, (n,)) for n, unit, size in _SPEEDS),
-    *(Term(f"abs_{n}_{n}", f"|{n}| {n}", f"({unit})2", size**2, (n,)) for n, unit, size in _SPEEDS),
+    *(Term(n, n, unit, size, (n,), per=per) for n, unit, size, per in _SPEEDS),
+    *(
+        Term(f"abs_{n}_{n}", f"|{n}| {n}", f"({unit})2", size**2, (n,), per=per + per)
+        for n, unit, size, per in _SPEEDS
+    ),
     *(
         Term(
             f"{_SPEEDS[i][0]}_{_SPEEDS[j][0]}",
@@ -80,6 +97,7 @@ TERMS: tuple[Term, ...] = (
             f"({_SPEEDS[i][1]})({_SPEEDS[j][1]})",
             _SPEEDS[i][2] * _SPEEDS[j][2],
             (_SPEEDS[i][0], _SPEEDS[j][0]),
+            per=_SPEEDS[i][3] + _SPEEDS[j][3],
         )
         for i, j in _PAIRS
     ),
@@ -88,13 +106,22 @@ TERMS: tuple[Term, ...] = (
     Term("cos_phi", "(1 - cos(phi))", "1", 0.01, ("phi",)),
     Term("cos_theta", "(1 - cos(theta))", "1", 0.01, ("theta",)),
     *(term for k in range(1, HARMONICS + 1) for term in _heading(k)),
-    Term("omega_u", "(omega_u - hover)", "rad/s", 10.0, ("omega_u",)),
-    Term("omega_l", "(omega_l - hover)", "rad/s", 10.0, ("omega_l",)),
+    Term("omega_u", "(omega_u - hover)", "rad/s", 10.0, ("omega_u",), per=_SPIN),
+    Term("omega_l", "(omega_l - hover)", "rad/s", 10.0, ("omega_l",), per=_SPIN),
     Term("delta_lon", "delta_lon", "rad", 0.05, ("delta_lon",)),
     Term("delta_lat", "delta_lat", "rad", 0.05, ("delta_lat",)),
-    Term("omega_u_rate", "omega_u'", "rad/s2", 50.0, ("omega_u",)),
-    Term("omega_l_rate", "omega_l'", "rad/s2", 50.0, ("omega_l",)),
-)
+    Term("omega_u_rate", "omega_u'", "rad/s2", 50.0, ("omega_u",), per=_SPIN + " * time"),
+    Term("omega_l_rate", "omega_l'", "rad/s2", 50.0, ("omega_l",), per=_SPIN + " * time"),
+    Term("north", "x", "m", 1.0, ("x",), per=" / length", needs=("pn",)),
+    Term("east", "y", "m", 1.0, ("y",), per=" / length", needs=("pe",)),
+    Term("height", "(h - 6 R)", "m", 0.5, ("h",), per=" / length", needs=("h",)),
+    Term("omega_u_2", "(omega_u - hover)2", "(rad/s)2", 100.0, ("omega_u",), per=_SPIN + _SPIN),
+    Term("omega_l_2", "(omega_l - hover)2", "(rad/s)2", 100.0, ("omega_l",), per=_SPIN + _SPIN),
+    Term("omega_u_l", "(omega_u - hover) (omega_l - hover)", "(rad/s)2", 100.0,
+         ("omega_u", "omega_l"), per=_SPIN + _SPIN),
+    Term("lon_direction", "sgn(delta_lon')", "1", 1.0, ("delta_lon",)),
+    Term("lat_direction", "sgn(delta_lat')", "1", 1.0, ("delta_lat",)),
+)  # fmt: skip
 """Every term, in the order of the coefficients in the parameter vector."""
 
 _N_TERMS = len(TERMS)
@@ -102,6 +129,9 @@ _SQUARES, _PRODUCTS = 6, 12
 _TILT = _PRODUCTS + len(_PAIRS)
 _HEADING = _TILT + 4
 _COMMAND = _HEADING + 2 * HARMONICS
+_PLACE = _COMMAND + 6
+_ROTORS = _PLACE + 3
+_DIRECTION = _ROTORS + 3
 
 
 @compiled()
@@ -136,13 +166,23 @@ def term_value(i: int, x: np.ndarray, f: np.ndarray, p: np.ndarray) -> float:
         which = i - _HEADING
         angle = (which // 2 + 1) * x[S.PSI]
         return math.sin(angle) if which % 2 == 0 else math.cos(angle)
-    which = i - _COMMAND
-    if which < 2:
+    if i < _PLACE:
+        which = i - _COMMAND
+        if which < 2:
+            upper, lower = hover_speeds(p)
+            return f[F.OMEGA_U] - upper if which == 0 else f[F.OMEGA_L] - lower
+        if which < 4:
+            return x[S.SWASH_LON + which - 2]
+        return f[F.OMEGA_U_DOT] if which == 4 else f[F.OMEGA_L_DOT]
+    if i < _ROTORS:
+        which = i - _PLACE
+        return x[S.X + which] if which < 2 else -x[S.Z] - REFERENCE_HEIGHT * p[P.ROTOR_RADIUS]
+    if i < _DIRECTION:
         upper, lower = hover_speeds(p)
-        return f[F.OMEGA_U] - upper if which == 0 else f[F.OMEGA_L] - lower
-    if which < 4:
-        return x[S.SWASH_LON + which - 2]
-    return f[F.OMEGA_U_DOT] if which == 4 else f[F.OMEGA_L_DOT]
+        first = f[F.OMEGA_L] - lower if i == _ROTORS + 1 else f[F.OMEGA_U] - upper
+        second = f[F.OMEGA_U] - upper if i == _ROTORS else f[F.OMEGA_L] - lower
+        return first * second
+    return math.tanh(f[F.LON_STEP + i - _DIRECTION] / DIRECTION_STEP)
 
 
 def _axis(target: int, summary: str) -> Callable:

@@ -30,7 +30,8 @@ TRIM_STATES = (("trim_Z", "N"), ("trim_N", "N m"))
 """Force and yaw moment that drift: a random walk of thrust and torque; zero outside the estimator."""
 
 INFLOW_STATES = (("inflow", "1"),)
-"""Induced velocity over that at hover, as the rotors' mean speed has it once the inflow has settled."""
+"""Induced velocity over that at hover, less one; settled where it is the rotors' mean speed over
+theirs, less one. It moves with the effect dynamic_inflow alone."""
 
 FULL_STATES = STATES + ACTUATOR_STATES + GUST_STATES + TRIM_STATES + INFLOW_STATES
 N_STATES = len(STATES)
@@ -56,8 +57,10 @@ COMMANDS = (
     ("omega_u", "rad/s"), ("omega_l", "rad/s"), ("delta_lon", "rad"), ("delta_lat", "rad"),
 )  # fmt: skip
 N_COMMANDS = len(COMMANDS)
-TIME = 4  # the kernel's input is the four commands and the time since the run's start [s]
-N_INPUTS = N_COMMANDS + 1
+# the kernel's input is the four commands, and beside them
+TIME = 4  # since the run's start [s]
+BATTERY = 5  # voltage over the nominal one [V]; 0 where none is known
+N_INPUTS = N_COMMANDS + 2
 
 # --- measurement channels -----------------------------------------------------------------------
 CHANNEL_UNITS = {

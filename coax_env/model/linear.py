@@ -28,6 +28,9 @@ from coax_env.model.vehicle_file import load_vehicle
 if TYPE_CHECKING:
     import control
 
+WITHOUT_SLOPE = ("servo_play", "servo_deadband", "servo_rate", "dynamic_inflow")
+"""Effects that designs leave out: a small command does not meet a servo's limits, or is not answered
+at all; the inflow, a state that designs do not have, has settled."""
 FASTEST_LAG = 1e-3  # [s] what an actuator without lag is given where its lag is a state
 N_FLOWN = N_STATES + len(ACTUATOR_STATES)  # all but the gusts
 N_SAMPLED = GUSTS.stop
@@ -46,12 +49,13 @@ def linearize(vehicle: Vehicle | str, full: bool = False) -> "control.StateSpace
 
     Args:
         full: add the actual rotor speeds and swash tilt as four more states. An actuator without
-            lag gets FASTEST_LAG there; with ``full=False`` every lag is at its static limit. A pure
-            ``servo_delay`` is in neither.
+            lag gets FASTEST_LAG there; with ``full=False`` every lag is at its static limit. Pure
+            delays (``command_delay``, ``servo_delay``) are in neither, nor what has no slope
+            (WITHOUT_SLOPE); droop is, and a battery is at its nominal voltage.
     """
     import control
 
-    vehicle = with_lags(load_vehicle(vehicle), None if full else 0.0)
+    vehicle = with_lags(load_vehicle(vehicle).without_effects(WITHOUT_SLOPE), None if full else 0.0)
     state, command = hover_trim(vehicle)
     x, u = full_state(state, command, vehicle), kernel_input(command)
     n = N_FLOWN if full else N_STATES
@@ -75,8 +79,8 @@ def sampled(
 
     The state is the full one up to the gusts (26,): drifts of trim are the estimator's, and the inflow
     stays at hover's. Lags and held commands are those of `dynamics.step`, with nothing discretised a
-    second time. A reading is taken at a row's end, with
-    the command that is in force there::
+    second time; pure delays and WITHOUT_SLOPE are left out. A reading is taken at a row's end, with the
+    command that is in force there::
 
         x[k+1] = A x[k] + B u[k]        y[k] = C x[k] + D u[k-1]       (deviations from trim)
 
@@ -86,6 +90,7 @@ def sampled(
     Returns:
         A (26, 26), B (26, 4), C (18, 26), D (18, 4), and the trim: state (26,), command (4,).
     """
+    vehicle = vehicle.without_effects(WITHOUT_SLOPE)
     state, command = hover_trim(vehicle)
     x, u = full_state(state, command, vehicle), kernel_input(command)
     work = np.zeros(WORK_SIZE)

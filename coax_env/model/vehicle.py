@@ -157,12 +157,14 @@ class Vehicle:
             table[name] = Parameter(float(value), 0.0, ACTUATOR_NUMBERS[name], "set by hand")
         return replace(self, actuators=table)
 
-    def without_effects(self) -> "Vehicle":
-        """The bare model."""
-        keep = [name for name in self.correlated if "." not in name]
+    def without_effects(self, names: Iterable[str] | None = None) -> "Vehicle":
+        """A copy without some effects; None: without any, the bare model."""
+        gone = set(self.effects if names is None else names)
+        keep = [name for name in self.correlated if name.rpartition(".")[0] not in gone]
         index = [self.correlated.index(name) for name in keep]
         corner = None if self.correlation is None else self.correlation[np.ix_(index, index)]
-        return replace(self, effects={}, correlated=tuple(keep), correlation=corner)
+        left = {name: own for name, own in self.effects.items() if name not in gone}
+        return replace(self, effects=left, correlated=tuple(keep), correlation=corner)
 
     def in_air(self, air: Mapping[str, float]) -> "Vehicle":
         """A copy with a flight card's ``density`` and ``gravity`` instead of the file's."""

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from coax_env.model import effects
+from coax_env.model.usual_sizes import sized_for
 from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import (
     and_list,
@@ -13,10 +14,12 @@ from coax_env.plain_words import (
     plain,
     title,
     unit_name,
+    whole_percent,
 )
-from coax_env.report.consequences import NORMAL_95, described, outside_usual, sigmas
+from coax_env.report.consequences import NORMAL_95, described, sigmas
 from coax_env.report.page import (
     Markup,
+    Section,
     bullets,
     callout,
     card,
@@ -30,8 +33,8 @@ from coax_env.report.page import (
 Findings = Mapping[str, Any]
 
 
-def cause_blocks(findings: Findings, bare: Vehicle, corrected: Vehicle) -> list[str]:
-    """Every cause in words, strongest first, and all its numbers.
+def cause_sections(findings: Findings, bare: Vehicle, corrected: Vehicle) -> list[Section]:
+    """Every cause in words, sure and doubtful ones apart, strongest first, and all its numbers.
 
     Args:
         findings: as in findings.json.
@@ -39,34 +42,67 @@ def cause_blocks(findings: Findings, bare: Vehicle, corrected: Vehicle) -> list[
         corrected: the vehicle with the causes in it.
     """
     causes = findings["causes"]
-    alarms = prose(_false_alarms(findings.get("false_alarm_rate")))
+    alarms = prose(_false_alarms(findings["false_alarm_rate"], findings["class"]))
     if not causes:
         nothing = prose("No effect of the catalogue is named: these flights show none.")
-        return [nothing, alarms]
-    rows = [row for k, cause in enumerate(causes) for row in _rows(k, cause)]
+        return [Section("The causes", [nothing, alarms])]
+    rows = [row for k, cause in enumerate(causes) for row in _rows(k, cause, bare)]
     header = ["parameter", "value", "std", "95 % interval", "unit", "usual size"]
-    return [
+    numbers = [
         prose(
-            "In brackets: 95 % intervals. Evidence is the gain in log-likelihood over the best model "
-            "without the cause, in nats: 5 nats are odds of 150 to 1. In sigma it is that of one "
+            "In brackets: 95 % intervals. Evidence is the gain in log-likelihood over the best "
+            "model without the cause, in nats: 5 nats are odds of 150 to 1. In sigma it is that of one "
             "number so many standard deviations from zero."
         ),
-        cards(_card(k, cause, bare, corrected) for k, cause in enumerate(causes)),
         folded_table("The parameters in numbers", header, rows),
+        folded_table("Why a name is believed", _ROBUST_HEADER, map(_robust_row, causes)),
         alarms,
+    ]
+    shown = {t: [(k, c) for k, c in enumerate(causes) if c["trust"] == t] for t in TRUST}
+    sections = [
+        Section(heading, [prose(words), cards(_card(k, c, bare, corrected) for k, c in shown[t])])
+        for t, (heading, words) in TRUST.items()
+        if shown[t]
+    ]
+    last = sections[-1]
+    return [*sections[:-1], Section(last.title, [*last.blocks, *numbers])]
+
+
+TRUST = {
+    "sure": (
+        "Causes that are sure",
+        "**Sure.** These names hold at half and twice every noise level, on parts of the flights, "
+        "and no other effect of the catalogue does as well.",
+    ),
+    "doubtful": (
+        "Doubtful causes",
+        "**Doubtful.** With these the model predicts better, but the flights do not settle the "
+        "name: another cause may hide behind it.",
+    ),
+}
+"""How far a cause's name may be believed -> the heading of such causes, and what that means."""
+_ROBUST_HEADER = ["cause", "name is", "under other noise", "left-out runs", "halves"]
+
+
+def _robust_row(cause: Mapping[str, Any]) -> list[str]:
+    """What a cause's name withstood, in a table."""
+    robust = cause["robust"]
+    return [
+        capital(plain(cause["effect"])),
+        cause["trust"],
+        "holds" if robust["noise"] else "falls",
+        f"returns in {whole_percent(100.0 * robust['runs'])}",
+        "could not tell"
+        if robust["kept"] is None
+        else f"returns in {whole_percent(100.0 * robust['kept'])}",
     ]
 
 
 def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicle) -> str:
-    effect, alternatives = cause["effect"], cause["confusable_with"]
-    unusual = effect in effects.CATALOGUE and outside_usual(effect, _values(cause))
-    lines = [
-        f"**These flights cannot distinguish it from {_plain_list(alternatives)}.**"
-        if alternatives
-        else "No other effect fits these flights equally well."
+    effect, doubts = cause["effect"], cause["doubts"]
+    lines = [f"**{capital(doubt)}.**" for doubt in doubts] or [
+        "Within the catalogue and this class of noise no other effect fits these flights equally well."
     ]
-    if unusual:
-        lines.append("**Its size is outside the usual range: the name is doubtful.**")
     if cause["channels"]:
         lines.append(f"Seen in {and_list([channel_name(c) for c in cause['channels']])}.")
     evidence = cause["evidence"]
@@ -78,7 +114,7 @@ def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicl
         ),
         [" ".join(lines)],
         badge=Markup(f"{inline(f'{sigmas(evidence):.0f} sigma')}, {nats}"),
-        kind="warning" if alternatives or unusual else "",
+        kind="warning" if doubts else "",
     )
 
 
@@ -86,15 +122,11 @@ def _plain_list(names: list[str]) -> str:
     return and_list([plain(name) for name in names])
 
 
-def _values(cause: Mapping[str, Any]) -> dict[str, float]:
-    """Parameter's own name -> value."""
-    return {name.rpartition(".")[2]: p["value"] for name, p in cause["parameters"].items()}
-
-
-def _rows(index: int, cause: Mapping[str, Any]) -> list[list[str]]:
+def _rows(index: int, cause: Mapping[str, Any], vehicle: Vehicle) -> list[list[str]]:
     """A cause's parameters in a table."""
-    entry = effects.CATALOGUE.get(cause["effect"])
-    usual = {f"{entry.name}.{p.name}": p.usual for p in entry.parameters} if entry else {}
+    effect = cause["effect"]
+    sized = sized_for(vehicle, effect) if effect in effects.CATALOGUE else ()
+    usual = {f"{effect}.{p.name}": p.usual for p in sized}
     result = []
     for name, p in cause["parameters"].items():
         place, value, std = f"causes/{index}/parameters/{name}", p["value"], p["std"]
@@ -104,7 +136,7 @@ def _rows(index: int, cause: Mapping[str, Any]) -> list[list[str]]:
                 capital(plain(name)),
                 datum(number(value), f"{place}/value", value),
                 datum(number(std, 2), f"{place}/std", std),
-                " to ".join(ends),
+                " to ".join(ends) if p["determined"] else "not determined",
                 unit_name(p["unit"]) or "1",
                 number(usual.get(name), 2),
             ]
@@ -127,7 +159,11 @@ def confounding_blocks(findings: Findings) -> list[str]:
         ]
     elif findings["causes"]:
         blocks.append(
-            callout("None: no other effect fits these flights as well as the causes named.", "good")
+            callout(
+                "None within the catalogue and this class of noise: no other effect of it fits these "
+                "flights as well as the causes named.",
+                "good",
+            )
         )
     if following:
         blocks.append(
@@ -143,10 +179,13 @@ def confounding_blocks(findings: Findings) -> list[str]:
     return blocks
 
 
-def _false_alarms(rate: float | None) -> str:
+def _false_alarms(rate: float | None, seen: Mapping[str, Any]) -> str:
     if rate is None:
-        return "How often a cause is named where there is none has not been calibrated yet."
+        return (
+            "**False alarms.** How often a cause is named where there is none is not known for flights "
+            f"of this class ({seen['why']})."
+        )
     return (
-        "**False alarms.** The threshold is calibrated on synthetic flights without any effect: a "
+        f"**False alarms.** The threshold is calibrated on {seen['calibrated']} without any effect: a "
         f"cause is named in {100 * rate:.2g} % of them."
     )

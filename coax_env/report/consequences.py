@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.estimation.helicopter import UNUSUAL_FROM
 from coax_env.model import effects
 from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import bounds
@@ -119,17 +118,3 @@ def described(cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicle) -> st
     found = consequences(effect, values, covariance_of(cause, corrected), bare)
     significant = [c for c in found if c.significant] or found[:1]
     return ", ".join(c.text for c in significant)
-
-
-def outside_usual(effect: str, values: Values) -> bool:
-    """Whether a value is beyond UNUSUAL_FROM times its usual size, or has no meaning."""
-    known = {p.name: p for p in effects.CATALOGUE[effect].parameters}
-    return any(
-        name in known
-        and not known[name].shape
-        and (
-            abs(value - known[name].off) > UNUSUAL_FROM * known[name].usual
-            or not known[name].lower <= value <= known[name].upper
-        )
-        for name, value in values.items()
-    )

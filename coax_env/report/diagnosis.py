@@ -3,7 +3,7 @@
 One page for someone who was not there: two minutes to read, the details folded away at its end.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from coax_env.estimation.trajectories import RESTART, trajectories
@@ -18,7 +18,7 @@ from coax_env.plain_words import (
     seconds,
     whole_percent,
 )
-from coax_env.report.causes import cause_blocks, confounding_blocks
+from coax_env.report.causes import cause_sections, confounding_blocks
 from coax_env.report.diagnosis_details import detail_blocks
 from coax_env.report.flight_data import data_blocks, ordered
 from coax_env.report.flight_view import flight_view
@@ -50,7 +50,7 @@ def diagnosis_page(
     sections = [
         Section("The flights", _flights(result)),
         Section("Where the bare model is wrong", error_blocks(result)),
-        Section("The causes", cause_blocks(findings, bare, corrected)),
+        *cause_sections(findings, bare, corrected),
         Section("Confounded alternatives", confounding_blocks(findings)),
         Section("What the corrected model gains", gain_blocks(findings)),
         Section("Still unexplained", _unexplained(findings, bare)),
@@ -79,6 +79,9 @@ def headline(findings: Findings) -> str:
         named = and_list(names) if names else ""
     if findings["verdict"] == "consistent":
         return "The simulation agrees with these flights"
+    if names and all(c["trust"] != "sure" for c in findings["causes"]):
+        doubtful = "the name is doubtful" if len(names) == 1 else "the names are doubtful"
+        return f"The model predicts better with {named.rstrip(',')}; {doubtful}"
     if findings["verdict"] == "explained":
         return f"{capital(named)} {verb} what the simulation got wrong"
     if findings["verdict"] == "partly explained":
@@ -100,6 +103,8 @@ def lead(findings: Findings) -> list[str]:
         )
     elif not gain:
         sentences.append("No run was held out, so how well this predicts is not known.")
+    if findings["causes"]:
+        sentences.append(_trust_in_words(findings["causes"]))
     alternatives = sorted({name for c in findings["causes"] for name in c["confusable_with"]})
     if alternatives:
         sentences.append(
@@ -111,6 +116,18 @@ def lead(findings: Findings) -> list[str]:
         where = list(dict.fromkeys(channel_name(u["channel"]) for u in findings["unexplained"]))
         sentences.append(f"Unexplained structure is left in {and_list(where)}.")
     return sentences
+
+
+def _trust_in_words(causes: Sequence[Mapping[str, Any]]) -> str:
+    """Which names are sure, and which are doubtful."""
+    groups = {
+        trust: [plain(c["effect"]) for c in causes if c["trust"] == trust]
+        for trust in ("sure", "doubtful")
+    }
+    said = [f"{capital(trust)}: {and_list(names)}." for trust, names in groups.items() if names]
+    if groups["doubtful"]:
+        said.append("A doubtful name stands for something that improves the prediction.")
+    return " ".join(said)
 
 
 # --- the flights ----------------------------------------------------------------------------------
@@ -168,7 +185,7 @@ LOADS = {
 
 
 def _unexplained(findings: Findings, vehicle: Vehicle) -> list[str]:
-    """Structure beyond the causes, and the gusts."""
+    """Structure beyond the causes, what the fitted model does not make, and the gusts."""
     with_form = [u for u in findings["unexplained"] if u["depends_on"]]
     without = [u for u in findings["unexplained"] if not u["depends_on"]]
     lines = [
@@ -189,6 +206,7 @@ def _unexplained(findings: Findings, vehicle: Vehicle) -> list[str]:
         bullets(lines)
         if lines
         else callout("The innovations are white: nothing but noise and gusts is left.", "good"),
+        bullets(f"{capital(words)}." for words in findings["model_check"]["words"]),
         prose(_gusts_in_words(findings["gusts"], vehicle)),
     ]
 

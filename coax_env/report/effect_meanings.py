@@ -141,6 +141,28 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
         _own("the rotors turn {} slower after a minute", "%", "rate", 6000.0),
         _share("{} thrust by then", lambda e, v: (1.0 - 60.0 * e["rate"]) ** 2 - 1.0),
     ],
+    "battery_voltage": [
+        _own("the rotors turn {} slower per volt below the nominal", "%", "per_volt", 100.0),
+        _share("{} thrust one volt below it", lambda e, v: (1.0 - e["per_volt"]) ** 2 - 1.0),
+    ],
+    "command_delay": [
+        _own("rotors and swash plate answer {} after their command", "ms", "time", 1000.0),
+    ],
+    "motor_droop": [
+        _own("the upper rotor leaves out {} of a change of its speed command", "%", "upper", 100.0),
+        _own("the lower {}", "%", "lower", 100.0),
+    ],
+    "servo_play": [
+        _own("the swash plate has {} of play about its command", "°", "width", math.degrees(1.0)),
+    ],
+    "servo_deadband": [
+        _own("the swash plate does not answer a change below {}", "°", "width", math.degrees(1.0)),
+    ],
+    "servo_rate": [
+        _own("the swash plate tilts no faster than {}", "°/s", "limit", math.degrees(1.0)),
+        Consequence("it takes {} for a step of 5°", "ms",
+                    lambda e, v: 1000.0 * math.radians(5.0) / e["limit"]),
+    ],
     "wind": [
         Consequence("the air moves at {}", "m/s", lambda e, v: math.hypot(e["north"], e["east"])),
         Consequence("towards {} clockwise from north", "°", _wind_course, direction=True),
@@ -150,6 +172,8 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
              "the swash plate is turned back by {} about the mast"),
         Consequence("{} of a tilt back goes to the right", "%",
                     lambda e, v: 100.0 * math.sin(e["angle"]), "{} of a tilt back goes to the left"),
+        _own("by {} more at 100 rpm more of the lower rotor", "°", "per_rpm", 100.0 * math.degrees(1.0),
+             "by {} less at 100 rpm more of the lower rotor"),
     ],
     "swash_offset": [
         _own("the swash plate stands {} back at zero command", "°", "lon", math.degrees(1.0),
@@ -168,6 +192,9 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
         _share("{} thrust of the lower rotor, in the wake of the upper",
                lambda e, v: -e["gain"] * _upper_thrust_share(v)),
     ],
+    "dynamic_inflow": [
+        _own("the inflow follows a change of rotor speed in {}", "ms", "time", 1000.0),
+    ],
     "thrust_exponent": [
         Consequence("thrust goes as rotor speed to the power {}", "",
                     lambda e, v: 2.0 + e["excess"]),
@@ -184,6 +211,20 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
     ],
     "flap_blowback": [
         _own("the lower disc tilts back by {} at 1 m/s", "°", "gain", math.degrees(1.0)),
+    ],
+    "upper_blowback": [
+        _own("the upper disc tilts back by {} at 1 m/s", "°", "gain", math.degrees(1.0)),
+    ],
+    "gyroscopic_coupling": [
+        Consequence("{} of the body's own gyroscopic moment acts on it", "%",
+                    lambda e, v: 100.0 * e["gain"]),
+    ],
+    "position_spring": [
+        Consequence("a metre beside its anchor it is pulled back by {}", "m/s²",
+                    lambda e, v: e["stiffness"] / v["mass"]),
+        _own("the anchor lies {} north of the origin", "mm", "north", 1000.0,
+             "the anchor lies {} south of the origin"),
+        _own("{} east of it", "mm", "east", 1000.0, "{} west of it"),
     ],
     "yaw_damping": [
         Consequence(f"a turn at {TURN_RATE:g}°/s is braked by {{}}", "°/s²",
@@ -208,6 +249,24 @@ CONSEQUENCES: dict[str, list[Consequence]] = {
         Consequence("{} of the torque that speeds a rotor up turns the body", "%",
                     lambda e, v: 100.0 * e["gain"]),
     ],
+    "pose_delay": [_own("position and attitude readings are {} late", "ms", "time", 1000.0)],
+    "attitude_delay": [_own("the attitude readings are {} late", "ms", "time", 1000.0)],
+    "marker_offset": [
+        _own("the tracked point lies {} ahead of the centre of gravity", "mm", "x", 1000.0,
+             "the tracked point lies {} behind the centre of gravity"),
+        _own("{} to its right", "mm", "y", 1000.0, "{} to its left"),
+        _own("{} below it", "mm", "z", 1000.0, "{} above it"),
+    ],
+    "frame_yaw": [
+        _own("the markers' axes are turned by {} to the right about the mast", "°", "angle",
+             math.degrees(1.0), "the markers' axes are turned by {} to the left about the mast"),
+    ],
+    "magnetic_field": [
+        Consequence("as it turns, the heading reads up to {} too high and too low", "°",
+                    lambda e, v: math.degrees(math.asin(min(math.hypot(e["x"], e["y"]), 1.0)))),
+    ],
+    "gyro_scale": _axes("the AXIS gyro reads {} too high", "the AXIS gyro reads {} too low",
+                        "%", 100.0, x="roll", y="pitch", z="yaw"),
     "imu_lever_arm": [
         _own("the accelerometers sit {} ahead of the centre of gravity", "mm", "x", 1000.0,
              "the accelerometers sit {} behind the centre of gravity"),

@@ -1,6 +1,7 @@
 """What reports show of a flight: its data, and predictions against measurements."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -81,11 +82,28 @@ def points_each(count: int) -> int:
 
 
 def _logged(flight: Flight, run: str) -> Run:
-    """The run of that name, or the one of which a part was held out."""
-    for logged in flight.runs:
-        if run == logged.name or run.startswith(f"{logged.name} ("):
-            return logged
+    """The run of that name, all parts of it, or the one of which a part was held out."""
+    for whole in dict.fromkeys(logged.whole for logged in flight.runs):
+        if run == whole or run.startswith(f"{whole} ("):
+            return _joined([logged for logged in flight.runs if logged.whole == whole])
     return flight.run(run)
+
+
+def _joined(parts: Sequence[Run]) -> Run:
+    """The parts of a run as one."""
+    if len(parts) == 1:
+        return parts[0]
+    channels = dict.fromkeys(c for part in parts for c in part.measured)
+    missing = {part.name: np.full(part.t.size, np.nan) for part in parts}
+    return replace(
+        parts[0],
+        t=np.concatenate([part.t for part in parts]),
+        command=np.concatenate([part.command for part in parts]),
+        measured={
+            c: np.concatenate([part.measured.get(c, missing[part.name]) for part in parts])
+            for c in channels
+        },
+    )
 
 
 def _drawn(error: np.ndarray, measured: np.ndarray) -> np.ndarray:

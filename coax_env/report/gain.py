@@ -47,9 +47,12 @@ def gain_tiles(findings: Mapping[str, Any]) -> str:
     items = [
         (_percent(gain, "error_removed_percent"), f"of the {seconds(gain['horizon_s'])} prediction "
          "error removed", interval),
-        (_percent(gain, "noise_floor_percent"), "is the most possible", "with these sensors' noise"),
+        (_percent(gain, "noise_floor_percent"), "expected of a perfect model",
+         "from the same starts, at these sensors' noise"),
         (_percent(gain, "refitted_base_percent"), "by refitting alone",
          "the bare model's own parameters"),
+        (_percent(gain, "persistence_percent"), "by saying that nothing moves",
+         "the least that a model must beat"),
     ]  # fmt: skip
     if gain.get("black_box_percent") is not None:
         items.append(
@@ -82,7 +85,10 @@ def gain_blocks(findings: Mapping[str, Any]) -> list[str]:
     )
     if gain.get("black_box_percent") is None:
         caption += "With `--ceiling` a black box is fitted too, for comparison."
-    header = ["channel", "unit", "bare", "refitted", "corrected", "95 % interval", "sensor noise"]
+    header = [
+        "channel", "unit", "bare", "refitted", "corrected", "95 % interval", "nothing moves",
+        "sensor noise",
+    ]  # fmt: skip
     return [
         figure(figures.gain_bars(channels), caption, "Prediction error by channel"),
         folded_table(
@@ -115,6 +121,7 @@ def _row(channel: str, entry: Mapping[str, Any]) -> list[str]:
         shown("before_refitted"),
         shown("after"),
         Markup(" to ".join(ends)) or "–",
+        shown("persistence"),
         shown("noise"),
     ]
 

@@ -149,9 +149,10 @@ class _Machine:
         """From a paper state (16,) at a command (4,); ``dt``: seconds per row."""
         self.x = dynamics.full_state(start, trim, vehicle)
         self._p = vehicle.vector.copy()
-        self._u, self._last, self._limits = np.empty(N_INPUTS), trim.copy(), limits(vehicle)
-        slots = period.delay_slots(vehicle.values().get("servo_delay.time", 0.0), dt)
-        self._ring = np.tile(trim[2:], (slots, 1))
+        self._u, self._last, self._limits = np.zeros(N_INPUTS), trim.copy(), limits(vehicle)
+        values = vehicle.values()
+        slots = period.delay_slots(sum(values.get(name, 0.0) for name in period.DELAYS), dt)
+        self._ring = np.tile(trim, (slots, 1))
         self._row, self._azimuth, self._dt = 0, 0.0, dt
         self._work = np.empty(dynamics.WORK_SIZE)
         self._gust = np.zeros(6) if gusts is None else gusts.levels()
@@ -170,7 +171,7 @@ class _Machine:
         u, p, ring, row = self._u, self._p, self._ring, self._row
         u[:N_COMMANDS] = command
         period.give_command(u, self._last, self._limits, ring, row, self._dt)
-        period.apply_servo_delay(u, p, ring, row, self._dt)
+        period.apply_delays(u, p, ring, row, self._dt)
         period.true_readings(self.x, u, p, self._azimuth, self._work, readings)
 
     def fly(self) -> None:

@@ -13,6 +13,8 @@ from scipy.stats import binomtest
 TIES: tuple[frozenset[str], ...] = (
     # first-order lag and pure delay differ above 3 Hz only, where gusts and gyro noise are
     frozenset({"servo_lag", "servo_delay"}),
+    # a deadband's jumps follow the last digit of a command; play trails as far, on average
+    frozenset({"servo_play", "servo_deadband"}),
     # the same acceleration; they part by the moments' gain alone, which K_b, I_xx, I_yy cover (3-5 %)
     frozenset({"added_mass", "thrust_scale"}),
 )

@@ -19,6 +19,20 @@ FALSE_ALARMS = 0.01
 FEWEST = 20  # clean flights
 TAIL = 0.25
 DRAWS = 2000
+CLASS = {
+    "name": "synthetic flights of the study",
+    "data": "tests/injector.py, a lama400d, still or in gusts of 0.2 N and 6 mN m",
+    "sensors": ["accelerometers, attitude, gyros, heading, height, rotor speeds, velocity"],
+    "rate_hz": [95.0, 105.0],
+    "gap_share": [0.0, 0.01],
+    "card_noise": [True],
+    "mass_kg": [0.7, 0.9],
+    "gust_force": [0.0, 0.05],  # of the weight
+    "gust_moment": [0.0, 0.01],  # of the weight at the upper hub's arm
+    "gust_memory_s": [0.2, 1.2],
+    "white_noise": [False],
+}
+"""What the clean flights are like: what may be seen of a flight of theirs, or the ends of a range."""
 
 
 def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
@@ -39,6 +53,7 @@ def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
     estimate = max(alarms / len(clean), share_beyond(evidence, SETTINGS.evidence))
     finite = np.sort(evidence[np.isfinite(evidence)])[::-1]
     return {
+        "class": CLASS,
         "false_alarm_rate": round(max(estimate, FALSE_ALARMS), 4),  # less is not claimed
         "estimated_rate": round(estimate, 4),
         "threshold_nats_for_1_percent": _number(tail_quantile(evidence)),

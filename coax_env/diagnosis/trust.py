@@ -1,0 +1,244 @@
+"""When may a name be believed? Each cause is sure, or doubtful with the reasons in plain words.
+
+Sure is what holds: under half and twice every noise level (noise_variation.py), without any one run and
+on halves of the flights (replication.py), with white innovations where it shows, a usual size, a number
+that the flights determine, and no other effect that would do as well. A doubtful cause still improves
+the model, and stays in it.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from coax_env.diagnosis.confounding import Alternatives, channels_of
+from coax_env.diagnosis.evidence import Evidence
+from coax_env.diagnosis.noise_variation import not_holding
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.replication import Asked, Replication, halves_of, replications
+from coax_env.diagnosis.settings import SETTINGS, Settings
+from coax_env.diagnosis.vibration import Line
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import FreeParameter
+from coax_env.estimation.whiteness import Whiteness
+from coax_env.model import effects
+from coax_env.plain_words import and_list, channel_name, plain
+
+AT_BOUND = 0.99
+"""Share of the most usual sizes from which a number stands at its bound; ours."""
+MOST_VARIATIONS = 3
+"""Variations of the noise that a doubt names; of more, their number; ours."""
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What is known of a name.
+
+    Attributes:
+        noise: it holds at half and twice every noise level.
+        runs: share of left-out runs without which it returns.
+        kept: share of halves in which it returns; None where none could tell.
+        determined: parameter -> whether the flights say more of it than its prior did.
+        doubts: reasons against the name, in plain words; none: it is sure.
+    """
+
+    noise: bool
+    runs: float
+    kept: float | None
+    determined: Mapping[str, bool]
+    doubts: tuple[str, ...]
+
+    @property
+    def word(self) -> str:
+        """findings.json's `trust`."""
+        return "doubtful" if self.doubts else "sure"
+
+    def entries(self) -> dict[str, Any]:
+        """What findings.json has of it, beside `determined`."""
+        return {
+            "robust": {"noise": self.noise, "runs": self.runs, "kept": self.kept},
+            "trust": self.word,
+            "doubts": list(self.doubts),
+            "since": None,
+        }
+
+
+def trusts(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    evidence: Mapping[str, Evidence],
+    found: Alternatives,
+    white: Mapping[str, Whiteness],
+) -> dict[str, Trust]:
+    """Every active effect judged.
+
+    Args:
+        problem, fit: with the causes.
+        quadratic: linearised at the fit, its runs in it.
+        evidence: of each cause.
+        found: the confounded alternatives of each cause.
+        white: whiteness of the innovations, by channel.
+    """
+    worth = {effect: weighed.nats for effect, weighed in evidence.items()}
+    replicated = replications(problem, fit, quadratic, worth)
+    falling = not_holding(problem, fit, quadratic, worth)
+    result = {}
+    for effect in fit.active:
+        known = determined(problem, fit, quadratic, effect, evidence[effect].inflation)
+        doubts = (
+            *_not_white(channels_of(problem, fit, quadratic, effect), white),
+            *_under_noise(falling[effect]),
+            *on_parts(replicated[effect], len(problem.engine.records), problem.settings),
+            *_sizes(problem, fit, effect),
+            *_undetermined(problem, effect, known),
+            *_alternatives(found[effect]),
+        )
+        of_parts = replicated[effect]
+        result[effect] = Trust(
+            not falling[effect], of_parts.runs, of_parts.kept, known, tuple(doubts)
+        )
+    return result
+
+
+def of_line(line: Line, chosen: Settings = SETTINGS) -> Trust:
+    """What is known of a vibration, which is found by its line and not by a signature.
+
+    Its evidence compares the line with its neighbours, so that no level of noise is in it.
+
+    Args:
+        line: with its segments.
+        chosen: what decides.
+    """
+    runs = [name for name, ratios in line.ratios.items() if ratios]
+    rest = [[r for n in runs if n != out for r in line.ratios[n]] for out in runs]
+    every = [r for n in runs for r in line.ratios[n]]
+    groups = [range(len(every))]
+    halves = [[every[i] for i in half] for half in halves_of(groups, chosen.splits)]
+
+    def returns(part: Sequence[float]) -> bool:
+        asked = Asked(len(part) / len(every), 1.0, line.evidence, chosen)
+        return asked.can_tell and asked.margin(line.evidence_of(part)) >= 0.0
+
+    of_parts = Replication(
+        sum(map(returns, rest)) / len(runs),
+        sum(map(returns, halves)) / len(halves) if halves else None,
+        tuple(name for name, part in zip(runs, rest, strict=True) if not returns(part)),
+    )
+    doubts = tuple(on_parts(of_parts, len(runs), chosen))
+    return Trust(True, of_parts.runs, of_parts.kept, {"vibration.amplitude": True}, doubts)
+
+
+def determined(
+    problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, inflation: float
+) -> dict[str, bool]:
+    """Whether the flights determine each of an effect's parameters, or its interval is the prior's.
+
+    Args:
+        problem, fit: with the effect.
+        quadratic: linearised at the fit.
+        effect: an active one.
+        inflation: of the data's variance, by coloured innovations.
+    """
+    free = problem.free_names(fit.active)
+    variance = dict(zip(free, quadratic.covariance(free).diagonal(), strict=True))
+    result = {}
+    for f in problem.own[effect]:
+        of_data = max(1.0 / variance[f.name] - 1.0 / f.std**2, 0.0) / inflation
+        left = 1.0 / math.sqrt(1.0 + of_data * f.std**2)  # std over the prior's
+        result[f.name] = left <= problem.settings.undetermined
+    return result
+
+
+# --- what speaks against a name ---------------------------------------------------------------------
+
+
+def _not_white(channels: Sequence[str], white: Mapping[str, Whiteness]) -> Iterable[str]:
+    coloured = [channel_name(c) for c in channels if c in white and not white[c].white]
+    if coloured:
+        yield f"it shows in {and_list(coloured)}, where the model leaves more than noise"
+
+
+def _under_noise(variations: Sequence[str]) -> Iterable[str]:
+    if variations:
+        shown = list(variations[:MOST_VARIATIONS])
+        if len(variations) > MOST_VARIATIONS:
+            shown.append(f"{len(variations) - MOST_VARIATIONS} more changes of the noise")
+        yield f"it does not hold at {and_list(shown)}"
+
+
+def on_parts(of_parts: Replication, runs: int, chosen: Settings) -> Iterable[str]:
+    """What left-out runs and halves say against a name.
+
+    Args:
+        of_parts: how it fared.
+        runs: number of runs that were fitted.
+        chosen: the shares that it needs.
+    """
+    if runs < 2:
+        yield "one run alone was fitted"
+    elif of_parts.runs < chosen.least_runs:
+        if len(of_parts.rests_on) == 1:
+            yield f"it rests on {of_parts.rests_on[0]} alone"
+        else:
+            yield f"it is gone without {' or without '.join(of_parts.rests_on)}"
+    if of_parts.kept is None:
+        yield "no half of the flights could tell"
+    elif of_parts.kept < chosen.least_kept:
+        yield f"it returns in {100.0 * of_parts.kept:.0f} % of the halves of the flights"
+
+
+def _sizes(problem: Problem, fit: Fit, effect: str) -> Iterable[str]:
+    for f in usual_sizes(problem, effect):
+        size = abs(fit.values[f.name] - f.value)
+        if size > AT_BOUND * MOST_USUAL_SIZES * f.std:
+            limit = f"{plain(f.name)} stands at the limit of what is believed"
+            yield f"{limit}: something else hides behind the name"
+        elif size > UNUSUAL_FROM * f.std:
+            yield f"{plain(f.name)} is {size / f.std:.1f} usual sizes"
+
+
+def usual_sizes(problem: Problem, effect: str) -> list[FreeParameter]:
+    """An effect's parameters with their usual sizes, however wide their priors were made.
+
+    Args:
+        problem: whose candidate it is.
+        effect: its name.
+    """
+    return problem.model.effect_parameters(effect)
+
+
+def _undetermined(problem: Problem, effect: str, known: Mapping[str, bool]) -> Iterable[str]:
+    if not any(known[name] for name in problem.acting_names(effect)):
+        yield "none of its numbers is determined"
+
+
+def _alternatives(names: Iterable[str]) -> Iterable[str]:
+    alternatives = [plain(name) for name in names]
+    if alternatives:
+        yield f"these flights cannot distinguish it from {and_list(alternatives)}"
+
+
+# --- priors beside a large axis ---------------------------------------------------------------------
+
+
+def beside_large_axes(problem: Problem, fit: Fit) -> Problem:
+    """With the priors of an effect's other axes as wide as the largest that was found.
+
+    Where x is five times its usual size, that y and z are usual is not known.
+
+    Args:
+        problem, fit: after the search.
+    """
+    own = dict(problem.own)
+    for effect in fit.active:
+        acting = set(problem.acting_names(effect))
+        axes = [f for f in own[effect] if f.name in acting]
+        units = {p.unit for p in effects.CATALOGUE[effect].parameters if not p.shape}
+        largest = max(abs(fit.values[f.name] - f.value) / f.std for f in axes)
+        if len(axes) > 1 and len(units) == 1 and largest > UNUSUAL_FROM:
+            own[effect] = tuple(
+                replace(f, std=largest * f.std) if f.name in acting else f for f in own[effect]
+            )
+    return replace(problem, own=own)

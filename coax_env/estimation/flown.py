@@ -1,0 +1,200 @@
+"""What of a flight was flown: runs cut where nothing is known, or something else moves the machine.
+
+- A gap: the last command is held for so long, and no longer; a new part begins behind it.
+- Commands that freeze, where they otherwise change all the time: the machine obeys others, or none.
+- Rotors that carry less than half the weight: it stands on the ground, or is carried.
+
+A part keeps its run's name, from the second on with a number. All that fits or flies again (diagnosis,
+identification, replay, check) asks for the parts here, since only a vehicle says what carries it.
+"""
+
+import math
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from coax_env.logs.flight import Flight, Run
+from coax_env.logs.packets import stretches
+from coax_env.logs.repairs import hold_last
+from coax_env.model.layout import RPM_PER_RAD_S
+from coax_env.model.vehicle import Vehicle
+
+LONGEST_BELIEVED = 0.25
+"""Time [s] for which the last command is believed, and not less than BELIEVED_STEPS usual steps.
+
+A swash command that is 0.05 rad off turns a machine of this size by half a radian in that time. Gaps of
+radio links that are shorter cost less by a held command than by a filter that starts anew; ours.
+"""
+BELIEVED_STEPS = 5.0
+SHORTEST_PART = 2.0
+"""A part that is shorter [s] is left out: the filter needs the first second to settle; ours."""
+
+FROZEN = 1.0
+"""Time [s] through which all four commands stay the same to the last digit..."""
+FROZEN_TIMES = 10.0
+"""...if that is so many times longer than nearly all (95 %) of the times between two changes; ours."""
+FEWEST_CHANGES = 20  # of the commands, so that their usual time is known; ours
+
+CARRIES = 0.5
+"""Share of the weight, as mean over MEAN_TIME, below which the rotors carry nothing; ours."""
+MEAN_TIME = 0.5  # [s]; ours
+FLIES = 0.9
+"""Share of the run's usual thrust from which on it flies again: between them it may stand; ours."""
+MOST_GROUNDED = 0.8
+"""Share of all rows beyond which the vehicle is another one, and nothing is cut; ours."""
+
+
+def flown_parts(flight: Flight, vehicle: Vehicle) -> Flight:
+    """The flight with every run cut into what was flown, and with notes of what was left out.
+
+    Args:
+        flight: as read.
+        vehicle: whose rotors carry its weight.
+    """
+    grounded = _grounded_rows(flight, vehicle)
+    counts: Counter[str] = Counter(flight.counts)
+    notes: list[str] = []
+    taken = set(flight.run_names)
+    parts: list[Run] = []
+    for run, on_ground in zip(flight.runs, grounded, strict=True):
+        frozen = frozen_rows(run)
+        for what, mask in (("commands frozen", frozen), ("rotors too slow to fly", on_ground)):
+            for first, stop in stretches(mask):
+                last = run.t[min(stop, run.t.size - 1)]
+                notes.append(f"{run.name}: {run.t[first]:.1f} to {last:.1f} s left out: {what}")
+                counts[f"stretches left out: {what}"] += 1
+        parts += _parts(run, frozen | on_ground, taken, counts, notes)
+    if not parts:
+        too_short = (
+            f"no run has {SHORTEST_PART:g} s of flight without a gap: all are used as they are"
+        )
+        return replace(flight, notes=(*flight.notes, too_short))
+    if not notes:
+        return flight
+    return replace(flight, runs=tuple(parts), notes=(*flight.notes, *notes), counts=dict(counts))
+
+
+def _parts(
+    run: Run, left_out: np.ndarray, taken: set[str], counts: Counter[str], notes: list[str]
+) -> list[Run]:
+    """What is left of a run, cut at its gaps too; `taken`: names of runs that there are."""
+    step = np.diff(run.t)
+    gap = np.concatenate([[False], step > longest_believed(run.t)])
+    for row in np.flatnonzero(gap):
+        if not left_out[row - 1 : row + 1].any():
+            notes.append(f"{run.name}: cut at a gap of {step[row - 1]:.2f} s, {run.t[row]:.1f} s")
+            counts["gaps at which a run is cut"] += 1
+    if not (gap.any() or left_out.any()):
+        return [run]
+    pieces = np.cumsum(gap | np.diff(left_out, prepend=left_out[:1]))
+    kept = []
+    for piece in np.unique(pieces[~left_out]):
+        rows = np.flatnonzero(pieces == piece)
+        if run.t[rows[-1]] - run.t[rows[0]] < SHORTEST_PART:
+            counts[f"parts of less than {SHORTEST_PART:g} s left out"] += 1
+            notes.append(
+                f"{run.name}: {run.t[rows[0]]:.1f} to {run.t[rows[-1]]:.1f} s left out: shorter"
+                f" than {SHORTEST_PART:g} s"
+            )
+        else:
+            kept.append(rows)
+    names = [run.name]
+    while len(names) < len(kept):
+        names.append(_free_name(run.name, taken))
+    return [_part(run, rows, name) for rows, name in zip(kept, names, strict=False)]
+
+
+def _free_name(name: str, taken: set[str]) -> str:
+    number = 2
+    while f"{name} ({number})" in taken:
+        number += 1
+    taken.add(f"{name} ({number})")
+    return f"{name} ({number})"
+
+
+def _part(run: Run, rows: np.ndarray, name: str) -> Run:
+    return replace(
+        run,
+        name=name,
+        t=run.t[rows],
+        command=run.command[rows],
+        measured={c: values[rows] for c, values in run.measured.items()},
+        part_of=run.whole,
+        began=run.beginning,
+        battery=None if run.battery is None else run.battery[rows],
+    )
+
+
+def longest_believed(t: np.ndarray) -> float:
+    """Time [s] for which a run's last command is believed; t: (n,) its rows."""
+    return max(LONGEST_BELIEVED, BELIEVED_STEPS * float(np.median(np.diff(t))))
+
+
+# --- commands that freeze ------------------------------------------------------------------------
+
+
+def frozen_rows(run: Run) -> np.ndarray:
+    """Rows (n,) in which all commands stand still, in a run in which they otherwise change."""
+    found = np.zeros(run.t.size, bool)
+    changes = np.flatnonzero((np.diff(run.command, axis=0) != 0.0).any(axis=1)) + 1
+    if changes.size < FEWEST_CHANGES:
+        return found
+    edges = np.concatenate([[0], changes, [run.t.size - 1]])
+    lasted = np.diff(run.t[edges])
+    usual = float(np.quantile(lasted, 0.95))
+    for k in np.flatnonzero(lasted > max(FROZEN, FROZEN_TIMES * usual)):
+        found[edges[k] + 1 : edges[k + 1]] = True
+    if lasted[-1] > max(FROZEN, FROZEN_TIMES * usual):
+        found[-1] = True
+    return found
+
+
+# --- rotors that carry nothing -------------------------------------------------------------------
+
+
+def _grounded_rows(flight: Flight, vehicle: Vehicle) -> list[np.ndarray]:
+    """Rows of each run in which the rotors are too slow to fly; none where they never are fast."""
+    found = [grounded_rows(run, vehicle) for run in flight.runs]
+    share = sum(int(mask.sum()) for mask in found) / sum(mask.size for mask in found)
+    return found if share <= MOST_GROUNDED else [np.zeros(mask.size, bool) for mask in found]
+
+
+def grounded_rows(run: Run, vehicle: Vehicle) -> np.ndarray:
+    """Rows (n,) of a run in which the rotors carry less than half the weight, and until they fly."""
+    thrust = _mean(run.t, thrust_share(run, vehicle))
+    low = thrust < CARRIES
+    if not low.any() or low.all():
+        return low
+    not_flying = thrust < FLIES * float(np.median(thrust[~low]))
+    found = np.zeros(run.t.size, bool)
+    for first, stop in stretches(not_flying | low):
+        if low[first:stop].any():
+            found[first:stop] = True
+    return found
+
+
+def thrust_share(run: Run, vehicle: Vehicle) -> np.ndarray:
+    """Thrust over weight (n,) at a run's rotor speeds, the measured ones where they are logged."""
+    p = {name: number.value for name, number in vehicle.parameters.items()}
+    per_speed2 = p["air_density"] * math.pi * p["rotor_radius"] ** 4
+    lift = np.zeros(run.t.size)
+    for column, rotor in enumerate(("upper", "lower")):
+        lift += per_speed2 * p[f"thrust_coefficient_{rotor}"] * _speed(run, column, rotor) ** 2
+    return lift / (p["mass"] * p["gravity"])
+
+
+def _speed(run: Run, column: int, rotor: str) -> np.ndarray:
+    """A rotor's speed [rad/s], (n,): as measured, else as commanded."""
+    measured = run.measured.get(f"rpm_{rotor}")
+    if measured is None or np.isnan(measured).all():
+        return run.command[:, column]
+    return hold_last(measured) / RPM_PER_RAD_S
+
+
+def _mean(t: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Mean of a held signal over MEAN_TIME around each row, (n,)."""
+    area = np.concatenate([[0.0], np.cumsum(held[:-1] * np.diff(t))])
+    first = np.maximum(t - 0.5 * MEAN_TIME, t[0])
+    last = np.minimum(t + 0.5 * MEAN_TIME, t[-1])
+    return (np.interp(last, t, area) - np.interp(first, t, area)) / (last - first)

@@ -1,0 +1,382 @@
+"""Faults of real logs: each is planted into a sound flight, and what is left must be that flight's."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shared_flights import shared_flight
+
+import coax_env
+from coax_env.diagnosis.diagnose import diagnose
+from coax_env.diagnosis.hold_out import split
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.engine import Engine
+from coax_env.estimation.flown import flown_parts
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.estimation.prediction import replay_runs
+from coax_env.logs.flight import Flight, Run, read_flight
+from coax_env.logs.held import repeats
+from coax_env.logs.outliers import find_leaps
+from coax_env.model.vehicle_file import load_vehicle
+
+BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
+RUN = "hover"
+FIRST, RATE = 400, 100
+"""First row at fault, and rows per second of the bundled flight."""
+
+Table = dict[str, list[str]]
+"""Columns of a CSV, as text."""
+
+
+def edited(folder: Path, change: Callable[[Table], None], run: str = RUN) -> Flight:
+    """The bundled flight with one run's CSV changed cell by cell."""
+    shutil.copytree(BUNDLED, folder)
+    file = folder / f"{run}.csv"
+    header, *lines = (line.split(",") for line in file.read_text().splitlines())
+    table = {name: [line[k] for line in lines] for k, name in enumerate(header)}
+    change(table)
+    rows = zip(*table.values(), strict=True)
+    file.write_text("\n".join([",".join(table), *(",".join(row) for row in rows)]) + "\n")
+    return read_flight(folder)
+
+
+@cache
+def sound() -> Flight:
+    return read_flight(BUNDLED)
+
+
+def parts(flight: Flight) -> Flight:
+    return flown_parts(flight, load_vehicle(flight.vehicle).in_air(flight.air))
+
+
+def same_but(found: Run, expected: Run, missing: slice) -> None:
+    """Equal readings but for rows that are missing, and equal commands but there."""
+    rows = np.ones(expected.t.size, bool)
+    rows[missing] = False
+    np.testing.assert_array_equal(found.t, expected.t)
+    np.testing.assert_allclose(found.command[rows], expected.command[rows], rtol=1e-12)
+    for channel, values in expected.measured.items():
+        np.testing.assert_array_equal(found.measured[channel][rows], values[rows], channel)
+        assert np.isnan(found.measured[channel][missing]).all(), channel
+
+
+# --- a broken packet ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", [1, 4, 8])
+def test_a_broken_packet_is_missing(tmp_path, rows):
+    at = slice(FIRST, FIRST + rows)
+
+    def broken(table: Table) -> None:
+        table["rpm_upper_cmd"][at] = ["23512"] * rows
+        table["delta_lon"][at] = ["-4.6"] * rows
+        table["p"][at] = ["0.01"] * rows  # sound as a number, but it came in this packet
+
+    found, expected = edited(tmp_path / "f", broken).run(RUN), sound().run(RUN)
+    same_but(found, expected, at)
+    np.testing.assert_array_equal(found.command[at], np.tile(found.command[FIRST - 1], (rows, 1)))
+
+
+def test_a_broken_packet_is_counted(tmp_path):
+    def broken(table: Table) -> None:
+        table["delta_lat"][FIRST] = "5.0"
+
+    flight = edited(tmp_path / "f", broken)
+    assert flight.counts["rows of broken packets, nothing in them believed"] == 1
+
+
+@pytest.mark.parametrize(
+    ("column", "rows", "value"),
+    [("delta_lon", 100, "-4.6"), ("rpm_upper_cmd", 4, "4000"), ("delta_lat", 4, "0.2")],
+)
+def test_what_stays_or_can_be_flown_is_believed(tmp_path, column, rows, value):
+    """A second of it is no packet, and a sharp stick movement is one that the machine has seen."""
+
+    def step(table: Table) -> None:
+        table[column][FIRST : FIRST + rows] = [value] * rows
+
+    flight = edited(tmp_path / "f", step)
+    assert flight.counts == sound().counts
+    commands = flight.run(RUN).command[FIRST : FIRST + rows]
+    assert not np.allclose(commands, sound().run(RUN).command[FIRST : FIRST + rows])
+
+
+@pytest.mark.parametrize("rate", [100, 150, 400])
+@pytest.mark.parametrize(("channel", "nonsense"), [("theta", -4.6), ("q", 60.0), ("pn", 900.0)])
+def test_40_ms_of_nonsense_are_found_at_any_rate(rate, channel, nonsense):
+    rng = np.random.default_rng(rate)
+    t = np.arange(0.0, 10.0, 1.0 / rate)
+    y = 0.3 * np.sin(2.0 * t) + rng.normal(0.0, 0.01, t.size)
+    burst = (t > 4.0) & (t < 4.04)
+    spoilt = np.where(burst, nonsense, y)
+    if channel != "theta":  # whose whole turns are taken out
+        np.testing.assert_array_equal(find_leaps(channel, t, spoilt), burst)
+    assert find_leaps(channel, t, spoilt)[burst].all()
+    assert not find_leaps(channel, t, spoilt)[~burst].any()
+    assert not find_leaps(channel, t, y).any()
+    assert not find_leaps(channel, t, np.where(t > 4.0, nonsense, y)).any()
+
+
+@pytest.mark.needs_shared_flights
+@pytest.mark.parametrize("name", ["open_none", "open_near_ground", "open_rigging", "open_outside"])
+def test_no_sound_flight_is_repaired(name):
+    flight = read_flight(shared_flight(name))
+    assert flight.counts == {}
+    assert parts(flight) is flight
+
+
+# --- carried, landed, frozen ----------------------------------------------------------------------
+
+
+def test_a_carried_segment_with_frozen_commands_is_left_out(tmp_path):
+    commands = ("rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat")
+    rows = slice(FIRST, FIRST + 5 * RATE)
+
+    def carried(table: Table) -> None:
+        for column in commands:
+            table[column][rows] = [table[column][FIRST]] * (5 * RATE)
+        for k in range(5 * RATE):
+            if table["h"][FIRST + k]:
+                table["h"][FIRST + k] = f"{1.0 + 0.5 * np.sin(2.0 * k / RATE):.4f}"
+
+    flight = parts(edited(tmp_path / "f", carried))
+    first, second = (run for run in flight.runs if run.whole == RUN)
+    expected = sound().run(RUN)
+    assert (first.name, second.name) == (RUN, f"{RUN} (2)")
+    np.testing.assert_array_equal(first.t, expected.t[: FIRST + 1])
+    np.testing.assert_array_equal(second.t, expected.t[rows.stop :])
+    np.testing.assert_array_equal(second.measured["q"], expected.measured["q"][rows.stop :])
+    assert flight.counts["stretches left out: commands frozen"] == 1
+    assert any("4.0 to 9.0 s left out: commands frozen" in note for note in flight.notes)
+
+
+@pytest.mark.parametrize("speed", [0.0, 900.0])
+def test_standing_on_the_ground_is_left_out(tmp_path, speed):
+    """Motors off, or at idle, with a second in which they run up: half a second is not flown yet."""
+    rows = slice(0, FIRST)
+
+    def landed(table: Table) -> None:
+        rng = np.random.default_rng(0)
+        for column in ("rpm_upper_cmd", "rpm_lower_cmd", "rpm_upper", "rpm_lower"):
+            top = float(table[column][FIRST])
+            rise = np.clip((np.arange(FIRST) - FIRST + RATE) / RATE, 0.0, 1.0)
+            idle = speed + (top - speed) * rise + rng.uniform(0.0, 5.0, FIRST)
+            table[column][rows] = [f"{x:.1f}" for x in idle]
+
+    flight = parts(edited(tmp_path / "f", landed))
+    (only,) = (run for run in flight.runs if run.whole == RUN)
+    assert only.name == RUN
+    assert 3.8 < only.t[0] < 4.3 and only.t[-1] == sound().run(RUN).t[-1]
+    assert only.beginning == 0.0
+    assert record_of(only).origin == 0.0
+    assert flight.counts["stretches left out: rotors too slow to fly"] == 1
+
+
+def test_another_machines_speeds_are_no_landing():
+    """A vehicle that its rotors never carry is the wrong one: nothing is cut away to hide that."""
+    heavy = load_vehicle("lama400d").with_values({"mass": 5.0})
+    assert flown_parts(sound(), heavy) is sound()
+
+
+def test_commands_that_seldom_change_are_not_frozen():
+    """A doublet flown open loop: its commands stand still for seconds because that is the maneuver."""
+    t = np.arange(0.0, 12.0, 0.01)
+    run = sound().run(RUN)
+    command = np.tile(run.command[0], (t.size, 1))
+    for start, size in ((3.0, 0.1), (3.5, -0.1), (9.0, 0.05)):
+        command[(t >= start) & (t < start + 0.5), 2] += size
+    steps = replace(run, t=t, command=command, measured={"q": np.zeros(t.size)})
+    flight = replace(sound(), runs=(steps,))
+    assert flown_parts(flight, load_vehicle(flight.vehicle)) is flight
+
+
+# --- held samples ---------------------------------------------------------------------------------
+
+
+def test_forward_filled_columns_become_what_they_were(tmp_path):
+    """The compass at 50 Hz and the sonar at 20 Hz, their blanks filled with the reading before."""
+
+    def filled(table: Table) -> None:
+        for column in ("psi", "h", "vn"):
+            for k in range(1, len(table[column])):
+                table[column][k] = table[column][k] or table[column][k - 1]
+
+    found, expected = edited(tmp_path / "f", filled).run(RUN), sound().run(RUN)
+    for channel in ("psi", "h", "vn"):
+        new = np.isfinite(found.measured[channel])
+        known = np.isfinite(expected.measured[channel])
+        assert np.count_nonzero(new & ~known) <= 0.02 * known.sum(), channel
+        assert np.count_nonzero(known & ~new) <= 0.05 * known.sum(), channel
+
+
+def test_a_coarse_or_quiet_sensor_is_not_held():
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, 20.0, 0.01)
+    ramp = np.round(0.25 * t, 2)  # a centimetre every four rows
+    rest = np.where(t < 10.0, 0.5, np.round(0.5 + 0.3 * np.sin(t), 2))
+    dithered = np.round(0.3 * np.sin(t) + rng.normal(0.0, 0.006, t.size), 2)
+    for values in (ramp, rest, dithered, np.full(t.size, 0.3), rng.normal(0.0, 1.0, t.size)):
+        assert not repeats(values).any()
+    assert repeats(ramp, hold=True).sum() == t.size - np.unique(ramp).size
+
+
+def test_the_card_forces_and_forbids():
+    rng = np.random.default_rng(4)
+    held = np.repeat(rng.normal(0.0, 1.0, 400), 5)
+    new = np.zeros(held.size, bool)
+    new[::5] = True
+    np.testing.assert_array_equal(repeats(held), ~new)
+    assert not repeats(held, hold=False).any()
+    np.testing.assert_array_equal(repeats(held, hold=True), ~new)
+
+
+def test_a_sensor_that_froze_for_a_while_reads_nothing_there():
+    values = np.random.default_rng(5).normal(0.0, 1.0, 2000)
+    values[700:760] = values[700]
+    found = repeats(values)
+    assert found[701:760].all() and found.sum() == 59
+
+
+def test_the_card_says_hold(tmp_path):
+    shutil.copytree(BUNDLED, tmp_path / "f")
+    card = tmp_path / "f" / "card.toml"
+    text = card.read_text()
+    card.write_text(text.replace("[[run]]", '[columns]\np = { hold = "yes" }\n[[run]]', 1))
+    with pytest.raises(coax_env.errors.InputError, match=r"p hold should be true or false"):
+        read_flight(tmp_path / "f")
+    card.write_text(text.replace("[[run]]", "[columns]\np = { hold = true }\n[[run]]", 1))
+    read_flight(tmp_path / "f")
+
+
+# --- gaps -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("blank", [False, True])
+def test_a_gap_cuts_the_run(tmp_path, blank):
+    """1.3 s of rows that are not there, or that hold nothing but their time."""
+    gone = range(FIRST, FIRST + 130)
+
+    def gap(table: Table) -> None:
+        for column in list(table):
+            if not blank:
+                table[column] = [x for k, x in enumerate(table[column]) if k not in gone]
+            elif column != "t":
+                table[column] = ["" if k in gone else x for k, x in enumerate(table[column])]
+
+    flight = parts(edited(tmp_path / "f", gap))
+    first, second = (run for run in flight.runs if run.whole == RUN)
+    expected = sound().run(RUN)
+    np.testing.assert_array_equal(first.t, expected.t[:FIRST])
+    np.testing.assert_array_equal(second.t, expected.t[gone.stop :])
+    np.testing.assert_allclose(second.command, expected.command[gone.stop :], rtol=1e-12)
+    assert second.beginning == expected.t[0]
+    assert flight.counts["gaps at which a run is cut"] == 1
+
+
+def test_a_short_gap_is_bridged_and_a_short_part_is_left_out():
+    run = sound().run(RUN)
+
+    def without(*gone: range) -> Flight:
+        rows = [k for k in range(run.t.size) if not any(k in g for g in gone)]
+        shorter = replace(
+            run, t=run.t[rows], command=run.command[rows],
+            measured={c: v[rows] for c, v in run.measured.items()},
+        )  # fmt: skip
+        return parts(replace(sound(), runs=(shorter,)))
+
+    assert len(without(range(400, 420)).runs) == 1
+    cut = without(range(400, 450), range(600, 650))
+    assert [r.name for r in cut.runs] == [RUN, f"{RUN} (2)"]
+    assert cut.counts["parts of less than 2 s left out"] == 1
+
+
+def test_parts_are_held_out_and_flown_again_as_one_run():
+    vehicle = load_vehicle("lama400d")
+    flight = sound().select(["hover", "lon_doublet"])
+    halves = []
+    for run in flight.runs:
+        for rows, name in ((slice(0, 500), run.name), (slice(560, 1200), f"{run.name} (2)")):
+            halves.append(
+                replace(
+                    run,
+                    name=name,
+                    part_of=run.name,
+                    t=run.t[rows],
+                    command=run.command[rows],
+                    measured={c: v[rows] for c, v in run.measured.items()},
+                    began=float(run.t[0]),
+                )
+            )
+    cut = replace(flight, runs=tuple(halves))
+    model, records = HeliModel(vehicle), [record_of(run) for run in cut.runs]
+    noise = starting_noise(cut, vehicle)
+    used, held = split(model, records, noise, ["hover"], (), SETTINGS)
+    assert [r.name for r in used] == ["lon_doublet", "lon_doublet (2)"]
+    assert [r.name for r in held] == ["hover", "hover (2)"]
+    (joined,) = replay_runs(Engine(model, held), model.bare_values, noise)
+    single = [replay_runs(Engine(model, [r]), model.bare_values, noise)[0] for r in held]
+    assert joined.name == "hover"
+    for channel, replayed in joined.channels.items():
+        error = np.concatenate([one.channels[channel].error for one in single])
+        np.testing.assert_array_equal(replayed.error, error)
+
+
+def test_a_start_before_a_gap_is_no_full_horizon():
+    """What is compared at the horizon's end is measured there, within 0.15 s."""
+    run = sound().run("lon_doublet")
+    rows = np.r_[0:500, 520:1200]
+    gapped = replace(
+        run, t=run.t[rows], command=run.command[rows],
+        measured={c: v[rows] for c, v in run.measured.items()},
+    )  # fmt: skip
+    vehicle = load_vehicle("lama400d")
+    model = HeliModel(vehicle)
+    noise = starting_noise(replace(sound(), runs=(gapped,)), vehicle)
+    (replayed,) = replay_runs(Engine(model, [record_of(gapped)]), model.bare_values, noise, 1.0)
+    q = replayed.channels["q"]
+    starts = np.arange(gapped.t[0] + 1.0, gapped.t[-1] - 1.0 + 1e-9, 0.25)
+    seen = np.isfinite(q.t)
+    began = gapped.t[np.unique(np.searchsorted(gapped.t, starts - 1e-6))]
+    assert (q.t[seen] >= began[seen] + 1.0 - 0.15 - 1e-6).all()
+    assert not seen.all()
+
+
+# --- the diagnosis is not blind -------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["packet", "carried"])
+def test_the_causes_are_those_of_the_sound_flight(tmp_path, fault):
+    """Four causes are hidden in the bundled flight; all are named still."""
+    rows = slice(FIRST, FIRST + 5 * RATE)
+
+    def packet(table: Table) -> None:
+        table["rpm_upper_cmd"][FIRST : FIRST + 4] = ["23512"] * 4
+        table["delta_lat"][FIRST : FIRST + 4] = ["-4.6"] * 4
+
+    def carried(table: Table) -> None:
+        for column in ("rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat"):
+            table[column][rows] = [table[column][FIRST]] * (5 * RATE)
+        for k in range(rows.start, rows.stop):
+            if table["vn"][k]:
+                table["vn"][k] = f"{float(table['vn'][k]) + 3.0 * np.sin(0.01 * k):.4f}"
+
+    flight = edited(tmp_path / "f", {"packet": packet, "carried": carried}[fault], "side_run")
+    expected = {c["effect"] for c in diagnose(BUNDLED).findings["causes"]}
+    assert {c["effect"] for c in diagnose(flight).findings["causes"]} == expected
+
+
+@pytest.mark.slow
+@pytest.mark.needs_shared_flights
+def test_the_second_coax_is_read_cut_and_diagnosed():
+    """25 Hz, 21 gaps, one of 1.3 s, which cuts its run in two."""
+    result = diagnose(shared_flight("skybotix_second"), hold_out=["4x5ft_1"])
+    assert result.findings["gain"]["held_out"] == ["4x5ft_1"]
+    names = [run.name for run in result.flight.runs]
+    assert names == ["4x5ft_1", "4x5ft_1 (2)", "4x5ft_2", "15ft_1", "15ft_2"]
+    assert "4x5ft_1: cut at a gap of 1.29 s, 20.3 s" in result.remarks

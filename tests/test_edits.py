@@ -1,0 +1,181 @@
+"""Edits of logs, whose truth is known: what they do to a log, and that a difference finds just that."""
+
+import importlib
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shared_flights import shared_flight
+
+import coax_env
+from coax_env.diagnosis.changes import Before, changes, coordinates, effective, moved
+from coax_env.diagnosis.fits import start
+from coax_env.diagnosis.problem import Problem
+from coax_env.errors import InputError
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.logs.edits import EDITS, LAT, LON, edited
+from coax_env.logs.flight import Flight, read_flight, write_flight
+from coax_env.model.vehicle_file import load_vehicle
+
+BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
+RUNS = ("lon_3211", "lat_3211")
+
+
+@cache
+def flight() -> Flight:
+    return read_flight(BUNDLED).select(RUNS)
+
+
+# --- what an edit does to a log -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_an_edit_changes_what_it_says_and_nothing_else(name):
+    rotors, swash = {"upper", "lower"}, {"lon", "lat"}
+    touched = {
+        "phase": swash, "delay": swash, "command_delay": rotors | swash, "offset_lon": {"lon"},
+        "offset_lat": {"lat"}, "gain": swash, "rotor_scale": rotors, "h_scale": {"h"},
+        "p_bias": {"p"}, "q_bias": {"q"}, "r_bias": {"r"},
+    }.get(name, {name})  # fmt: skip
+    size = 1.1 if EDITS[name].unit == "1" else 0.05
+    for before, after in zip(flight().runs, edited(flight(), {name: size}).runs, strict=True):
+        columns = dict(zip(("upper", "lower", "lon", "lat"), before.command.T, strict=True))
+        changed = dict(zip(columns, after.command.T, strict=True))
+        columns |= before.measured
+        changed |= after.measured
+        assert {c for c in columns if not np.array_equal(columns[c], changed[c], True)} == touched
+        np.testing.assert_array_equal(before.t, after.t)
+
+
+def test_a_phase_turns_and_a_gain_stretches():
+    (run, *_) = flight().runs
+    (turned, *_) = edited(flight(), {"phase": 0.15}).runs
+    both = run.command[:, LON] + 1j * run.command[:, LAT]
+    np.testing.assert_allclose(
+        turned.command[:, LON] + 1j * turned.command[:, LAT], both * np.exp(0.15j), atol=1e-15
+    )
+    (stretched, *_) = edited(flight(), {"gain": 1.25}).runs
+    np.testing.assert_allclose(stretched.command[:, LON:], 1.25 * run.command[:, LON:])
+
+
+def test_a_shift_keeps_the_integral_of_the_command():
+    """Logged sooner by whole rows, a command is its later rows; in between it is their mean."""
+    (run, *_) = flight().runs
+    (rows, *_) = edited(flight(), {"delay": 0.03}).runs
+    np.testing.assert_allclose(rows.command[:-3, LON], run.command[3:, LON], atol=1e-12)
+    (half, *_) = edited(flight(), {"delay": 0.035}).runs
+    between = 0.5 * (run.command[3:-1, LON] + run.command[4:, LON])
+    np.testing.assert_allclose(half.command[:-4, LON], between, atol=1e-12)
+
+
+def test_from_a_moment_on():
+    first, second = flight().runs
+    one, other = edited(flight(), {"theta": 0.03}, (RUNS[1], 6.0)).runs
+    assert one is first
+    late = other.t >= 6.0
+    known = np.isfinite(second.measured["theta"])
+    apart = (other.measured["theta"] - second.measured["theta"])[known]
+    np.testing.assert_allclose(apart, np.where(late[known], 0.03, 0.0), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("edits", "since", "words"),
+    [
+        ({"phse": 0.1}, None, "no edit 'phse'; there are phase"),
+        ({"gain": 0.0}, None, "gain is a factor and should be positive"),
+        ({"theta": 0.1}, ("no", 1.0), "no run 'no'"),
+    ],
+)
+def test_what_cannot_be_edited(edits, since, words):
+    with pytest.raises(InputError, match=words):
+        edited(flight(), edits, since)
+
+
+def test_an_edited_log_is_a_flight_of_its_own(tmp_path):
+    write_flight(edited(flight(), {"gain": 1.25, "theta": 0.03}), tmp_path / "f")
+    for before, after in zip(flight().runs, read_flight(tmp_path / "f").runs, strict=True):
+        np.testing.assert_allclose(after.command[:, LON:], 1.25 * before.command[:, LON:])
+        np.testing.assert_allclose(
+            after.measured["theta"], before.measured["theta"] + 0.03, atol=1e-9
+        )
+
+
+# --- what a difference finds ----------------------------------------------------------------------
+
+
+@cache
+def before() -> Before:
+    """The bare model of two runs that wind, drag and lags shook: none of which it has."""
+    vehicle = load_vehicle("lama400d").in_air(flight().air)
+    candidates = ("swash_phase", "swash_gain", "servo_lag", "cg_offset", "attitude_bias")
+    records = [record_of(run) for run in flight().runs]
+    problem = Problem.of(HeliModel(vehicle), records, candidates)
+    return Before.of(problem, start(problem, starting_noise(flight(), vehicle)))
+
+
+def difference(edits: dict[str, float]) -> dict[str, dict[str, tuple[float, float]]]:
+    """Effect -> number -> (change, std)."""
+    found = changes(before(), [record_of(run) for run in edited(flight(), edits).runs])
+    return {
+        c.effect: {name: (p.change, p.std) for name, p in c.parameters.items()}
+        for c in found.changes
+    }
+
+
+def test_the_same_log_has_not_changed():
+    assert difference({}) == {}
+
+
+def test_an_edit_is_found_at_its_size_by_a_model_that_lacks_much():
+    found = difference({"gain": 1.25})
+    assert list(found) == ["swash_gain"]
+    change, std = found["swash_gain"]["swash_gain.scale"]
+    assert abs(change - (1.0 / 1.25 - 1.0)) < 2.0 * std < 0.02
+
+
+def test_two_edits_are_two_changes():
+    found = difference({"phase": 0.15, "theta": 0.03})
+    assert set(found) == {"swash_phase", "attitude_bias"}
+    for name, size in (("swash_phase.angle", -0.15), ("attitude_bias.y", 0.03)):
+        change, std = found[name.partition(".")[0]][name]
+        assert abs(change - size) < 3.0 * std < 0.2 * abs(size), name
+
+
+def test_logs_of_two_flights_are_refused():
+    with pytest.raises(InputError, match="not two logs of one flight"):
+        changes(before(), [record_of(run) for run in flight().runs[:1]])
+
+
+def test_a_linkage_gain_is_one_number_wherever_a_fit_put_it():
+    """Half in the base parameter, half in the effect: the same machine, the same number."""
+    problem = before().problem
+    file = problem.model.bare_values
+    base = {**file, "swash_to_flap": 1.2 * file["swash_to_flap"], "swash_gain.scale": 0.0}
+    own = {**file, "swash_gain.scale": 0.2}
+    for values in (base, own):
+        assert effective(problem, values, "swash_gain")["swash_gain.scale"] == pytest.approx(0.2)
+        after = moved(values, {"swash_gain.scale": -0.2})
+        assert effective(problem, after, "swash_gain")["swash_gain.scale"] == pytest.approx(-0.04)
+
+
+def test_a_number_moves_within_what_physics_gives():
+    """A lag of nothing cannot become less, and a derivative is taken on the side that there is."""
+    of_lag = [c for c in coordinates(before().problem, before().fit) if c.effect == "servo_lag"]
+    assert [(c.lower, c.step > 0.0) for c in of_lag] == [(0.0, True)]
+
+
+@pytest.mark.slow
+@pytest.mark.needs_shared_flights
+@pytest.mark.parametrize("name", ["skybotix_coax", "skybotix_second"])
+def test_edits_of_real_logs(name):
+    """Six edits of each: all at their size, by the effect's own name, and nothing else changed."""
+    script = importlib.import_module("check_edits")
+    rows = script.check(shared_flight(name), None, script.STANDARD, lambda text: None)
+    assert [row["edit"] for row in rows] == list(script.STANDARD)
+    for row in rows:
+        assert row["found"] and row["named"] == row["effect"], row
+        assert not row["else"], row
+        largest = max(abs(p["planted"]) for p in row["parameters"].values())
+        assert all(p["std"] < 0.5 * largest for p in row["parameters"].values()), row

@@ -1,0 +1,98 @@
+"""Effects of sensors and body that the injector hides in other form: found, and nothing beside them."""
+
+import injector
+import numpy as np
+import pytest
+from causes import check_causes, say_what_was_found, truth_of
+from injector_sensors import NOISE, POSE, Sensors
+
+from coax_env import diagnose, load_vehicle
+from coax_env.diagnosis.diagnose import namable
+from coax_env.logs.flight import Flight, Run
+from coax_env.model import effects
+
+LAMA = load_vehicle("lama400d")
+
+# --- what may be named ------------------------------------------------------------------------------
+
+POSITION = {"pose_delay", "marker_offset", "frame_yaw", "position_spring"}
+SONAR = {"sonar_tilt", "sonar_scale", "sonar_delay"}
+
+
+def flight_with(channels: str, turn: float = 0.0) -> Flight:
+    """Two runs with these channels aboard; the second one's heading covers a turn."""
+    t = np.arange(0.0, 3.0, 0.01)
+    measured = {c: np.zeros(t.size) for c in channels.split()}
+    turned = {c: turn * t / t[-1] if c == "psi" else x for c, x in measured.items()}
+    runs = [Run(n, t, np.zeros((t.size, 4)), m) for n, m in (("a", measured), ("b", turned))]
+    return Flight("lama400d", tuple(runs))
+
+
+@pytest.mark.parametrize(
+    ("channels", "absent"),
+    [
+        ("p q r phi theta psi h", POSITION),
+        ("phi theta psi pn pe h", SONAR | {"attitude_delay", "magnetic_field"}),
+        ("p q r phi theta psi pn pe h", SONAR),
+    ],
+)
+def test_only_what_a_sensor_shows_may_be_named(channels, absent):
+    """Of attitude and pose that come late, one; of the compass, none where cameras see the heading."""
+    named = set(namable((), LAMA, flight_with(channels, turn=4.0)))
+    assert set(effects.CATALOGUE) - named == absent | {"vibration"}
+
+
+def test_a_compass_is_judged_where_the_heading_turns():
+    for turn, may in ((0.0, False), (1.4, False), (1.8, True), (40.0, True), (-1.8, True)):
+        found = namable((), LAMA, flight_with("p psi", turn))
+        assert ("magnetic_field" in found) == may, turn
+
+
+# --- recovered --------------------------------------------------------------------------------------
+
+TRACKED = Sensors(NOISE | POSE, formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"))
+"""Table V's gyros and accelerometers, and a motion capture."""
+ON_AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "heading_turn")
+FAST = ("lon_3211", "lat_3211", "forward_run", "side_run", "heading_turn", "yaw_3211")
+
+HIDDEN = {
+    "late attitude": ({"attitude_delay": {}}, "full", ON_AXES),
+    "gyro scale": ({"gyro_scale": {}}, "full", ON_AXES),
+    "compass": ({"magnetic_field": {}}, "full", ON_AXES),
+    "markers' axes, gyros aboard": ({"frame_yaw": {}}, "tracked", ON_AXES),
+    "markers beside the centre of gravity": ({"marker_offset": {}}, "pose", ON_AXES),
+    "tether": ({"position_spring": {}}, "tracked", FAST),
+    "upper blow-back": ({"upper_blowback": {}}, "full", FAST),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", HIDDEN)
+def test_a_sensor_or_body_effect_is_named_alone(tmp_path, monkeypatch, case):
+    hidden, sensors, runs = HIDDEN[case]
+    monkeypatch.setitem(injector.SENSORS, "tracked", TRACKED)
+    folder = injector.fly(tmp_path / "f", hidden, sensors=sensors, runs=runs, seed=21)
+    truth = truth_of(folder)
+    (folder / "truth.json").unlink()
+    check_causes(diagnose(folder, hold_out=[]).findings, *truth)
+
+
+@pytest.mark.slow
+def test_the_bodys_own_gyroscopic_moment_misleads_nobody(tmp_path):
+    """Every real body has it; flown gently it does not show, and no other effect is blamed."""
+    folder = injector.fly(tmp_path / "f", {"gyroscopic_coupling": {}}, runs=FAST, seed=21)
+    (folder / "truth.json").unlink()
+    assert diagnose(folder, hold_out=[]).findings["verdict"] == "consistent"
+
+
+@pytest.mark.slow
+def test_two_names_of_one_column_are_both_said(tmp_path):
+    """A pose alone cannot tell turned markers from a turned swash plate: whichever is named."""
+    folder = injector.fly(tmp_path / "f", {"frame_yaw": {}}, sensors="pose", runs=ON_AXES, seed=21)
+    (folder / "truth.json").unlink()
+    findings = diagnose(folder, hold_out=[]).findings
+    (cause,) = findings["causes"]
+    both = {"frame_yaw", "swash_phase"}
+    assert both <= {cause["effect"], *cause["confusable_with"]}, say_what_was_found(findings)
+    (number,) = cause["parameters"].values()
+    assert abs(number["value"] - 0.15) < 3.0 * number["std"] + 0.005

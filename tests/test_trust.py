@@ -1,0 +1,293 @@
+"""When may a name be believed? Parts of the flights, on likelihoods whose truth is known.
+
+The likelihoods are exactly quadratic: linear regressions with white noise, drawn here, run by run. What
+a cause of given evidence does on a part of them is then a matter of the normal distribution.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import binom, norm
+
+from coax_env.diagnosis import moves
+from coax_env.diagnosis.hold_out import fair_part
+from coax_env.diagnosis.moves import Proposal, accepted
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.replication import Asked, Replication, halves_of, replications
+from coax_env.diagnosis.scores import lost
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.diagnosis.trust import beside_large_axes, determined, of_line, on_parts
+from coax_env.diagnosis.vibration import Line
+from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.quadratic import Linearised, Quadratic
+from coax_env.estimation.state_space import FreeParameter, Noise
+from coax_env.model.vehicle_file import load_vehicle
+
+NAMES = ("axial_damping.coefficient", "rotor_drag.coefficient", "flap_blowback.gain")
+EFFECTS = tuple(name.partition(".")[0] for name in NAMES)
+WIDE = 1e3  # prior std: the data alone speak
+LAMA = load_vehicle("lama400d")
+
+
+def problem_of(runs: int) -> Problem:
+    """Effects with one number each on runs that were never flown."""
+    free = [FreeParameter(name, 0.0, WIDE) for name in NAMES]
+    engine = SimpleNamespace(records=[SimpleNamespace(name=f"run {i}") for i in range(runs)])
+    model = SimpleNamespace(bare_values={})
+    base = (FreeParameter("mass", 0.0, WIDE),)
+    own = {effect: (f,) for effect, f in zip(EFFECTS, free, strict=True)}
+    return Problem(model, engine, base, own)  # type: ignore[arg-type]
+
+
+def fitted_to(
+    problem: Problem, designs: Sequence[np.ndarray], y: Sequence[np.ndarray], active: Sequence[str]
+) -> tuple[Fit, Quadratic, dict[str, float]]:
+    """A regression of y (n,) on columns (n, 4) run by run: the fit, its quadratic, the evidence."""
+    parameters = problem.parameters
+    at = dict.fromkeys((f.name for f in parameters), 0.0)
+
+    def about() -> Quadratic:
+        here = np.array([at[f.name] for f in parameters])
+        left = [X @ here - target for X, target in zip(designs, y, strict=True)]
+        lin = Linearised(
+            tuple(at),
+            np.array([X.T @ X for X in designs]),
+            np.array([X.T @ e for X, e in zip(designs, left, strict=True)]),
+            np.zeros((len(designs), len(at), 1)),
+            np.array([e @ X for X, e in zip(designs, left, strict=True)]),
+        )  # fmt: skip
+        return Quadratic.of(lin, parameters, at)
+
+    _, move = about().best(problem.free_names(active))
+    at = about().moved(move)
+    quadratic = about()
+    fit = Fit(tuple(active), at, Noise({}))
+    return fit, quadratic, {e: lost(problem, quadratic, active, e) for e in active}
+
+
+def drawn(
+    rng: np.random.Generator, sizes: Sequence[float], shown: Sequence[float], runs: int = 8
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Runs of 100 readings in white noise: the first effect's size and its column's size, by run."""
+    designs, y = [], []
+    for i in range(runs):
+        X = rng.standard_normal((100, 1 + len(NAMES)))
+        X[:, 1] *= shown[i]
+        designs.append(X)
+        y.append(sizes[i] * X[:, 1] + rng.standard_normal(100))
+    return designs, y
+
+
+def asked_again(
+    nats: float, made_by: Callable[[int], float], shown: Callable[[int], float], seed: int
+) -> Replication | None:
+    """How a name fares whose evidence was to be `nats`; None where it came out under the threshold."""
+    runs = 8
+    rng = np.random.default_rng(seed)
+    columns = [shown(i) for i in range(runs)]
+    made = np.array([made_by(i) for i in range(runs)])
+    power = sum(100.0 * c**2 * m for c, m in zip(columns, made, strict=True))
+    known = sum(100.0 * c**2 for c in columns)
+    size = math.sqrt(2.0 * nats * known) / power  # so that the pooled estimate is worth that
+    problem = problem_of(runs)
+    designs, y = drawn(rng, list(size * made), columns, runs)
+    fit, quadratic, worth = fitted_to(problem, designs, y, EFFECTS[:1])
+    if worth[EFFECTS[0]] < SETTINGS.evidence:
+        return None
+    return replications(problem, fit, quadratic, worth)[EFFECTS[0]]
+
+
+def believed(replication: Replication) -> bool:
+    return not list(on_parts(replication, 8, SETTINGS))
+
+
+def test_a_cause_in_all_runs_returns():
+    found = [asked_again(22.0, lambda i: 1.0, lambda i: 1.0, seed) for seed in range(40)]
+    judged = [believed(r) for r in found if r]
+    assert len(judged) > 25 and np.mean(judged) > 0.94
+    strong = asked_again(80.0, lambda i: 1.0, lambda i: 1.0, 0)
+    assert strong == Replication(1.0, 1.0, ())
+
+
+def test_what_one_run_made_does_not():
+    """All runs could show it, one alone does: half of the halves have it."""
+    found = [asked_again(30.0, lambda i: float(i == 3), lambda i: 1.0, seed) for seed in range(40)]
+    judged = [r for r in found if r]
+    assert len(judged) > 25
+    assert np.mean([believed(r) for r in judged]) < 0.05
+    assert all(r.rests_on == ("run 3",) for r in judged if len(r.rests_on) == 1)
+    assert np.mean([r.kept for r in judged]) == pytest.approx(0.5, abs=0.12)
+
+
+def test_what_one_run_alone_can_show_is_not_held_against_it():
+    """Ground effect in the only low run: a half without that run is not asked."""
+    low = lambda i: 1.0 if i == 5 else 0.0  # noqa: E731
+    replication = asked_again(60.0, lambda i: 1.0, low, 1)
+    assert replication == Replication(7 / 8, 1.0, ("run 5",))
+    assert believed(replication)
+    assert list(on_parts(Replication(0.5, 1.0, ("sine",)), 2, SETTINGS)) == [
+        "it rests on sine alone"
+    ]
+
+
+def test_a_name_that_another_explains_better_on_a_part_has_not_returned():
+    """Two columns nearly alike on four runs; on the four others the second alone explains."""
+    rng = np.random.default_rng(3)
+    problem = problem_of(8)
+    designs, y = [], []
+    for i in range(8):
+        X = rng.standard_normal((100, 4))
+        if i < 4:
+            X[:, 1] = X[:, 2] + 0.02 * rng.standard_normal(100)
+        designs.append(X)
+        y.append(1.0 * X[:, 2] + rng.standard_normal(100))
+    wrong = fitted_to(problem, designs, y, EFFECTS[:1])
+    right = fitted_to(problem, designs, y, EFFECTS[1:2])
+    assert replications(problem, *wrong)[EFFECTS[0]].kept < 0.2
+    assert replications(problem, *right)[EFFECTS[1]].kept == 1.0
+
+
+def test_what_changes_its_sign_has_not_returned():
+    """Half of the runs say plus, as the whole does, and half nearly as much minus: no return."""
+    rng = np.random.default_rng(4)
+    problem = problem_of(8)
+    designs, y = drawn(rng, [2.0] * 4 + [-1.6] * 4, [1.0] * 8)
+    fit, quadratic, worth = fitted_to(problem, designs, y, EFFECTS[:1])
+    assert worth[EFFECTS[0]] > SETTINGS.evidence
+    assert not believed(replications(problem, fit, quadratic, worth)[EFFECTS[0]])
+
+
+# --- what is asked ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.5, 0.7, 0.9])
+def test_a_cause_at_the_threshold_returns_in_95_of_100(share):
+    """Its z on a part, given the whole, is normal: mean sqrt(s) z, std sqrt(1 - s)."""
+    asked = Asked(share, 1.0, SETTINGS.evidence, SETTINGS)
+    z = math.sqrt(2.0 * SETTINGS.evidence)
+    least = math.sqrt(2.0 * asked.needed)
+    passed = norm.sf(least, math.sqrt(share) * z, math.sqrt(1.0 - share))
+    assert passed == pytest.approx(0.95, abs=1e-3)
+    assert asked.can_tell and norm.sf(least) < 0.025
+
+
+def test_the_whole_must_be_worth_the_threshold_and_a_tenth_cannot_tell():
+    assert Asked(1.0, 1.0, 14.0, SETTINGS).needed == pytest.approx(SETTINGS.evidence)
+    assert not Asked(0.1, 1.0, 14.0, SETTINGS).can_tell
+    assert Asked(0.1, 1.0, 200.0, SETTINGS).can_tell
+
+
+def test_the_halves_that_are_asked_for_are_those_that_chance_allows():
+    """20 halves: a cause at the threshold fails them once in 400; half of them is not enough."""
+    needed = math.ceil(SETTINGS.least_kept * 2 * SETTINGS.splits)
+    assert binom.cdf(needed - 1, 2 * SETTINGS.splits, 0.95) < 1 / 350
+    assert 0.5 < SETTINGS.least_kept < 0.95
+
+
+@pytest.mark.parametrize("groups", [[range(9)], [range(4)], [range(5), range(5, 12)]])
+def test_halves_are_halves(groups):
+    every = sorted(i for group in groups for i in group)
+    halves = list(halves_of(groups, 10))
+    assert 0 < len(halves) <= 20 and len(halves) % 2 == 0
+    for first, second in zip(halves[::2], halves[1::2], strict=True):
+        assert sorted((*first, *second)) == every
+        for group in groups:
+            assert abs(len(set(first) & set(group)) - len(group) / 2) <= 0.5
+
+
+# --- a vibration --------------------------------------------------------------------------------------
+
+
+def line_of(ratios: dict[str, list[float]]) -> Line:
+    every = [r for own in ratios.values() for r in own]
+    F = float(np.mean(every))
+    nats = len(every) * (F - 1.0 - math.log(F))
+    return Line("upper", 0.3, 0.01, nats, ("ax",), ratios)
+
+
+def test_a_line_in_every_run_is_sure_and_one_of_a_single_run_is_not():
+    rng = np.random.default_rng(0)
+    runs = [f"run {i}" for i in range(6)]
+    everywhere = line_of({run: rng.exponential(2.5, 30).tolist() for run in runs})
+    assert of_line(everywhere).word == "sure"
+    once = line_of(
+        {r: rng.exponential(12.0 if r == "run 2" else 1.0, 30).tolist() for r in runs[:3]}
+    )
+    assert of_line(once).doubts == ("it rests on run 2 alone",)
+
+
+# --- numbers ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("told", "known"), [(0.5, False), (0.9, False), (1.2, True), (50.0, True)])
+def test_a_number_is_determined_where_the_flights_say_more_than_the_prior(told, known):
+    """The data's information as a multiple of the prior's; coloured noise takes from it."""
+    problem = replace(
+        problem_of(1), own={EFFECTS[0]: (FreeParameter(NAMES[0], 0.0, 0.1),)}, base=()
+    )
+    X = np.full((1, 1), math.sqrt(told) / 0.1)
+    lin = Linearised(
+        NAMES[:1], (X.T @ X)[None], np.zeros((1, 1)), np.zeros((1, 1, 1)), np.zeros((4, 1))
+    )
+    values = {NAMES[0]: 0.1}
+    fit = Fit(EFFECTS[:1], values, Noise({}))
+    quadratic = Quadratic.of(lin, problem.parameters, values)
+    assert determined(problem, fit, quadratic, EFFECTS[0], 1.0) == {NAMES[0]: known}
+    assert determined(problem, fit, quadratic, EFFECTS[0], 1e4) == {NAMES[0]: False}
+
+
+def test_beside_a_large_axis_the_others_are_as_wide():
+    model = HeliModel(LAMA)
+    own = {e: tuple(model.effect_parameters(e)) for e in ("gyro_bias", "ground_effect")}
+    usual = {f.name: f.std for group in own.values() for f in group}
+    problem = replace(problem_of(1), own=own)
+    values = {f.name: f.value for group in own.values() for f in group}
+    values["gyro_bias.x"] = 4.0 * usual["gyro_bias.x"]
+    wider = beside_large_axes(problem, Fit(tuple(own), values, Noise({})))
+    for f in (*wider.own["gyro_bias"], *wider.own["ground_effect"]):
+        factor = 4.0 if f.name.startswith("gyro_bias") else 1.0
+        assert f.std == pytest.approx(factor * usual[f.name]), f.name
+    values["gyro_bias.x"] = 2.0 * usual["gyro_bias.x"]
+    same = beside_large_axes(problem, Fit(tuple(own), values, Noise({})))
+    assert same.own == problem.own
+
+
+# --- the hold-out -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("runs", [4, 12, 48, 200])
+def test_the_hold_out_is_fair_quick_and_no_more_than_a_third_of_the_time(runs):
+    """Random excitation: every column's held share is near a quarter, however many runs there are."""
+    rng = np.random.default_rng(runs)
+    shares = rng.gamma(2.0, 1.0, (runs, 40))
+    shares /= shares.sum(0)
+    seconds = rng.uniform(5.0, 30.0, runs)
+    chosen = fair_part(shares, np.ones(40), seconds / seconds.sum())
+    assert chosen and len(set(chosen)) == len(chosen)
+    assert seconds[chosen].sum() <= seconds.sum() / 3.0
+    if runs >= 48:
+        assert shares[chosen].sum(0).mean() == pytest.approx(0.25, abs=0.04)
+
+
+def test_what_two_runs_alone_show_is_neither_lost_nor_unseen():
+    shares = np.full((8, 2), 1 / 8)
+    shares[:, 1] = [0.5, 0.5, 0, 0, 0, 0, 0, 0]
+    chosen = fair_part(shares, np.ones(2), np.full(8, 1 / 8))
+    assert len({0, 1} & set(chosen)) == 1
+
+
+# --- the search ------------------------------------------------------------------------------------
+
+
+def test_a_trial_that_diverges_is_refused_and_says_so(monkeypatch):
+    said: list[str] = []
+    problem = replace(problem_of(1), progress=said.append)
+    fit = Fit((), dict.fromkeys(NAMES, 0.0), Noise({}), objective=10.0)
+    proposal = Proposal(f"+ {EFFECTS[0]}", EFFECTS[0], fit, 0.0, 14.0, "added")
+    monkeypatch.setattr(moves, "fitted", lambda problem, fit: replace(fit, objective=math.inf))
+    assert accepted(problem, fit, proposal) is None
+    assert said == [f"refused + {EFFECTS[0]}: with it the filter diverges"]
