@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from coax_env.estimation.quadratic import Linearised
-from coax_env.estimation.state_space import FreeParameter
-from coax_env.identification.maximum_likelihood import _squared_moves, each_run
+from coax_env.estimation.state_space import FreeParameter, Noise
+from coax_env.identification import maximum_likelihood
+from coax_env.identification.maximum_likelihood import OwnNumbers, _squared_moves, each_run
 from coax_env.identification.undetermined import left_open
 from coax_env.plain_words import plain
 
@@ -135,3 +136,37 @@ def test_what_all_flights_see_leaves_nothing_open_and_what_none_sees_stays():
         )  # of a reading that leaves so much of the prior's std
         seen = [(axes[0], spread), (axes[1], 0.05), (axes[2], 0.05)]
         assert left_open(free, posterior(free, *seen)) == (named, ())
+
+
+# --- priors that are contradicted -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("widened", "white", "words", "believed"),
+    [
+        (1.0, True, "", 1.0),
+        (1.0, False, "", 1.0),
+        (6.5, True, "priors taken 6.5 times as wide", 6.5),
+        (6.5, False, "the model lacks something", 1.0),
+    ],
+)
+def test_what_is_said_where_flights_contradict_the_file(
+    monkeypatch, widened, white, words, believed
+):
+    """Nothing where they do not; wide priors only where they leave nothing to explain."""
+    asked = []
+
+    def by_turns(engine, free, start, noise, progress, most):
+        asked.append(most)
+        estimate = SimpleNamespace(values={})
+        return OwnNumbers(free, estimate, noise, min(widened, most))
+
+    monkeypatch.setattr(maximum_likelihood, "_by_turns", by_turns)
+    monkeypatch.setattr(maximum_likelihood, "is_white", lambda passes, channels: white)
+    engine = SimpleNamespace(
+        filter=lambda values, noise: [], model=SimpleNamespace(channels=("p",))
+    )  # fmt: skip
+    found = maximum_likelihood.own_numbers(engine, [], {}, Noise({}), lambda text: None)
+    assert found.widened == believed
+    assert words in found.remark and bool(found.remark) == bool(words)
+    assert len(asked) == (2 if believed < widened else 1)
