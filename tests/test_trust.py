@@ -36,7 +36,7 @@ LAMA = load_vehicle("lama400d")
 def problem_of(runs: int) -> Problem:
     """Effects with one number each on runs that were never flown."""
     free = [FreeParameter(name, 0.0, WIDE) for name in NAMES]
-    engine = SimpleNamespace(records=[SimpleNamespace(name=f"run {i}") for i in range(runs)])
+    engine = SimpleNamespace(records=[SimpleNamespace(whole=f"run {i}") for i in range(runs)])
     model = SimpleNamespace(bare_values={})
     base = (FreeParameter("mass", 0.0, WIDE),)
     own = {effect: (f,) for effect, f in zip(EFFECTS, free, strict=True)}

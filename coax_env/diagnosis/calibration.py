@@ -132,7 +132,10 @@ def class_of(flight: Flight, vehicle: Vehicle, fit: Fit) -> dict[str, Any]:
         fit: whose noise levels were fitted.
     """
     steps = np.concatenate([np.diff(run.t) for run in flight.runs])
-    between = np.concatenate([np.diff(run.t[_read(run)]) for run in flight.runs])
+    read: dict[str, list[np.ndarray]] = {}
+    for run in flight.runs:
+        read.setdefault(run.whole, []).append(run.t[_read(run)])
+    between = np.concatenate([np.diff(np.concatenate(times)) for times in read.values()])
     level, floor = fit.noise.process, fit.noise.floor
     weight = vehicle["mass"].value * vehicle["gravity"].value
     arm = vehicle["arm_upper"].value
@@ -141,7 +144,7 @@ def class_of(flight: Flight, vehicle: Vehicle, fit: Fit) -> dict[str, Any]:
     return {
         "sensors": ", ".join(sorted(aboard)),
         "rate_hz": round(1.0 / float(np.median(steps)), 1),
-        "gap_share": round(float(between[between > GAP].sum() / steps.sum()), 4),
+        "gap_share": round(float(between[between > GAP].sum() / between.sum()), 4),
         "card_noise": all(c in flight.noise for c in flight.channels),
         "mass_kg": vehicle["mass"].value,
         "gust_force": round(max(level[n] for n in GUST_LEVELS if "force" in n) / weight, 4),

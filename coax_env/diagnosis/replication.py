@@ -17,7 +17,7 @@ every run.
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import numpy as np
 
@@ -55,14 +55,14 @@ def replications(
     """
     if not fit.active:
         return {}
-    names = [r.name for r in problem.engine.records]
+    runs = of_runs(problem.engine.records)
     without = [
-        _standing(problem, fit, quadratic, quadratic.of_parts(rest), worth)
-        for rest in _left_out(len(names))
+        _standing(problem, fit, quadratic, quadratic.of_parts(_all_but(runs, out)), worth)
+        for out in runs
     ]
     whole, halves = _halves(problem, fit, quadratic)
     halved = [_standing(problem, fit, whole, whole.of_parts(half), worth) for half in halves]
-    return {effect: _of_one(effect, names, without, halved) for effect in fit.active}
+    return {effect: _of_one(effect, list(runs), without, halved) for effect in fit.active}
 
 
 def _of_one(
@@ -79,8 +79,16 @@ def _of_one(
     )
 
 
-def _left_out(count: int) -> list[list[int]]:
-    return [[i for i in range(count) if i != out] for out in range(count)]
+def of_runs(records: Sequence[Record]) -> dict[str, list[int]]:
+    """Run -> indices of its records: a log with gaps is cut."""
+    runs: dict[str, list[int]] = {}
+    for i, record in enumerate(records):
+        runs.setdefault(record.whole, []).append(i)
+    return runs
+
+
+def _all_but(runs: Mapping[str, Sequence[int]], out: str) -> list[int]:
+    return [i for name, own in runs.items() if name != out for i in own]
 
 
 # --- halves -----------------------------------------------------------------------------------------
@@ -91,13 +99,14 @@ def _halves(
 ) -> tuple[Quadratic, list[tuple[int, ...]]]:
     """The quadratic whose parts are halved, and the parts of each half."""
     chosen, records = problem.settings, problem.engine.records
-    if len(records) >= chosen.fewest_runs:
-        return quadratic, list(halves_of([range(len(records))], chosen.splits))
-    pieces = [_pieces(record, chosen.piece_seconds) for record in records]
-    engine = problem.with_records([piece for own in pieces for piece in own]).engine
+    runs = list(of_runs(records).values())
+    if len(runs) >= chosen.fewest_runs:
+        halves = halves_of([range(len(runs))], chosen.splits)
+        return quadratic, [tuple(i for k in half for i in runs[k]) for half in halves]
+    pieces = [piece for record in records for piece in _pieces(record, chosen.piece_seconds)]
+    engine = problem.with_records(pieces).engine
     _, lin = engine.linearise(fit.values, fit.noise, problem.parameters)
-    ends = np.cumsum([0, *(len(own) for own in pieces)])
-    groups = [range(a, b) for a, b in pairwise(ends)]
+    groups = list(of_runs(pieces).values())
     whole = Quadratic.of(lin, problem.parameters, fit.values)
     return replace(whole, blocks=quadratic.blocks), list(halves_of(groups, chosen.splits))
 
@@ -134,8 +143,8 @@ def _half_of_each(groups: Sequence[Sequence[int]], rng: np.random.Generator) -> 
 
 
 def _pieces(record: Record, seconds: float) -> list[Record]:
-    """A run in pieces of about so many seconds, two at least."""
-    count = max(2, round((record.t[-1] - record.t[0]) / seconds))
+    """A record in pieces of about so many seconds."""
+    count = max(1, round((record.t[-1] - record.t[0]) / seconds))
     edges = np.linspace(record.t[0], record.t[-1], count + 1)
     which = np.clip(np.searchsorted(edges, record.t, side="right") - 1, 0, count - 1)
     return [part(record, which == k) for k in range(count)]

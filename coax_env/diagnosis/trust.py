@@ -15,7 +15,7 @@ from coax_env.diagnosis.confounding import Alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.noise_variation import not_holding
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.replication import Asked, Replication, halves_of, replications
+from coax_env.diagnosis.replication import Asked, Replication, halves_of, of_runs, replications
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
@@ -84,13 +84,14 @@ def trusts(
     worth = {effect: weighed.nats for effect, weighed in evidence.items()}
     replicated = replications(problem, fit, quadratic, worth)
     falling = not_holding(problem, fit, quadratic, worth)
+    runs = len(of_runs(problem.engine.records))
     result = {}
     for effect in fit.active:
         known = determined(problem, fit, quadratic, effect, evidence[effect].inflation)
         doubts = (
             *_not_white(channels_of(problem, fit, quadratic, effect), white),
             *_under_noise(falling[effect]),
-            *on_parts(replicated[effect], len(problem.engine.records), problem.settings),
+            *on_parts(replicated[effect], runs, problem.settings),
             *_sizes(problem, fit, effect),
             *_undetermined(problem, effect, known),
             *_alternatives(found[effect]),

@@ -100,7 +100,7 @@ def _joined(name: str, parts: Sequence[RunReplay]) -> RunReplay:
     if len(parts) == 1:
         return replace(parts[0], name=name)
     columns = [f.name for f in fields(ChannelReplay)]
-    channels, floor = {}, {}
+    channels, floor, still = {}, {}, {}
     for channel in dict.fromkeys(c for part in parts for c in part.channels):
         there = [part for part in parts if channel in part.channels]
         channels[channel] = ChannelReplay(
@@ -109,7 +109,9 @@ def _joined(name: str, parts: Sequence[RunReplay]) -> RunReplay:
         floors = [p.floor[channel] for p in there if channel in p.floor]
         if floors:
             floor[channel] = float(np.sqrt(np.mean(np.square(floors))))
-    return RunReplay(name, channels, any(part.diverged for part in parts), floor)
+        still[channel] = np.concatenate([p.still[channel] for p in there])
+    nats = sum(part.log_likelihood for part in parts)
+    return RunReplay(name, channels, any(part.diverged for part in parts), floor, still, nats)
 
 
 def _replay_run(

@@ -291,11 +291,12 @@ def motor_droop(x, f, p, e):
 
     Hover is the bare model's: what a rotor with droop needs to hover is in the bench line or trim.
     """
-    hover_u, hover_l = generic_terms.hover_speeds(p)
-    f[F.SPEED_SHARE_U] = 1.0 - p[e]
-    f[F.SPEED_REST_U] = p[e] * hover_u
-    f[F.SPEED_SHARE_L] = 1.0 - p[e + 1]
-    f[F.SPEED_REST_L] = p[e + 1] * hover_l
+    if p[e] != 0.0 or p[e + 1] != 0.0:
+        hover_u, hover_l = generic_terms.hover_speeds(p)
+        f[F.SPEED_SHARE_U] = 1.0 - p[e]
+        f[F.SPEED_REST_U] = p[e] * hover_u
+        f[F.SPEED_SHARE_L] = 1.0 - p[e + 1]
+        f[F.SPEED_REST_L] = p[e + 1] * hover_l
 
 
 @effect(
@@ -481,8 +482,8 @@ def wake_interference(x, f, p, e):
 )
 def thrust_exponent(x, f, p, e):
     """Thrust goes as speed to the power 2 + excess, unchanged at the bare model's hover speed."""
-    hover_u, hover_l = generic_terms.hover_speeds(p)
-    if f[F.OMEGA_U] > 0.0 and f[F.OMEGA_L] > 0.0:
+    if p[e] != 0.0 and f[F.OMEGA_U] > 0.0 and f[F.OMEGA_L] > 0.0:
+        hover_u, hover_l = generic_terms.hover_speeds(p)
         f[F.THRUST_U] *= (f[F.OMEGA_U] / hover_u) ** p[e]
         f[F.THRUST_L] *= (f[F.OMEGA_L] / hover_l) ** p[e]
 
