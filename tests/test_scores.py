@@ -18,7 +18,7 @@ from coax_env.diagnosis import confounding, remarks
 from coax_env.diagnosis.confounding import channels_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import damping_gain, inflation, is_large, loss, score, scores, swap
-from coax_env.estimation.helicopter import MOST_USUAL_SIZES, HeliModel
+from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import WHITE_LEVELS
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
@@ -282,22 +282,6 @@ def test_channels_are_those_that_carry_a_tenth_of_the_signature():
     found = channels_of(PROBLEM, fit, replace(q, by_channel=by_channel), "gyro_bias")
     assert found == ["theta", "q"]
     assert channels_of(PROBLEM, fit, replace(q, by_channel=0.0 * by_channel), "gyro_bias") == []
-
-
-def test_an_unusual_size_is_said_from_two_and_a_half_usual_ones_on():
-    usual = next(f.std for f in FREE if f.name == "gyro_bias.x")
-
-    def words(sizes: float) -> list[str]:
-        fit = Fit(("gyro_bias",), {**OFF, "gyro_bias.x": sizes * usual}, NOISE)
-        return remarks._unusual_sizes(PROBLEM, fit)
-
-    assert words(2.4) == [] and words(-2.4) == []
-    (one,) = words(-2.6)
-    assert one.startswith("gyro_bias.x = -0.078 is outside its usual range (0 +- 0.03)")
-    for side in (1.0, -1.0):
-        (limit,) = words(side * MOST_USUAL_SIZES)
-        assert "stands at the limit" in limit
-    assert "outside" in words(0.97 * MOST_USUAL_SIZES)[0]
 
 
 def test_a_base_number_is_said_to_have_moved_from_two_sigmas_on():
