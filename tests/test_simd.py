@@ -19,7 +19,7 @@ from coax_env.model import state as S
 from coax_env.model.dynamics import WORK_SIZE, full_state, hover_trim, measure, step
 from coax_env.model.dynamics import measure_bare as measure_any
 from coax_env.model.dynamics import step_bare as step_any
-from coax_env.model.layout import N_CHANNELS, N_INPUTS
+from coax_env.model.layout import N_CHANNELS, N_FULL, N_INPUTS
 
 LAMA = coax_env.load_vehicle("lama400d")
 
@@ -145,10 +145,10 @@ def test_normal_numbers_are_those_of_box_and_muller():
 
 
 def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States anywhere in flight (26, SIMD_WIDTH), inputs (6, SIMD_WIDTH), vehicles (n, SIMD_WIDTH)."""
+    """States anywhere in flight (29, SIMD_WIDTH), inputs (6, SIMD_WIDTH), vehicles (n, SIMD_WIDTH)."""
     rng = np.random.default_rng(seed)
     state, command = hover_trim(LAMA)
-    x = full_state(state, command, LAMA)[:, None] + rng.normal(0.0, 0.3, (26, SIMD_WIDTH))
+    x = full_state(state, command, LAMA)[:, None] + rng.normal(0.0, 0.3, (29, SIMD_WIDTH))
     x[S.PSI] += rng.uniform(-30.0, 30.0, SIMD_WIDTH)
     u = np.zeros((N_INPUTS, SIMD_WIDTH))
     u[: U.TIME] = command[:, None] * (1.0 + rng.normal(0.0, 0.1, (4, SIMD_WIDTH)))
@@ -166,7 +166,7 @@ def test_each_lane_flies_and_measures_as_one_helicopter(seed):
     _measure_registers(x, u, p, work, readings)
     for j in range(SIMD_WIDTH):
         one = [np.ascontiguousarray(a[:, j]) for a in (x, u, p)]
-        expected, measured = np.empty(26), np.empty(N_CHANNELS)
+        expected, measured = np.empty(N_FULL), np.empty(N_CHANNELS)
         step(one[0], one[1], 0.01, one[2], np.zeros(WORK_SIZE), expected)
         measure(*one, np.zeros(WORK_SIZE), measured)
         assert flown[:, j] == pytest.approx(expected, rel=1e-12, abs=1e-12)
