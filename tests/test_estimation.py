@@ -327,6 +327,58 @@ def test_start_score_is_the_gradient_in_the_first_variances(state):
         assert found == pytest.approx(exact, rel=0.02, abs=2e-4)
 
 
+class Shaken(Pendulum):
+    """Whose first rate is the less certain, the more noise there is: as a gust's is."""
+
+    def start_noise(self, noise: Noise) -> np.ndarray:
+        return np.array([0.0, 2.0 * noise.process["torque"] ** 2])
+
+
+def test_what_noise_adds_to_the_first_state_is_added():
+    record = swing(9, n=60)
+    wider = Pendulum()
+    spread = math.sqrt(Pendulum.start_std[RATE] ** 2 + 2.0 * NOISE.process["torque"] ** 2)
+    wider.start_std = np.array([Pendulum.start_std[ANGLE], spread])
+    assert Engine(Shaken(), [record]).log_likelihood(TRUTH, NOISE) == pytest.approx(
+        Engine(wider, [record]).log_likelihood(TRUTH, NOISE), rel=1e-12
+    )
+
+
+def test_a_fitted_level_has_the_largest_likelihood_where_first_states_depend_on_it_too():
+    """Sixty short flights, of which the first states say nearly as much as the rest."""
+    rng = np.random.default_rng(11)
+    level = 1.5
+    loud = replace(NOISE, process={"torque": level})
+    starts = Pendulum.start_at + rng.standard_normal((60, 2)) * [0.3, math.hypot(0.5, 1.4 * level)]
+    records = [swing(k, n=12, noise=loud, start=at) for k, at in enumerate(starts)]
+    engine = Engine(Shaken(), records)
+    found = fit_noise(engine, TRUTH, NOISE, ["torque"], tolerance=0.02).process["torque"]
+
+    def at(factor: float) -> float:
+        return engine.log_likelihood(TRUTH, replace(NOISE, process={"torque": factor * found}))
+
+    slope = (at(1.02) - at(1.0 / 1.02)) / (2.0 * math.log(1.02))
+    curvature = (2.0 * at(1.0) - at(1.02) - at(1.0 / 1.02)) / math.log(1.02) ** 2
+    assert curvature > 0.0 and abs(slope) < 0.2 * math.sqrt(curvature), "within a fifth of its std"
+
+
+def test_some_seconds_of_flight_are_whole_runs_evenly_picked_wherever_clocks_start():
+    """Twenty of thirty seconds: the first and the last of three runs."""
+    quiet, loud = NOISE, replace(NOISE, process={"torque": 1.2})
+    records = [swing(1, noise=loud), swing(2, noise=quiet), swing(3, noise=loud)]
+    late = [replace(r, t=r.t + 1e3) for r in records]
+
+    def found(runs: list[Record], seconds: float = math.inf) -> float:
+        return fit_noise(
+            Engine(Pendulum(), runs), TRUTH, NOISE, ["torque"], seconds=seconds
+        ).process["torque"]
+
+    picked = found([records[0], records[2]])
+    assert found(records, 19.9) == picked == pytest.approx(1.2, rel=0.25)
+    assert found(late, 19.9) == pytest.approx(picked, rel=1e-6)
+    assert found(records, 25.0) == found(records) < 0.9 * picked
+
+
 def test_angles_wrap():
     """A pendulum that goes over the top many times is followed as if its encoder never jumped."""
     values = {**TRUTH, "sine": 1.0, "damping": 0.05}
@@ -497,6 +549,76 @@ def test_a_run_without_readings_has_no_signature(parameter):
     assert linearised.information[0, 0, 0] > 0.0
     assert lin.information[0] == pytest.approx(linearised.information[0])
     assert not lin.information[1].any()
+
+
+def test_a_finite_step_finds_the_slope_of_what_is_linear():
+    """A gyro's bias, probed by half a radian a second: the derivative itself, in every channel."""
+    engine = Engine(Pendulum(), [with_holes(swing(3), 0.2, 1), swing(4, n=200)])
+    free = [prior("bias", 0.05)]
+    _, lin = engine.linearise(TRUTH, NOISE, free)
+    _, probed = engine.linearise(TRUTH, NOISE, [replace(free[0], probe=0.5)])
+    for name in ("information", "slope", "by_channel", "blocks"):
+        np.testing.assert_allclose(getattr(probed, name), getattr(lin, name), rtol=1e-4, atol=1e-6)
+
+
+def test_a_step_stays_within_its_bound():
+    """One that stands at its upper bound is moved the other way: the slope is the same."""
+    engine = Engine(Pendulum(), [swing(3)])
+    for more in ({}, {"probe": 0.5}):
+        (_, lin), (_, fenced) = (
+            engine.linearise(TRUTH, NOISE, [prior("bias", 0.05, upper=upper, **more)])
+            for upper in (math.inf, 0.0)
+        )
+        np.testing.assert_allclose(fenced.slope, lin.slope, rtol=1e-4)
+        np.testing.assert_allclose(fenced.information, lin.information, rtol=1e-4)
+
+
+def test_scores_are_summed_over_blocks_of_two_seconds():
+    """A filter looks back alone: the first blocks are the slope of a record that ends there."""
+    record = with_holes(replace(swing(3, n=430), t=11.0 + DT * np.arange(430)), 0.2, 4)
+    free = [prior("bias", 0.05), prior("damping", 0.2)]
+    _, lin = Engine(Pendulum(), [record]).linearise(TRUTH, NOISE, free)
+    assert lin.blocks.shape == (5, 2)
+    for k in range(1, 5):
+        rows = slice(0, 100 * k)
+        first = replace(record, t=record.t[rows], z=record.z[rows], command=record.command[rows])
+        _, alone = Engine(Pendulum(), [first]).linearise(TRUTH, NOISE, free)
+        np.testing.assert_allclose(lin.blocks[:k].sum(0), alone.slope[0], rtol=1e-6)
+
+    in_noise = Engine(Pendulum(), [record]).noise_score(TRUTH, NOISE).in_noise
+    assert in_noise.shape == (5, 2) and in_noise.any(axis=1).all()
+
+
+def test_a_step_is_shortened_until_the_cost_falls():
+    """Four times too long on a parabola: half of it gains nothing, a quarter is the optimum."""
+    engine = Engine(Pendulum(), [swing(1, n=600, values={**TRUTH, "bias": 0.1})])
+    free = [prior("bias", 1.0)]
+    passes, lin = engine.linearise(TRUTH, NOISE, free)
+    change, step = Quadratic.of(lin, free, TRUTH).best(["bias"])
+    for times, share in ((1.0, 1.0), (4.05, 0.25), (12.0, 0.1)):
+        move = {"bias": times * float(step[0])}
+        found, gained = engine.descend(passes, free, TRUTH, NOISE, move)
+        assert found["bias"] == pytest.approx(share * times * step[0], rel=1e-6)
+        cost = [engine.frozen_cost(passes, free, at, NOISE) for at in (TRUTH, found)]
+        assert 0.0 < gained == pytest.approx(cost[0] - cost[1])
+    assert gained < -change
+    far = [replace(free[0], value=3.0, std=0.5)]
+    costs = [engine.frozen_cost(passes, some, TRUTH, NOISE) for some in (far, [])]
+    assert costs[0] - costs[1] == pytest.approx(18.0), "six widths of the prior"
+    stays, gained = engine.descend(passes, free, TRUTH, NOISE, {"bias": -float(step[0])})
+    assert (stays, gained) == (TRUTH, 0.0)
+    fenced = [replace(free[0], upper=0.5 * float(step[0]))]
+    found, _ = engine.descend(passes, fenced, TRUTH, NOISE, {"bias": float(step[0])})
+    assert found["bias"] == pytest.approx(0.5 * step[0])
+
+
+def test_one_step_is_one_step():
+    """Of a parameter that is linear: a second one has nothing left to do."""
+    engine = Engine(Pendulum(), [swing(1, n=600, values={**TRUTH, "bias": 0.1})])
+    once, again = (engine.fit([prior("bias", 1.0)], TRUTH, NOISE, n, 1e-9) for n in (1, 2))
+    assert once.iterations == 1
+    assert once.values["bias"] == pytest.approx(again.values["bias"], abs=1e-3)
+    assert once.values["bias"] == pytest.approx(0.1, abs=0.03)
 
 
 # --- fits ----------------------------------------------------------------------------------------
@@ -692,3 +814,76 @@ def test_a_channel_with_few_readings_is_not_judged():
     e = 3.0 * np.random.default_rng(4).standard_normal((1000, 2))
     e[150:, 1] = np.nan  # fifty are left after the first second
     assert set(whiteness([a_pass(e)], ("a", "b"))) == {"a"}
+
+
+@pytest.mark.parametrize("pole", [0.3, 0.6, 0.8])
+def test_what_an_autoregression_predicts_of_itself_is_its_pole_squared(pole):
+    """And what its innovations carry falls as much: n of them are worth n (1 - pole^2), to a fifth."""
+    rng = np.random.default_rng(6)
+    e = lfilter([math.sqrt(1.0 - pole**2)], [1.0, -pole], rng.standard_normal(60_000))
+    found = whiteness([a_pass(e[1000:, None])], ("a",))["a"]
+    assert found.coloured_share == pytest.approx(pole**2, abs=0.015)
+    assert found.inflation == pytest.approx(1.0 / (1.0 - pole**2), rel=0.05)
+    drift = whiteness([a_pass(np.cumsum(rng.standard_normal((20_000, 1)), axis=0))], ("a",))["a"]
+    assert drift.inflation == pytest.approx(5.0)
+
+
+def test_white_noise_predicts_nothing_of_itself_however_short_the_record():
+    """Twenty correlations fitted to a hundred readings look like a fifth: that much is taken off."""
+    draws = np.random.default_rng(7).standard_normal((300, 201, 1))
+    judged = [whiteness([a_pass(e)], ("a",))["a"] for e in draws]
+    shares = np.array([w.coloured_share for w in judged])
+    assert np.median(shares) < 0.02 and shares.mean() < 0.05
+    assert all(w.white for w in judged)
+    assert np.mean([w.inflation for w in judged]) == pytest.approx(1.0, abs=0.06)
+
+
+def test_the_worst_run_is_judged_and_many_runs_have_many_chances():
+    """Bonferroni: of six p values the least is six times likelier; a coloured run comes first."""
+    rng = np.random.default_rng(8)
+    alone = [a_pass(e) for e in rng.standard_normal((6, 900, 1))]
+    p_values = [whiteness([run], ("a",))["a"].p_value for run in alone]
+    together = whiteness(alone, ("a",))["a"]
+    assert any(together.p_value == pytest.approx(min(6.0 * p, 1.0)) for p in p_values)
+    assert together.white and together.p_value <= 1.0
+    pole = 0.7
+    red = math.sqrt(1.0 - pole**2) * lfilter([1.0], [1.0, -pole], rng.standard_normal(900))
+    coloured = replace(alone[0], record=replace(alone[0].record, name="red"))
+    coloured = replace(coloured, innovations=red[:, None])
+    draws = rng.standard_normal((6, 8, 400, 1))
+    p_values = [whiteness([a_pass(e) for e in runs], ("a",))["a"].p_value for runs in draws]
+    assert 0.3 < max(p_values) <= 1.0, "a probability, however many runs"
+    for runs in ([coloured, *alone], [*alone, coloured]):
+        found = whiteness(runs, ("a",))["a"]
+        assert found.run == "red" and not found.white
+    redder = replace(alone[1], record=replace(alone[1].record, name="redder"))
+    more = math.sqrt(1.0 - 0.9**2) * lfilter([1.0], [1.0, -0.9], rng.standard_normal(900))
+    redder = replace(redder, innovations=more[:, None])
+    for runs in ([coloured, redder], [redder, coloured]):
+        assert whiteness(runs, ("a",))["a"].run == "redder"
+
+
+def test_colour_far_below_the_assumed_noise_does_not_matter():
+    """The same correlation in innovations a tenth as large is a hundredth of the variance."""
+    pole = 0.7
+    red = lfilter([1.0], [1.0, -pole], np.random.default_rng(9).standard_normal((2000, 1)), axis=0)
+    red *= math.sqrt(1.0 - pole**2)
+    assert not whiteness([a_pass(red)], ("a",))["a"].white
+    faint = whiteness([a_pass(0.1 * red)], ("a",))["a"]
+    assert faint.white and faint.p_value < 1e-5
+    loud = whiteness([a_pass(1.1 * red)], ("a",))[
+        "a"
+    ]  # louder than assumed is no worse than as loud
+    assert loud.coloured_share == pytest.approx(faint.coloured_share)
+
+
+def test_the_first_second_is_not_judged():
+    """A filter that has not settled says nothing of the model, wherever the clock starts."""
+    e = np.random.default_rng(10).standard_normal((1500, 1))
+    run = a_pass(e)
+    wild = e.copy()
+    wild[:100] *= 50.0
+    late = replace(run, record=replace(run.record, t=run.record.t + 60.0), innovations=wild)
+    assert whiteness([late], ("a",))["a"] == whiteness([run], ("a",))["a"]
+    wild[110:130] *= 50.0
+    assert whiteness([replace(late, innovations=wild)], ("a",))["a"].spread > 2.0

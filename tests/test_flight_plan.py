@@ -7,7 +7,14 @@ from coax_env import identify, load_vehicle, read_flight, simulate
 from coax_env.design.candidates import Envelope
 from coax_env.design.flight_plan import multisine_maneuvers, plan_flight, write_plan
 from coax_env.errors import InputError
-from coax_env.simulation.multisine import UPDATE, harmonics, multisines, relative_peak_factor
+from coax_env.simulation.maneuvers import Maneuver
+from coax_env.simulation.multisine import (
+    UPDATE,
+    harmonics,
+    multisines,
+    relative_peak_factor,
+    steps,
+)
 from coax_env.simulation.simulate import fly
 
 LAMA = load_vehicle("lama400d")
@@ -41,6 +48,48 @@ def test_phases_keep_the_peak_low():
 def test_a_record_too_short_for_its_inputs_is_refused():
     with pytest.raises(InputError, match="too few"):
         harmonics(4, 2.0)
+
+
+def test_harmonics_are_all_those_of_the_band_dealt_out_in_turn():
+    """Of a record of 10 s, from 0.2 to 2.5 Hz: 2 to 25, each to one input; ends of a band count."""
+    dealt = harmonics(3, 10.0)
+    assert sorted(np.concatenate(dealt)) == list(range(2, 26))
+    assert [list(numbers[:2]) for numbers in dealt] == [[2, 5], [3, 6], [4, 7]]
+    assert sorted(np.concatenate(harmonics(2, 7.0, 0.5, 2.0))) == list(range(4, 15))
+    assert min(harmonics(1, 2.0, 0.1, 3.0)[0]) == 1  # slower than the record is none
+    assert len(np.concatenate(harmonics(2, 2.0, 0.5, 2.0))) == 4  # two each are enough
+    with pytest.raises(InputError, match=r"multisine of 2 s has 3 harmonics"):
+        harmonics(2, 2.0, 1.0, 2.0)
+
+
+def test_a_history_is_a_sum_of_sines_of_equal_power_that_starts_from_rest():
+    """Equal amplitudes at its harmonics and none elsewhere; it begins where it crosses 0 upwards."""
+    for wave, numbers in zip(multisines(2, 10.0).T, harmonics(2, 10.0), strict=True):
+        power = np.abs(np.fft.rfft(wave)) / len(wave)
+        expected = np.zeros_like(power)
+        expected[numbers] = power[numbers[0]]
+        np.testing.assert_allclose(power, expected, atol=1e-9)
+        assert wave[0] > 0.0 >= wave[-1] and wave[0] - wave[-1] < 1.0
+    again, other = multisines(2, 10.0), multisines(2, 10.0, seed=5)
+    np.testing.assert_array_equal(again, multisines(2, 10.0, seed=0))
+    assert other.shape == (round(10.0 / UPDATE), 2)
+
+
+def test_a_peak_factor_has_no_unit_and_no_offset():
+    """Range over 2 sqrt(2) rms: a square wave 1/sqrt(2), a triangle sqrt(3/2)."""
+    phase = (np.arange(4000) + 0.5) / 4000
+    square, triangle = np.where(phase < 0.5, 1.0, -1.0), np.abs(4.0 * phase - 2.0) - 1.0
+    for wave, expected in ((square, 2.0**-0.5), (triangle, 1.5**0.5)):
+        assert relative_peak_factor(wave) == pytest.approx(expected, rel=1e-3)
+        assert relative_peak_factor(7.0 - 3.0 * wave) == pytest.approx(expected, rel=1e-3)
+
+
+def test_steps_hold_each_level_for_an_update_and_end_at_nothing():
+    wave = np.array([0.5, -1.0, 0.25])
+    plan = Maneuver("m", 9.0, "", injected={"delta_lat": steps(wave, 0.04, 2.0)})
+    between = 2.0 + UPDATE * (np.arange(-1, 5) + 0.5)
+    found = plan.injection(between, np.ones(4))[:, 3]
+    np.testing.assert_allclose(found, [0.0, 0.02, -0.04, 0.01, 0.0, 0.0], atol=1e-15)
 
 
 def test_all_inputs_are_stirred_by_the_multisine():

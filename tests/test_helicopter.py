@@ -108,6 +108,15 @@ def test_the_first_state_is_the_median_of_the_first_half_second():
     assert np.array_equal(P0, np.diag(np.diag(P0))) and (np.diag(P0)[:20] > 0.0).all()
 
 
+def test_half_a_second_is_half_a_second_at_any_rate_and_commands_are_the_first():
+    """Readings at 0, 0.25 and 0.5 s are early, one at 0.75 s is not: the median of three."""
+    slow = record(seconds=2.0, dt=0.25, h=np.array([1.0, 2.0, 3.0, 9.0, 9.0, 9.0, 9.0, 9.0]))
+    slow.command[1:] += 1.0
+    x, _ = MODEL.start(slow)
+    assert x[X["z"]] == pytest.approx(-2.0)
+    np.testing.assert_array_equal(x[16:20], slow.command[0])
+
+
 def test_a_heading_at_the_seam_starts_at_the_seam():
     psi = np.where(np.arange(100) % 2, math.pi - 0.01, 0.01 - math.pi)
     x, _ = MODEL.start(record(psi=psi))
@@ -165,6 +174,17 @@ def test_late_commands_are_their_mean_over_the_row(common, of_servos):
         for columns, delay in ((slice(0, 2), common), (slice(2, 4), common + of_servos)):
             row = np.maximum(np.searchsorted(t, fine - delay, side="right") - 1, 0)
             assert u[k, columns] == pytest.approx(command[row, columns].mean(axis=0), abs=2e-4), k
+
+
+def test_a_command_that_has_long_been_held_is_itself_however_late():
+    """In every row, in the last too, whose end the log does not show; before the log the first held."""
+    late = LAMA.with_effect("servo_delay", time=0.033)
+    one = record(seconds=1.0)
+    held = Record("", one.t, one.command.copy(), one.z, one.origin)
+    held.command[:20, 2:4] = 0.3, -0.2
+    u = HeliModel(late).inputs(held, late.vector)
+    np.testing.assert_allclose(u[:20, 2:4], held.command[:20, 2:4], atol=1e-12)
+    np.testing.assert_allclose(u[23:, 2:4], held.command[23:, 2:4], atol=1e-12)
 
 
 @pytest.mark.parametrize("gain", P.COMMAND_GAINS)
@@ -276,6 +296,9 @@ def test_what_may_be_fitted_lies_within_its_bounds():
         own = LAMA[name]
         assert (free.value, free.std) == (own.value, own.std)
         assert free.lower < own.value - 5.0 * own.std and own.value + 5.0 * own.std < free.upper
+        assert 0.2 < free.lower / own.value < 0.5 and 2.0 < free.upper / own.value < 5.0, (
+            "no other machine: neither a fifth nor five times as much"
+        )
     for name, entry in effects.CATALOGUE.items():
         for free, own in zip(MODEL.effect_parameters(name), entry.fitted, strict=True):
             assert own.lower <= free.lower <= own.off <= free.upper <= own.upper

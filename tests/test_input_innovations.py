@@ -1,6 +1,8 @@
 """Input innovations: the regression, the correction of the filter, and what it is good for."""
 
+import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import injector
 import numpy as np
@@ -9,6 +11,8 @@ import pytest
 from coax_env import read_flight
 from coax_env.diagnosis.fits import converged, fitted, linearise, start
 from coax_env.diagnosis.input_innovations import (
+    _gains,
+    _innovations,
     clipped_residual,
     has_command_gains,
     with_command_gains,
@@ -20,7 +24,7 @@ from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import replay_runs
 from coax_env.model import parameters as P
-from coax_env.model.layout import CHANNELS, GUSTS
+from coax_env.model.layout import CHANNELS, GUSTS, N_FULL
 from coax_env.model.vehicle_file import load_vehicle
 
 LAMA = load_vehicle("lama400d")
@@ -57,6 +61,70 @@ def test_a_command_that_is_held_has_no_innovation():
     assert not found[change == 0.0].any()
     assert np.std(found[::3]) > 0.03
     assert not clipped_residual(known, np.zeros(900)).any()
+
+
+def made_pass(u: np.ndarray, states: np.ndarray, covariances: np.ndarray) -> SimpleNamespace:
+    return SimpleNamespace(
+        states=states, record=SimpleNamespace(command=u), start_covariances=covariances
+    )
+
+
+def test_a_pilot_sees_ahead_and_to_the_right_whatever_his_heading():
+    """He turns twice round while he steers back by where he is from his nose: one pilot all the way."""
+    rng = np.random.default_rng(3)
+    ahead, right = np.cumsum(0.1 * rng.standard_normal((2, 900)), axis=1)
+    heading = 4.0 * np.pi * np.arange(900) / 900
+    planted = 0.01 * rng.standard_normal((900, 4))
+    u = np.zeros((900, 4))
+    for k in range(2, 900):
+        seen = np.array([0.0, 0.0, ahead[k], right[k]])
+        u[k] = 0.8 * u[k - 1] + 0.1 * u[k - 2] - 0.02 * seen + planted[k]
+    states = 1e-9 * rng.standard_normal((900, N_FULL))
+    states[:, 12] = heading
+    states[:, 13] = np.cos(heading) * ahead - np.sin(heading) * right
+    states[:, 14] = np.sin(heading) * ahead + np.cos(heading) * right
+    (e,) = _innovations([made_pass(u, states, np.zeros((1, N_FULL, N_FULL)))])
+    assert e.shape == (900, 4) and not e[:2].any()
+    for j in range(4):
+        quiet = np.abs(planted[:, j]) < 0.015
+        quiet[:2] = False
+        assert np.corrcoef(e[quiet, j], planted[quiet, j])[0, 1] > 0.95
+
+
+def test_runs_are_regressed_together_and_each_gets_its_own_back():
+    rng = np.random.default_rng(4)
+    parts = []
+    for n, level in ((400, 5.0), (300, -2.0)):
+        u = level + 0.05 * np.cumsum(rng.standard_normal((n, 4)), axis=0)
+        parts.append(made_pass(u, rng.standard_normal((n, N_FULL)), np.zeros((1, N_FULL, N_FULL))))
+    both = _innovations(parts)
+    assert [e.shape for e in both] == [(400, 4), (300, 4)]
+    swapped = _innovations(parts[::-1])
+    np.testing.assert_allclose(both[0], swapped[1], atol=1e-9)
+    np.testing.assert_allclose(both[1], swapped[0], atol=1e-9)
+
+
+def test_a_gain_s_prior_is_what_the_filter_does_not_know_over_what_commands_show():
+    """Std of the states that it corrects over that of the tilts, or the rotors' difference or sum."""
+    rng = np.random.default_rng(5)
+    std = rng.uniform(0.5, 2.0, N_FULL)
+    covariances = np.array([0.5, 1.5])[:, None, None] * np.diag(std**2)  # of mean 1
+    e = rng.standard_normal((4000, 4)) * [1.0, 2.0, 0.01, 0.03]
+    run = made_pass(np.zeros((4000, 4)), np.zeros((4000, N_FULL)), covariances)
+    gains = {f.name: f for f in _gains([run], [e])}
+    assert list(gains) == list(P.COMMAND_GAINS) and all(f.value == 0.0 for f in gains.values())
+    tilt, rotors = math.sqrt(0.5 * (0.01**2 + 0.03**2)), math.sqrt(5.0)
+    for name, states, commands in (
+        ("rate_xy", (3, 4), tilt), ("moment_xy", (23, 24), tilt), ("force_xy", (20, 21), tilt),
+        ("rate_z", (5,), rotors), ("moment_z", (25,), rotors), ("speed_z", (2,), rotors),
+        ("force_z", (22,), rotors),
+    ):  # fmt: skip
+        expected = np.mean(std[list(states)]) / commands
+        assert gains[f"command_gain.{name}"].std == pytest.approx(expected, rel=0.05), name
+    tied = e.copy()
+    tied[:, 1] = tied[:, 0]  # the rotors are only moved together
+    names = [f.name for f in _gains([run], [tied])]
+    assert not any(n.endswith(("rate_z", "moment_z")) for n in names) and len(names) == 5
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from coax_env.estimation.quadratic import Linearised, Quadratic
+from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.state_space import FreeParameter
 
 NAMES = ("a", "b", "c", "d", "e")
@@ -94,6 +94,17 @@ def test_it_is_summed_over_the_runs_of_a_linearisation():
     np.testing.assert_allclose(q.lower, [-2.0, -np.inf])
     np.testing.assert_allclose(q.upper, [2.0, np.inf])
     assert q.names == ("a", "b")
+
+
+def test_a_move_is_added_to_where_it_was_taken():
+    q = quadratic(4)
+    move = np.array([0.5, 0.0, -1.0, 2.0, 0.1])
+    assert q.moved(move) == pytest.approx(dict(zip(NAMES, q.at + move, strict=True)))
+
+
+def test_a_penalty_is_half_the_squared_distance_in_prior_widths():
+    free = [FreeParameter("a", 1.0, 0.5), FreeParameter("b", -3.0, 4.0)]
+    assert penalty(free, {"a": 2.5, "b": 1.0, "other": 9.0}) == pytest.approx(0.5 * (9.0 + 1.0))
 
 
 # --- what the data determine -------------------------------------------------------------------------

@@ -148,11 +148,7 @@ def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States anywhere in flight (29, SIMD_WIDTH), inputs (6, SIMD_WIDTH), vehicles (n, SIMD_WIDTH)."""
     rng = np.random.default_rng(seed)
     state, command = hover_trim(LAMA)
-<<<<<<< HEAD
-    x = full_state(state, command, LAMA)[:, None] + rng.normal(0.0, 0.3, (29, SIMD_WIDTH))
-=======
     x = full_state(state, command, LAMA)[:, None] + rng.normal(0.0, 0.3, (N_FULL, SIMD_WIDTH))
->>>>>>> actuators
     x[S.PSI] += rng.uniform(-30.0, 30.0, SIMD_WIDTH)
     u = np.zeros((N_INPUTS, SIMD_WIDTH))
     u[: U.TIME] = command[:, None] * (1.0 + rng.normal(0.0, 0.1, (4, SIMD_WIDTH)))

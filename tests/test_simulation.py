@@ -7,11 +7,18 @@ import pytest
 
 from coax_env import InputError, load_vehicle, read_flight, simulate, write_flight
 from coax_env.model import dynamics
-from coax_env.model.layout import CHANNELS
+from coax_env.model.layout import CHANNELS, N_FULL
 from coax_env.model.sensors import SUITES
 from coax_env.simulation import paper_doublet
 from coax_env.simulation import simulate as sim
-from coax_env.simulation.maneuvers import MANEUVERS, Maneuver, maneuver
+from coax_env.simulation.maneuvers import (
+    MANEUVERS,
+    Maneuver,
+    doublet,
+    maneuver,
+    pulses,
+    steps_3211,
+)
 
 LAMA = load_vehicle("lama400d")
 
@@ -63,6 +70,69 @@ def test_effects_do_not_enter_the_papers_table(table):
     assert paper_doublet.doublet_table(extended)[0].run == table["u"].run
 
 
+def made_row(**changes) -> paper_doublet.DoubletRow:
+    given = dict(
+        quantity="u", unit="m/s", paper="2", axis=(-2.0, 2.0), equations=(-1.0, 3.0), digits=1,
+        run=(-1.0, 3.0), reduced=(-1.0, 1.0),
+    )  # fmt: skip
+    return paper_doublet.DoubletRow(**{**given, **changes})
+
+
+def test_the_doublet_from_rest_at_trim_speeds_goes_where_the_flown_one_does():
+    """Started level and not in trim, but pushed the same way, for as long."""
+    _, trim = dynamics.hover_trim(LAMA, 2.0)
+    end = paper_doublet._doublet_at(LAMA, trim[:2])
+    flown = sim.fly(LAMA, "lon_doublet")
+    assert end[13] == pytest.approx(flown["x"][-1] - flown["x"][0], rel=0.1)
+    assert end[15] == pytest.approx(flown["z"][-1] - flown["z"][0], abs=0.15)
+
+
+def test_a_row_agrees_within_two_per_cent_or_half_a_digit():
+    """Half a digit of 1.0 is 0.05, two per cent of 30 are 0.6: whichever is more, at either end."""
+    assert made_row().agrees
+    for run, agrees in (
+        ((-1.049, 3.0), True), ((-1.051, 3.0), False), ((-0.949, 3.0), False),
+        ((-1.0, 3.059), True), ((-1.0, 3.061), False), ((-1.0, 2.939), False),
+    ):  # fmt: skip
+        assert made_row(run=run).agrees == agrees, run
+    large = dict(equations=(-30.0, 30.0))
+    assert made_row(run=(-30.59, 30.0), **large).agrees
+    assert not made_row(run=(-30.61, 30.0), **large).agrees
+    assert not made_row(run=(-30.0, 30.61), **large).agrees
+
+
+def test_a_row_fits_where_both_its_ends_are_on_the_axis():
+    for run, fits in (((-2.0, 2.0), True), ((-2.1, 0.0), False), ((0.0, 2.1), False)):
+        assert made_row(run=run).fits_paper == fits
+        assert made_row(run=(9.0, 9.0), reduced=run).reduced_fits_paper == fits
+
+
+def test_a_remark_fails_where_any_of_its_numbers_does():
+    """A tenth is what small numbers are measured by: 0.01 off nothing is ten per cent."""
+
+    def holds(found: tuple[float, ...], tolerance: float = 0.1) -> bool:
+        return paper_doublet.Remark("r", (20.0, 0.0), found, tolerance).holds
+
+    assert holds((21.9, 0.009)) and holds((18.1, -0.009))
+    assert not holds((22.1, 0.0)) and not holds((17.9, 0.0)) and not holds((20.0, 0.011))
+    assert not holds((21.0, 0.0), 0.04)
+
+
+def test_remarks_are_held_to_the_digits_they_print():
+    """Whoever says 43, 2.9 or 6.07 claims less than a twentieth; only the quoted speeds are rougher."""
+    for remark in paper_doublet.doublet_remarks():
+        rough = "2000/2150" in remark.statement
+        off = 1.1 if rough else 1.05
+        for k in range(len(remark.expected)):
+            found = list(remark.expected)
+            found[k] *= off
+            assert not paper_doublet.Remark(
+                "", remark.expected, tuple(found), remark.tolerance
+            ).holds
+        for number in remark.expected:
+            assert f"{abs(number):g}" in remark.statement
+
+
 # --- maneuvers ----------------------------------------------------------------------------------
 
 
@@ -86,6 +156,58 @@ def test_differential_leaves_the_swash_alone_and_moves_the_rotors_apart():
     added = maneuver("yaw_3211").injection(np.arange(0, 14, 0.01), trim)
     np.testing.assert_allclose(added[:, 0] / 200.0, -added[:, 1] / 210.0)
     assert added[:, 0].max() > 1.0 and not added[:, 2:].any()
+
+
+def levels_of(axis: str, steps, seconds: float = 12.0) -> np.ndarray:
+    """What is added to a trim of ones, every 10 ms."""
+    plan = Maneuver("m", seconds, "", injected={axis: steps})
+    return plan.injection(np.arange(0.0, seconds, 0.01), np.ones(4))
+
+
+def test_a_doublet_is_two_sides_of_one_length():
+    added = levels_of("delta_lat", doublet(0.3, start=1.0, side=0.5))[:, 3]
+    for begin, end, level in ((0, 100, 0.0), (100, 150, 0.3), (150, 200, -0.3), (200, 1200, 0.0)):
+        np.testing.assert_allclose(added[begin:end], level)
+
+
+def test_a_3211_alternates_and_ends_at_nothing():
+    added = levels_of("delta_lon", steps_3211(0.2, start=1.0, unit=0.25))[:, 2]
+    edges = 100 + np.array([0, 75, 125, 150, 175])
+    for k, level in enumerate((0.2, -0.2, 0.2, -0.2)):
+        np.testing.assert_allclose(added[edges[k] : edges[k + 1]], level)
+    assert not added[:100].any() and not added[275:].any()
+
+
+def test_pulses_alternate_with_pauses_between_them():
+    added = levels_of("delta_lon", pulses(0.2, start=1.0, width=0.25, pause=0.75, count=3))[:, 2]
+    expected = np.zeros(1200)
+    expected[100:125] = expected[300:325] = 0.2
+    expected[200:225] = -0.2
+    np.testing.assert_allclose(added, expected)
+
+
+def test_collective_and_differential_are_shares_of_each_rotors_trim():
+    plan = Maneuver(
+        "m", 1.0, "", injected={"collective": [(0.0, 0.1)], "differential": [(0.5, 0.02)]}
+    )
+    added = plan.injection(np.array([0.2, 0.5]), np.array([200.0, 210.0, 0.3, 0.4]))
+    np.testing.assert_allclose(added[0], [20.0, 21.0, 0.0, 0.0])
+    np.testing.assert_allclose(added[1], [24.0, 16.8, 0.0, 0.0])
+
+
+def test_a_pilot_is_asked_for_straight_lines_and_else_to_stay():
+    plan = Maneuver("m", 9.0, "", asked={"right": [(1.0, 0.0), (3.0, 4.0)]}, height=2.5)
+    found = plan.asked_for(np.array([0.0, 1.5, 3.0, 8.0]))
+    np.testing.assert_allclose(found[:, 2], [0.0, 1.0, 4.0, 4.0])
+    np.testing.assert_allclose(found[:, [0, 1, 3]], np.tile([2.5, 0.0, 0.0], (4, 1)))
+
+
+def test_a_scaled_maneuver_has_its_steps_larger_and_all_else_as_it_was():
+    plan = maneuver("yaw_3211")
+    t = np.arange(0.0, 14.0, 0.01)
+    ratio = plan.scaled(1.5).injection(t, np.ones(4)) - 1.5 * plan.injection(t, np.ones(4))
+    np.testing.assert_allclose(ratio, 0.0, atol=1e-12)
+    assert plan.scaled(1.5).asked == plan.asked and plan.scaled(1.5).height == plan.height
 
 
 def test_unknown_maneuvers_and_axes_are_told():
@@ -181,6 +303,41 @@ def test_servo_delay_shifts_the_swash_by_its_time():
         np.testing.assert_allclose(track["theta"][moving], late[moving], atol=2e-4)
 
 
+def test_a_wind_has_always_blown():
+    """Gusts of the first row have the size of all later ones: none starts from still air."""
+    gusts = sim.Gusts((0.05, 0.1, 0.2), (1e-3, 2e-3, 3e-3), memory_s=0.3)
+    state, trim = dynamics.hover_trim(LAMA, 2.0)
+    rng = np.random.default_rng(3)
+    first = []
+    for _ in range(800):
+        machine = sim._Machine(LAMA, state, trim, 0.01, gusts)
+        machine.disturb(rng)
+        first.append(machine.x[20:26])
+    np.testing.assert_allclose(np.std(first, axis=0), gusts.levels(), rtol=0.1)
+
+
+def test_a_rotor_is_never_told_to_turn_backwards():
+    """However much a maneuver takes off: a pilot's command stops at a standstill."""
+    falling = maneuver("hover", injected={"collective": [(2.5, -1.5)]})
+    track = sim.fly("lama400d", falling)
+    assert track.command[:, :2].min() == 0.0 and track.ended
+
+
+def test_a_run_ends_upside_down_in_the_ground_or_where_numbers_end():
+    """Thrust that points sideways holds nothing up: beyond some 80 degrees there is no flight."""
+    x = np.zeros(N_FULL)
+    x[15] = -1.0
+    assert sim._why_it_ends(x) == ""
+    for place, value, words in (
+        (10, 1.3, ""), (10, -1.3, ""), (10, 1.5, "tipped"), (11, -1.5, "tipped"),
+        (15, 0.01, "ground"), (15, -0.01, ""), (3, np.nan, "diverged"),
+    ):  # fmt: skip
+        changed = x.copy()
+        changed[place] = value
+        found = sim._why_it_ends(changed)
+        assert words in found and bool(found) == bool(words), (place, value, found)
+
+
 def test_gusts_have_the_size_and_memory_asked_for():
     gusts = sim.Gusts((0.05, 0.1, 0.2), (1e-3, 2e-3, 3e-3), memory_s=0.3)
     plan = maneuver("hover", duration=40.0)
@@ -190,6 +347,20 @@ def test_gusts_have_the_size_and_memory_asked_for():
     now, later = force[:-30], force[30:]
     correlation = (now * later).mean(axis=0) / (force**2).mean(axis=0)
     np.testing.assert_allclose(correlation, math.exp(-1.0), atol=0.12)
+
+
+def test_a_machine_shakes_at_its_upper_rotors_speed():
+    """A sine whose frequency is that rotor's turns, on every axis."""
+    plan = maneuver("hover", closed_loop=False, duration=10.0)
+    shaking, still = (
+        sim.fly(LAMA.with_effect("vibration", amplitude=0.5), plan),
+        sim.fly(LAMA, plan),
+    )
+    for channel in ("ax", "ay", "az"):
+        line = (shaking.reading(channel) - still.reading(channel))[:-1]
+        assert line.std() == pytest.approx(0.5 / math.sqrt(2.0), rel=0.02)
+        turns = np.fft.rfftfreq(line.size, 0.01)[np.abs(np.fft.rfft(line)).argmax()]
+        assert 2.0 * math.pi * turns == pytest.approx(still.command[0, 0], abs=2.0 * math.pi * 0.1)
 
 
 # --- the log ------------------------------------------------------------------------------------

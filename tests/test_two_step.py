@@ -22,7 +22,7 @@ from coax_env import identify, load_vehicle, simulate
 from coax_env.errors import InputError
 from coax_env.files import write_text
 from coax_env.identification.two_step import method, modes
-from coax_env.identification.two_step.columns import DRAWS, IMU, columns_of, joined, rows_of
+from coax_env.identification.two_step.columns import DRAWS, IMU, Rows, columns_of, joined, rows_of
 from coax_env.identification.two_step.loads import coefficients, loads
 from coax_env.identification.two_step.modes import MODES, PHYSICS, fit_mode, fit_physics
 from coax_env.identification.two_step.processing import (
@@ -962,6 +962,31 @@ def test_a_hover_moves_nothing_and_says_so():
     assert result.after.values() == LAMA.values()
 
 
+def test_a_clock_that_starts_late_changes_nothing():
+    """Times are counted from a run's own start, the noise record's first seconds too."""
+    flight = simulate(LAMA, ("hover", "lon_3211"), seed=4)
+    late = replace(flight, runs=tuple(replace(run, t=run.t + 64.0) for run in flight.runs))
+    first, shifted = identify(flight, method="paper"), identify(late, method="paper")
+    assert shifted.after.values() == pytest.approx(first.after.values(), rel=1e-9)
+    for a, b in zip(first.reconstructed, shifted.reconstructed, strict=True):
+        assert b.t[0] == 0.0
+        n = len(b.t)  # rounding of the late clock may cost the last row
+        assert len(a.t) - n <= 1
+        np.testing.assert_allclose(b.t, a.t[:n], atol=1e-9)
+        inside = slice(100, n - 100)
+        np.testing.assert_allclose(b.states.states[inside], a.states.states[inside], atol=1e-3)
+        taken_off = [np.std(part.spectral["q"] - part.smooth["q"]) for part in (a, b)]
+        assert 0.0 < taken_off[1] == pytest.approx(taken_off[0], rel=0.1), "by its noise record"
+
+
+def test_a_columns_spread_is_about_each_runs_own_mean():
+    """Two runs at 3 and -5, each of unit variance: what differs between them is no movement."""
+    wave = np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(200) / 50)
+    column = np.concatenate([3.0 + wave, -5.0 + wave[:100]])
+    rows = Rows({"q": column}, {}, (200, 100), np.arange(300.0))
+    assert modes._spread(rows, "q") == pytest.approx(1.0)
+
+
 # --- Table VIII -----------------------------------------------------------------------------------
 
 
@@ -979,6 +1004,15 @@ def test_the_papers_own_tables_predict_something_else():
     assert theory["C_Z"]["T_l"] == pytest.approx(0.0033, abs=1e-4)
     assert theory["C_Z"]["T_u"] == pytest.approx(-0.0026, abs=1e-4)
     assert theory["C_Z"]["1"] == pytest.approx(0.0259, abs=3e-4)
+    radius, lift = LAMA["rotor_radius"].value, -sum(theory["C_X"].values())
+    for tilt, arm in (("alpha_u", "arm_upper"), ("alpha_l", "arm_lower")):
+        lever = -LAMA[arm].value / radius  # a thrust tilted back, above the centre of mass
+        assert theory["C_m"][tilt] == pytest.approx(lever * theory["C_X"][tilt])
+    level = loads(LAMA, *(rpm * np.pi / 30.0 for rpm in (2000.0, 2143.0)))
+    assert theory["C_X"]["alpha_u"] / theory["C_X"]["alpha_l"] == pytest.approx(
+        level.T_u / level.T_l
+    )
+    assert lift * level.T_u / (level.T_u + level.T_l) == pytest.approx(-theory["C_X"]["alpha_u"])
     for row in table_viii():
         away = abs(row.values["alpha_l"] - theory[row.response]["alpha_l"]) / row.std["alpha_l"]
         assert away > 15.0

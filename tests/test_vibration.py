@@ -1,6 +1,7 @@
 """A line at rotor speed, planted by hand: what it is worth is known without the code."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -85,6 +86,15 @@ def test_the_evidence_is_that_of_the_power_over_its_neighbours():
         for seed in range(6)
     ]
     assert np.mean(evidence) == pytest.approx(expected, rel=0.12)
+
+
+def test_a_clock_that_starts_late_changes_nothing():
+    """Segments are seconds of a run, not of a clock."""
+    flight = shaken(ALL, seconds=10)
+    late = replace(flight, runs=tuple(replace(run, t=run.t + 40.375) for run in flight.runs))
+    first, shifted = vibration._line(flight, "upper"), vibration._line(late, "upper")
+    assert shifted.amplitude == pytest.approx(first.amplitude, rel=1e-9)
+    assert shifted.evidence == pytest.approx(first.evidence, rel=1e-9)
 
 
 def test_the_std_is_the_scatter():

@@ -39,13 +39,15 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/env/fl*": (*_ENV, "tests/test_simd.py"),
     "coax_env/env/turbulence.py": ("tests/test_turbulence.py", *_ENV),
     "coax_env/env/*": _ENV,
+    "coax_env/simulation/multisine.py": ("tests/test_flight_plan.py",),
+    "coax_env/simulation/pilot.py": ("tests/test_pilot.py", "tests/test_simulation.py"),
     "coax_env/simulation/*": ("tests/test_simulation.py", "tests/test_sensors.py"),
     "controllers/estimator.py": (
         "tests/test_estimator.py", "tests/test_faulty_sensors.py", "tests/test_controllers.py",
     ),
     "coax_env/estimation/quadratic.py": ("tests/test_quadratic.py", "tests/test_diagnosis.py"),
     "coax_env/estimation/prediction.py": ("tests/test_prediction.py", "tests/test_diagnosis.py"),
-    "coax_env/estimation/trajectories.py": ("tests/test_report.py",),
+    "coax_env/estimation/trajectories.py": ("tests/test_trajectories.py", "tests/test_report.py"),
     "coax_env/estimation/*": (
         "tests/test_estimation.py", "tests/test_kalman.py", "tests/test_helicopter.py",
         "tests/test_fitted_vehicle.py",
@@ -53,13 +55,21 @@ OWN: dict[str, tuple[str, ...]] = {
         "tests/test_diagnosis.py",
     ),
     "coax_env/identification/two_step/*": ("tests/test_two_step.py",),
-    "coax_env/identification/*": ("tests/test_identification.py", "tests/test_two_step.py"),
+    "coax_env/identification/*": (
+        "tests/test_run_estimates.py", "tests/test_identification.py", "tests/test_two_step.py",
+    ),
     "coax_env/diagnosis/gain.py": ("tests/test_gain.py", "tests/test_diagnosis.py"),
+    "coax_env/diagnosis/refinement.py": (
+        "tests/test_refinement.py", "tests/test_diagnosis.py", "tests/test_unlisted.py",
+    ),
+    "coax_env/diagnosis/hold_out.py": (
+        "tests/test_hold_out.py", "tests/test_trust.py", "tests/test_diagnosis.py",
+    ),
     "coax_env/diagnosis/vibration.py": ("tests/test_vibration.py", "tests/test_unlisted.py"),
     "coax_env/diagnosis/calibration.py": ("tests/test_study.py",),
     "coax_env/diagnosis/*": (
-        "tests/test_diagnosis.py", "tests/test_unlisted.py", "tests/test_input_innovations.py",
-        "tests/test_gain.py",
+        "tests/test_scores.py", "tests/test_diagnosis.py", "tests/test_unlisted.py",
+        "tests/test_input_innovations.py", "tests/test_gain.py",
     ),
 }  # fmt: skip
 """Pattern of files -> the tests that belong to them, tried first, in this order; the first fit."""

@@ -217,7 +217,7 @@ def _reconstruct(
         except InputError:  # no noise record of a segment's length
             spectral[c] = smooth[c]
     g = vehicle["gravity"].value
-    places = np.clip(np.searchsorted(t, run.t), 0, len(t) - 1)
+    places = np.clip(np.round((run.t - t[0]) / dt).astype(int), 0, len(t) - 1)  # the nearest
     sonar = np.full(len(t), np.nan)
     there = np.isfinite(run.measured["h"])
     sonar[places[there]] = run.measured["h"][there]

@@ -1,0 +1,71 @@
+"""Which runs are held out, from information that is given by hand: nothing else may decide."""
+
+import numpy as np
+import pytest
+
+from coax_env import InputError, load_vehicle
+from coax_env.diagnosis.hold_out import check_hold_out, fair_part, split
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.state_space import Noise, Record
+
+MODEL = HeliModel(load_vehicle("lama400d"))
+
+
+def records(count: int, seconds: float = 6.0, start: float = 20.0) -> list[Record]:
+    t = start + 0.01 * np.arange(round(seconds / 0.01) + 1)
+    return [
+        Record(f"run {k}", t, np.full((t.size, 4), float(k)), np.zeros((t.size, 18)), start)
+        for k in range(count)
+    ]
+
+
+def held(information: list[list[float]]) -> list[int]:
+    """Runs held out where each, of one length, has so much information on each effect."""
+    table = np.array(information)
+    n, k = table.shape
+    return fair_part(table / table.sum(axis=0), np.ones(k), np.full(n, 1.0 / n))
+
+
+def test_a_quarter_of_the_information_on_each_effect_is_held_out():
+    """Two of eight runs whose shares add up to a quarter of either effect's, and no other two."""
+    thin = [[1.0, 40.0], [40.0, 1.0], [1.0, 1.0], [1.0, 1.0], [1.0, 1.0], [1.0, 2.0]]
+    fair = [[15.0, 9.0], [1.0, 7.0]]  # of 61 and 62
+    assert held([*thin[:3], fair[0], *thin[3:], fair[1]]) == [3, 7]
+
+
+def test_the_only_run_that_shows_an_effect_is_fitted():
+    """Run 2 has a fair share of the one effect, but all of the other: it stays."""
+    assert 2 not in held([[25.0, 0.0], [25.0, 0.0], [25.0, 100.0], [25.0, 0.0]])
+    # a run with three quarters stays too: one with an eighth is held out
+    assert held([[5.0], [75.0], [12.0], [8.0]]) == [2]
+
+
+def test_an_effect_that_could_not_be_measured_is_held_out_rather_than_an_even_share():
+    """Runs with a twentieth of the one effect are passed over for one with half of it."""
+    assert held([[50.0, 20.0], [40.0, 40.0], [5.0, 25.0], [5.0, 15.0]])[0] in (0, 1)
+
+
+def test_of_few_runs_the_last_third_of_each_is_held_out():
+    """Split at two thirds of their own time, wherever the clock starts; every row once."""
+    some = records(3)
+    fit, out = split(MODEL, some, Noise({}), None, ("gyro_bias",), SETTINGS)
+    assert [r.name for r in fit] == ["run 0", "run 1", "run 2"]
+    assert [r.name for r in out] == [f"run {k} (last third)" for k in range(3)]
+    for whole, first, last in zip(some, fit, out, strict=True):
+        np.testing.assert_array_equal(np.concatenate([first.t, last.t]), whole.t)
+        assert last.t[0] == pytest.approx(24.0, abs=0.011)
+        assert first.command.shape[0] == first.t.size and last.z.shape[0] == last.t.size
+        assert first.origin == last.origin == whole.origin
+
+
+def test_runs_that_are_named_are_held_out_and_not_all_may_be():
+    fit, out = split(MODEL, records(5), Noise({}), ["run 1", "run 4"], (), SETTINGS)
+    assert [r.name for r in fit] == ["run 0", "run 2", "run 3"]
+    assert [r.name for r in out] == ["run 1", "run 4"]
+    fit, out = split(MODEL, records(2), Noise({}), [], (), SETTINGS)
+    assert len(fit) == 2 and out == []
+    check_hold_out(["a"], ["a", "b"])
+    check_hold_out(None, ["a"])
+    with pytest.raises(InputError, match="nothing is left"):
+        check_hold_out(["b", "a"], ["a", "b"])
