@@ -95,7 +95,7 @@ def test_a_bias_of_its_flight_is_the_same_in_all_its_rows():
 def test_an_unbalance_turns_with_the_rotor(azimuth):
     """Its push lies in the rotor's plane, of one size, a quarter turn ahead in y; all else is still."""
     readings = np.arange(18.0)
-    add_vibration(readings, azimuth, 0.3)
+    add_vibration(readings, azimuth, 0.3, 0.0, 0.0, 0.0)
     change = dict(zip(CHANNELS, readings - np.arange(18.0), strict=True))
     assert math.hypot(change["ax"], change["ay"]) == pytest.approx(0.3)
     assert math.atan2(change["ax"], change["ay"]) == pytest.approx(azimuth)
