@@ -26,7 +26,6 @@ from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
 from coax_env.diagnosis.evidence import prune
-from coax_env.diagnosis.fits import fitted, noise_fitted, start
 from coax_env.diagnosis.gain import gain_of
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.input_innovations import (
@@ -37,7 +36,7 @@ from coax_env.diagnosis.input_innovations import (
 from coax_env.diagnosis.model_check import model_check
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import one_step_against_a_second, remarks, vibration_removed
-from coax_env.diagnosis.search import search
+from coax_env.diagnosis.searched import searched
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
@@ -136,15 +135,11 @@ def diagnose(
     records = [record_of(run) for run in calm.runs]
     used, held = split(model, records, noise, hold_out, candidates, settings)
 
-    report("estimating gusts and noise of the model as given")
     problem = Problem.of(model, used, candidates, settings, progress)
-    bare = start(problem, noise)
+    first = searched(problem, noise)
+    bare, refitted = first.bare, first.refitted
     passes_before = problem.engine.filter(bare.values, bare.noise)
-    report("fitting the model's own parameters")
-    refitted = noise_fitted(problem, fitted(problem, bare))
-    report("searching for causes")
-    fit, quadratic = search(problem, refitted)
-    problem, fit, quadratic, terms = unlisted.explain(problem, fit, quadratic)
+    problem, fit, quadratic, terms = unlisted.explain(problem, first.fit, first.quadratic)
     report("weighing the causes against their confounded alternatives")
     problem, fit = with_command_gains(beside_large_axes(problem, fit), fit)
     fit, quadratic, evidence = prune(problem, fit)

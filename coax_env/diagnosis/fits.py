@@ -14,13 +14,17 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 
 
-def start(problem: Problem, noise: Noise) -> Fit:
-    """The bare model with its own noise levels."""
+def start(problem: Problem, noise: Noise, held: Collection[str] = ()) -> Fit:
+    """The bare model with its own noise levels.
+
+    Args:
+        problem: what may be free. noise: levels to start from. held: those that stay.
+    """
     values = dict(problem.model.bare_values)
     for f in problem.parameters:
         values.setdefault(f.name, f.value)
     chosen = problem.settings
-    levels = fitted_levels(noise)
+    levels = tuple(name for name in fitted_levels(noise) if name not in held)
     noise = fit_noise(
         problem.engine, values, noise, levels,
         chosen.first_noise_evaluations, chosen.step_gain, chosen.noise_fit_seconds,

@@ -1,0 +1,83 @@
+"""From the model as given to the causes found, and again with readings believed less.
+
+A likelihood that no model in reach makes white is spent on what happens within a few rows: with the
+readings of a motion capture it prefers numbers that fit the last tenth of a millimetre and fly the
+next second worse. So where innovations stay coloured and readings are finer than a rigid body is
+(LEAST_READING_STD), the search is done a second time with readings no finer than that, and the model
+whose open-loop flight over the horizon is nearer to the fitted runs is kept (the likelihood raised to
+a power less than 1, for a model that is wrong: Miller and Dunson 2019, J. Am. Stat. Assoc. 114).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coax_env.diagnosis.fits import fitted, noise_fitted, start
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.search import search
+from coax_env.estimation.helicopter_noise import LEAST_READING_STD
+from coax_env.estimation.prediction import pooled_rms, replay_runs
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import Noise
+from coax_env.estimation.whiteness import is_white
+
+FINER = 2.0
+"""Times finer than LEAST_READING_STD that a channel must be for a second search; ours."""
+
+
+@dataclass(frozen=True)
+class Searched:
+    """The model as given, with its own numbers refitted, and with causes; the quadratic at the last.
+
+    coarse: whether readings were taken to be no finer than LEAST_READING_STD.
+    """
+
+    bare: Fit
+    refitted: Fit
+    fit: Fit
+    quadratic: Quadratic
+    coarse: bool = False
+
+
+def searched(problem: Problem, noise: Noise) -> Searched:
+    """The search from a starting noise, and from a coarser one where that flies better.
+
+    Args:
+        problem: what may be free. noise: levels to start from.
+    """
+    first = _searched(problem, noise)
+    coarser = _coarser(first.fit.noise)
+    passes = problem.engine.filter(first.fit.values, first.fit.noise)
+    if not coarser or is_white(passes, problem.model.channels):
+        return first
+    problem.report("the innovations stay coloured: searching again with readings believed less")
+    second = _searched(problem, noise.with_levels(coarser), coarse=True)
+    return second if _flies_better(problem, second.fit, first.fit) else first
+
+
+def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
+    problem.report("estimating gusts and noise of the model as given")
+    bare = start(problem, noise, held=LEAST_READING_STD if coarse else ())
+    problem.report("fitting the model's own parameters")
+    refitted = noise_fitted(problem, fitted(problem, bare))
+    problem.report("searching for causes")
+    return Searched(bare, refitted, *search(problem, refitted), coarse)
+
+
+def _coarser(noise: Noise) -> dict[str, float]:
+    """Levels of readings that are much finer than a rigid body, as coarse as that."""
+    return {
+        c: LEAST_READING_STD[c]
+        for c, std in noise.reading.items()
+        if FINER * std < LEAST_READING_STD[c]
+    }
+
+
+def _flies_better(problem: Problem, fit: Fit, other: Fit) -> bool:
+    """Whether the open-loop errors of a fit on the fitted runs are smaller, by their geometric mean."""
+    horizon = problem.settings.horizon
+    ours, theirs = (
+        pooled_rms(replay_runs(problem.engine, f.values, f.noise, horizon)) for f in (fit, other)
+    )
+    logs = [np.log(ours[c] / theirs[c]) for c in ours if theirs.get(c, 0.0) > 0.0]
+    return bool(logs) and float(np.mean(logs)) < 0.0
