@@ -28,7 +28,10 @@ from controllers import lqr
 LONGEST = 2000  # steps of a flight
 HELD = 25  # steps for which a random command is held
 PUSH = 0.3  # std of what is added to an LQG's actions
-FARTHEST = {"rad/s": 1e4, "m/s": 100.0, "m": 100.0, "rad": 1e4, "N": 100.0, "N m": 100.0}
+FARTHEST = {
+    "rad/s": 1e4, "m/s": 100.0, "m": 100.0, "rad": 1e4, "N": 100.0, "N m": 100.0,
+    "1": 100.0,
+}  # fmt: skip
 """Bounds of the states, by unit: far beyond any flight, far below what runs away. A heading counts its
 turns: a light machine with both rotors at their ends spins by a hundred in a flight."""
 

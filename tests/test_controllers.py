@@ -80,7 +80,7 @@ def test_the_riccati_solution_is_the_simulated_cost(exact):
 def test_the_regulators_weights_are_the_cost_every_controller_is_judged_by(exact):
     rng = np.random.default_rng(1)
     _, _, Q, R = lqr.regulator_problem(exact.estimator)
-    states, action = np.zeros(26), rng.standard_normal(4)
+    states, action = np.zeros(29), rng.standard_normal(4)
     states[:16] = rng.standard_normal(16)
     states[10:13] *= 0.1
     deviation = np.zeros(len(Q))

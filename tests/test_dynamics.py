@@ -979,7 +979,7 @@ from coax_env.kernel import lazy
 compiled = []
 make = lazy.pointer
 lazy.pointer = lambda kind: lambda f: (compiled.append(f.__name__), make(kind)(f))[1]
-x, work = np.zeros(26), np.zeros(dynamics.WORK_SIZE)
+x, work = np.zeros(29), np.zeros(dynamics.WORK_SIZE)
 bare = coax_env.load_vehicle("lama400d")
 
 def fly(vehicle):

@@ -196,7 +196,7 @@ def test_a_step_is_the_kernels_step():
     _, info = env.reset(seed=1)
     action = actions(3, 4)
     trim, scale = action_map(LAMA)
-    expected = np.empty(26)
+    expected = np.empty(29)
     command = kernel_input(trim + scale * action.astype(float))
     step(info["state"], command, DT, LAMA.vector, np.zeros(WORK_SIZE), expected)
     assert np.array_equal(env.step(action)[4]["state"], expected)

@@ -15,13 +15,14 @@ from coax_env.env.period import DT
 from coax_env.kernel.random_streams import stream_key
 from coax_env.model.dynamics import derivative
 from coax_env.model.layout import CHANNELS, FULL_STATES, N_FULL
+from coax_env.model.linear import N_SAMPLED
 from coax_env.model.sampling import is_new
 from coax_env.model.sensors import suite
 from controllers import estimator
 from controllers.estimator import BIAS_STD, Tracker, delay_as_lag, design_estimator
 
 LAMA = load_vehicle("lama400d")
-X = {name: i for i, (name, _) in enumerate(FULL_STATES)}
+X = {name: i for i, (name, _) in enumerate(FULL_STATES[:N_SAMPLED])}
 TRIM = hover_trim(LAMA)
 
 

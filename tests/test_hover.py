@@ -21,7 +21,7 @@ def stream(seed: int = 0) -> np.ndarray:
 def somewhere(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A state, an action and a target, x y z psi."""
     rng = np.random.default_rng(seed)
-    x = np.zeros(26)
+    x = np.zeros(29)
     x[:16] = rng.uniform(-1, 1, 16) * [1, 1, 1, 2, 2, 2, 0.1, 0.1, 0.1, 0.1, 0.5, 0.5, 9, 3, 3, 1]
     return x, rng.uniform(-1, 1, 4), rng.uniform(-1, 1, 4) * [2, 2, 1, 3]
 
@@ -85,17 +85,17 @@ ENDS = [
 @pytest.mark.parametrize(("where", "within", "without"), ENDS)
 def test_a_flight_ends_at_its_bounds(where, within, without):
     for size, over in ((within, False), (without, True)):
-        x = np.zeros(26)
+        x = np.zeros(29)
         x[15] = -1.5
         for name, share in where.items():
             x[X[name]] = size * share
         assert bool(hover.is_over(x)) is over
 
 
-@pytest.mark.parametrize("i", range(26))
+@pytest.mark.parametrize("i", range(29))
 def test_a_state_that_is_no_number_ends_the_flight(i):
     for wrong in (math.nan, math.inf, -math.inf):
-        x = np.zeros(26)
+        x = np.zeros(29)
         x[15] = -1.5
         x[i] = wrong
         assert bool(hover.is_over(x))
@@ -106,9 +106,9 @@ def test_starts_are_uniform_about_hover_and_settled():
     starts = np.full((3000, N_FULL), 7.0)
     for x in starts:
         hover.random_start(own, command, x)
-    centre = np.zeros(26)
+    centre = np.zeros(N_FULL)
     centre[15], centre[16:20] = -1.5, command
-    half = np.zeros(26)
+    half = np.zeros(N_FULL)
     half[:3], half[3:6], half[10:12], half[12] = 0.3, 10 * DEGREE, 5 * DEGREE, 20 * DEGREE
     half[15] = 0.3
     away = starts - centre
@@ -187,7 +187,7 @@ AWAY = [
 
 @pytest.mark.parametrize(("away", "there"), AWAY)
 def test_a_waypoint_is_reached_after_a_dwell_within_its_reach(away, there):
-    x = np.zeros(26)
+    x = np.zeros(29)
     x[13:16], x[12] = AT[:3], AT[3]
     for name, size in away.items():
         x[X[name]] += size
@@ -198,7 +198,7 @@ def test_a_waypoint_is_reached_after_a_dwell_within_its_reach(away, there):
 
 
 def test_leaving_begins_the_dwell_anew_and_a_course_ends():
-    x, away = np.zeros(26), np.zeros(26)
+    x, away = np.zeros(29), np.zeros(29)
     x[13:16], x[12] = AT[:3], AT[3]
     progress, course = np.zeros(2, dtype=np.int64), np.array([AT, AT])
     track = [x] * 4 + [away] + [x] * 30

@@ -184,7 +184,7 @@ def test_diagnosis_page_says_what_was_found(made):
         "71 % of the error of a 1 s prediction is gone on runs held out of the fit",
         "66 to 75 %, 95 % interval",
         "0 % by refitting alone",
-        "46 % by a black box of 270 generic terms",
+        "46 % by a black box of 318 generic terms",
         "Two runs of a lama400d",
         "the bare model misses height by 0.21 m (4.2 times the sensor's noise)",
         "+6.2 % (5.1 to 7.4) thrust at 0.25 m",

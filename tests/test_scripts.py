@@ -149,7 +149,7 @@ def check_refused(done: subprocess.CompletedProcess, folder: Path, *words: str) 
     assert done.returncode == 2, done.stderr
     lines = done.stderr.splitlines()
     assert len(lines) == 1, done.stderr
-    assert lines[0].startswith("error: ") and len(lines[0]) < 700
+    assert lines[0].startswith("error: ") and len(lines[0]) < 1000
     for word in words:
         assert word in lines[0], (word, lines[0])
     assert not done.stdout

@@ -337,7 +337,7 @@ def test_louder_noise_is_no_vibration(tmp_path, loud):
         replace(
             run,
             measured={
-                c: z + extra * rng.standard_normal(z.size) * (c in vibration.ACCELEROMETERS)
+                c: z + extra * rng.standard_normal(z.size) * (c in vibration.KINDS["amplitude"])
                 for c, z in run.measured.items()
             },
         )
@@ -357,7 +357,7 @@ def test_our_own_vibration_is_found_and_taken_out(sensors):
         runs = [
             replace(run, measured={
                 c: np.where(np.arange(z.size) % every == 0, z, np.nan)
-                if c in vibration.ACCELEROMETERS else z
+                if c in vibration.KINDS["amplitude"] else z
                 for c, z in run.measured.items()
             })
             for run in flight.runs
@@ -376,5 +376,5 @@ def test_vibration_is_reading_noise_to_the_filter():
     shaking = LAMA.with_effect("vibration", amplitude=0.4)
     bare, loud = (starting_noise(flight, v).reading for v in (LAMA, shaking))
     for channel, std in bare.items():
-        more = 0.4**2 / 2.0 if channel in vibration.ACCELEROMETERS else 0.0
+        more = 0.4**2 / 2.0 if channel in vibration.KINDS["amplitude"] else 0.0
         assert loud[channel] ** 2 == pytest.approx(std**2 + more)
