@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from coax_env import load_vehicle, simulate
+from coax_env.diagnosis.findings import noise_levels
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import (
@@ -17,7 +18,7 @@ from coax_env.estimation.helicopter_noise import (
     fitted_levels,
     starting_noise,
 )
-from coax_env.estimation.noise_levels import level_slopes
+from coax_env.estimation.noise_levels import fit_noise, level_slopes
 from coax_env.simulation.simulate import Gusts
 
 LAMA = load_vehicle("lama400d")
@@ -64,3 +65,32 @@ def test_slopes_are_those_of_the_likelihood(flown):
         ]
         exact = (sides[0] - sides[1]) / (2.0 * np.log(1.02))
         assert slope == pytest.approx(exact, rel=0.08, abs=2e-3 * size), name
+
+
+def test_every_level_is_reported_with_its_unit_and_whether_it_stands_at_a_bound(flown):
+    _, noise = flown
+    found = noise_levels(noise)
+    assert set(found) == {*noise.process, *noise.reading}
+    assert found["force_xy"]["unit"] == "N" and found["memory_moment_z"]["unit"] == "s"
+    assert found["p"] == {"value": noise.reading["p"], "unit": "rad/s", "at_bound": False}
+    assert found["trim_moment_z"]["at_bound"] and not found["moment_z"]["at_bound"]
+    most = noise.with_levels({"memory_force_z": noise.ceiling["memory_force_z"]})
+    assert noise_levels(most)["memory_force_z"]["at_bound"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", [0.05, 2.0])
+def test_the_memory_of_the_gusts_is_found(memory):
+    """Planted by the simulator, from the usual half second: within a factor that a minute allows."""
+    flight = simulate(
+        LAMA, ["lon_doublet", "climb_descend", "heading_turn"], seed=5, sensors="onboard",
+        gusts=Gusts((0.2, 0.2, 0.2), (4e-3, 4e-3, 2e-3), memory),
+    )  # fmt: skip
+    model = HeliModel(LAMA)
+    noise = starting_noise(flight, LAMA)
+    engine = Engine(model, [record_of(run) for run in flight.runs])
+    found = fit_noise(engine, model.bare_values, noise, fitted_levels(noise), evaluations=40)
+    for axes, level in (("force_xy", 0.2), ("moment_xy", 4e-3)):
+        assert found.level(axes) == pytest.approx(level, rel=0.35), axes
+        assert abs(np.log(found.level(f"memory_{axes}") / memory)) < np.log(1.8), axes
+    assert found.level("p") == pytest.approx(noise.level("p"), rel=0.1)

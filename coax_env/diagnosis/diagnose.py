@@ -172,6 +172,7 @@ def diagnose(
             "verdict": findings.verdict(causes, unexplained),
             "causes": causes,
             "gusts": gusts_of(fit.noise),
+            "noise": findings.noise_levels(fit.noise),
             "unexplained": unexplained,
             "gain": gain,
             "next_maneuver": next_maneuver.advise(design, settings.evidence),

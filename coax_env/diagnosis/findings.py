@@ -13,8 +13,9 @@ from coax_env.diagnosis.trust import Trust, of_line
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.engine import RunPass
 from coax_env.estimation.fitted_vehicle import median_step, with_timing
+from coax_env.estimation.helicopter_noise import level_unit
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.state_space import FreeParameter
+from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.model import effects
 from coax_env.model.layout import CHANNELS
@@ -136,3 +137,19 @@ def innovations(passes: Sequence[RunPass]) -> dict[str, dict[str, np.ndarray]]:
                 table[channel] = run.innovations[:, i]
         result[run.record.name] = table
     return result
+
+
+def noise_levels(noise: Noise) -> dict[str, dict[str, Any]]:
+    """Every level of the noise, process and readings (contract).
+
+    A level that stands at a bound says so: noise that is not there stands at the least that no model
+    is without.
+    """
+    return {
+        name: {
+            "value": float(noise.level(name)),
+            "unit": level_unit(name),
+            "at_bound": noise.at_bound(name),
+        }
+        for name in (*noise.process, *noise.reading)
+    }
