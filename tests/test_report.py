@@ -414,7 +414,7 @@ def test_the_page_prints(seen):
     paper = seen["paper"]
     assert paper["wide"] <= 700 and all(p["right"] <= 700 for p in paper["plots"])
     assert paper["folded"] == 0 and paper["buttons"] == 0
-    assert seen["after"]["folded"] == 2 and seen["after"]["buttons"] == seen["desk"]["buttons"]
+    assert seen["after"]["folded"] == 3 and seen["after"]["buttons"] == seen["desk"]["buttons"]
     assert seen["pdf"].startswith(b"%PDF") and len(seen["pdf"]) > 50_000
 
 

@@ -739,7 +739,8 @@ def test_one_flight_from_plan_to_table(tmp_path: Path, monkeypatch: pytest.Monke
     assert "error" not in row, row["error"]
     assert judge.is_exact_row(row)
     evidence = row["methods"]["coax"]["causes"][0]["evidence"]
-    assert 0.5 < evidence / row["expected"]["gyro_bias"] < 2.0
+    # without the cause the levels of the readings are fitted anew, and take up part of it
+    assert 0.3 < evidence / row["expected"]["gyro_bias"] < 2.0
     assert {"F > 4", "F > 20", "BIC"} <= set(row["methods"])
     store.store(tmp_path, flight, row)
     assert store.stored(tmp_path, flight) == row
