@@ -11,7 +11,7 @@ from study.one_flight import catalogue_values
 from coax_env.model import effects
 
 WITHIN = 3.0  # standard deviations
-DETERMINED = 0.25  # of the prior's width that a std may be: a wide interval holds every truth
+DETERMINED = 0.33  # of the prior's width that a std may be: a wide interval holds every truth
 FORM = 0.1  # of a value whose effect has another form in the injector than in the catalogue
 
 _OTHER_FORM = {name.partition(".")[0] for name in injector.OTHER_FORM}
