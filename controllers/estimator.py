@@ -173,7 +173,7 @@ def design_estimator(
         C_all[CHANNELS.index(name), N_SAMPLED + k] = 1.0
     D_all = np.vstack([D_channels, np.zeros((N_SAMPLED, N_COMMANDS))])
     rows = [s.index for s in used]
-    y_trim = np.concatenate([_trim_readings(vehicle, x_trim, u_trim), x_trim])[rows]
+    y_trim = np.concatenate([_trim_readings(vehicle, x_trim, u_trim), x_trim[:N_SAMPLED]])[rows]
 
     first, process = _spreads(vehicle, u_trim)
     noise = np.array([max(s.noise, _FREE_OF_NOISE) for s in used])

@@ -83,19 +83,19 @@ def check(
         report_progress: called with a line of text.
     """
     from coax_env import load_vehicle, read_flight
-    from coax_env.diagnosis.changes import Before, changes, fitted_model
-    from coax_env.estimation.flown import flown_parts
+    from coax_env.diagnosis.changes import Before, calm, changes, fitted_model
     from coax_env.estimation.helicopter import record_of
     from coax_env.logs.edits import edited
 
-    flight = read_flight(folder)
-    machine = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    log = read_flight(folder)
+    machine = load_vehicle(vehicle or log.vehicle).in_air(log.air)
+    flight = calm(log, machine)
     before = Before.of(*fitted_model(flight, machine, progress=report_progress))
     rows = []
     for name, size in edits.items():
         report_progress(f"{name} {size:g}")
-        log = flown_parts(edited(flight, {name: size}), machine)
-        found = changes(before, [record_of(run) for run in log.runs], report_progress)
+        records = [record_of(run) for run in edited(flight, {name: size}).runs]
+        found = changes(before, records, report_progress)
         rows.append(judged(name, size, PLANTED[name](size, before), found))
     return rows
 
@@ -153,7 +153,7 @@ def show(rows: list[dict[str, Any]]) -> None:
 
 def _offset(axis: str) -> Callable[[float, "Before"], Planted]:
     def planted(size: float, before: "Before") -> Planted:
-        angle = before.fit.values.get("swash_phase.angle", 0.0)
+        angle = _phase(before)
         cosine, sine = math.cos(angle), math.sin(angle)
         lon, lat = (-cosine, -sine) if axis == "lon" else (sine, -cosine)
         return Planted(
@@ -161,6 +161,21 @@ def _offset(axis: str) -> Callable[[float, "Before"], Planted]:
         )
 
     return planted
+
+
+def _phase(before: "Before") -> float:
+    """The swash plate's phase [rad] of a model, at the mean speed of the lower rotor as flown."""
+    import numpy as np
+
+    from coax_env.model import generic_terms, state
+    from coax_env.model.layout import RPM_PER_RAD_S
+
+    values = before.fit.values
+    _, hover = generic_terms.hover_speeds(before.problem.model.vector(values))
+    passes = before.problem.engine.filter(values, before.fit.noise)
+    flown = float(np.mean(np.concatenate([run.states[:, state.OMEGA_L] for run in passes])))
+    per_rpm = values.get("swash_phase.per_rpm", 0.0)
+    return values.get("swash_phase.angle", 0.0) + per_rpm * RPM_PER_RAD_S * (flown - hover)
 
 
 def _scale(effect: str) -> Callable[[float, "Before"], Planted]:

@@ -66,13 +66,14 @@ def test_the_riccati_solution_is_the_simulated_cost(exact):
     rng = np.random.default_rng(0)
     x = trim.copy()
     x[:16] += 1e-4 * rng.standard_normal(16)
-    known = np.concatenate([x[: len(design.states)] - trim, np.zeros(len(places))])
+    n = len(design.states)
+    known = np.concatenate([x[:n] - trim[:n], np.zeros(len(places))])
     predicted, simulated, work = known @ exact.cost_to_go @ known, 0.0, np.zeros(WORK_SIZE)
     for _ in range(6000):
-        known[: len(trim)] = x - trim
+        known[:n] = x[:n] - trim[:n]
         action = -exact.gain @ known
         simulated += known @ Q @ known + action @ R @ action
-        known[len(trim) :] += DT * known[places]
+        known[n:] += DT * known[places]
         step(x, kernel_input(command + design.action_scale * action), DT, LAMA.vector, work, x)
     assert simulated == pytest.approx(predicted, rel=1e-3)
 

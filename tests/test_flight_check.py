@@ -122,7 +122,7 @@ def test_what_is_not_excited_stays_hidden():
     both = {e.effect: e for e in checked("hover", "low_hover").effects}
     assert hover["ground_effect"].verdict == "hidden"
     assert both["ground_effect"].verdict == "shows" and both["ground_effect"].run == "low_hover"
-    assert hover["yaw_inertia"].verdict == "hidden"
+    assert hover["thrust_exponent"].verdict == "hidden"
     assert hover["gyro_bias"].verdict == "shows"
 
 

@@ -112,7 +112,8 @@ def test_the_sampled_system_is_the_kernels_step():
     sides = []
     for sign in (1.0, -1.0):
         start, end = np.zeros(29), np.empty(29)
-        start[:N_SAMPLED] = x + sign * dx
+        start[:] = x
+        start[:N_SAMPLED] += sign * dx
         u_there = kernel_input(u + sign * du)
         step(start, u_there, 0.01, LAGGING.vector, np.zeros(WORK_SIZE), end)
         sides.append(end[:N_SAMPLED])

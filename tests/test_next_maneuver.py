@@ -129,7 +129,9 @@ def test_flights_bring_the_evidence_that_was_expected():
         flight = simulate(truth.vehicle, plan, sensors="onboard", gusts=air, seed=seed)
         noise = replace(STILL, reading=dict(flight.noise))
         engine = Engine(MODEL, [record_of(run) for run in flight.runs])
-        of_truth, of_other = (engine.log_likelihood(a.vehicle.values(), noise) for a in (truth, other))
+        of_truth, of_other = (
+            engine.log_likelihood(a.vehicle.values(), noise) for a in (truth, other)
+        )
         ratios.append(of_truth - of_other)
     assert np.mean(ratios) == pytest.approx(expected, abs=4.0 * math.sqrt(2.0 * expected / 12))
 

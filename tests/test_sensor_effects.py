@@ -39,7 +39,11 @@ def flight_with(channels: str, turn: float = 0.0) -> Flight:
 def test_only_what_a_sensor_shows_may_be_named(channels, absent):
     """Of attitude and pose that come late, one; of the compass, none where cameras see the heading."""
     named = set(namable((), LAMA, flight_with(channels, turn=4.0)))
-    assert set(effects.CATALOGUE) - named == absent | {"vibration", "servo_deadband", "battery_voltage"}
+    assert set(effects.CATALOGUE) - named == absent | {
+        "vibration",
+        "servo_deadband",
+        "battery_voltage",
+    }
 
 
 def test_a_compass_is_judged_where_the_heading_turns():

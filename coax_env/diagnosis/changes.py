@@ -21,12 +21,13 @@ own is stated beside it, as its evidence.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.diagnose import namable
+from coax_env.diagnosis import vibration
+from coax_env.diagnosis.diagnose import namable, stated
 from coax_env.diagnosis.fits import fitted, noise_fitted, start
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
@@ -35,25 +36,23 @@ from coax_env.errors import InputError
 from coax_env.estimation.engine import BLOCK, Engine, Progress
 from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.flown import flown_parts
-from coax_env.estimation.helicopter import MOST_USUAL_SIZES, HeliModel, record_of
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES, ROTORS, HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import WARM_UP
 from coax_env.estimation.quadratic import bounded_solve
 from coax_env.estimation.state_space import Record
 from coax_env.logs.flight import Flight
 from coax_env.model import effects
+from coax_env.model.layout import N_COMMANDS
 from coax_env.model.vehicle import Vehicle
 
 ROTOR_SPEED = "rotor_speed"
 """Change that no effect of the catalogue is: both rotors turn (1 + s) times as fast per command.
 
-A fuller battery, another motor or speed controller. Thrust and torque of both go as its square; of the
-catalogue, thrust_scale lacks the torques and battery_sag begins with every run anew.
+A fuller battery, another motor or speed controller. Flown as commands that are (1 + s) times as large;
+of the catalogue, thrust_scale lacks the torques and battery_sag begins with every run anew.
 """
-SPEED_SQUARED = (
-    "thrust_coefficient_upper", "thrust_coefficient_lower",
-    "torque_coefficient_upper", "torque_coefficient_lower",
-)  # fmt: skip
+ROTOR_SCALE = f"{ROTOR_SPEED}.scale"
 USUAL_SPEED = 0.035  # half a usual thrust_scale
 STEP = 0.05  # usual sizes by which a number is moved for a derivative; ours
 STEPS = 5  # Gauss-Newton steps at most; ours
@@ -66,7 +65,9 @@ Measured: a delay of 30 ms, resampled on rows 7 ms apart, leaves 1 %; ours.
 MANY_FORM_ERRORS = 3.0
 """FORM_ERRORs that a change must be worth that is named by a flight's own noise only; ours."""
 LEAST_STD = 0.01
-"""Std of a change as a share of it at least, for the same reason; ours."""
+"""Std of a change as a share of it at least, for the same reason; ours. Where more of the difference is
+left, the share is the root of what is left of its square: a change that no number can express as it is,
+such as a constant tilt where the phase follows the rotor speed, is known no better than it fits."""
 LEAST_DIFFERENT = 0.1
 """nats by which two logs differ at least: the digits of a CSV are worth 1e-6; ours."""
 RIDGE = 100.0  # usual sizes: prior of a change that is there, wide enough not to move it; ours
@@ -152,6 +153,17 @@ class Changes:
 # --- the model of the flight before ---------------------------------------------------------------
 
 
+def calm(flight: Flight, vehicle: Vehicle) -> Flight:
+    """What was flown, without what vibrates at a rotor's speed: what a model is fitted to.
+
+    Args:
+        flight: as read.
+        vehicle: in the flight's air.
+    """
+    flown = flown_parts(flight, vehicle)
+    return vibration.taken_out(flown, vibration.find(flown))
+
+
 def fitted_model(
     flight: Flight,
     vehicle: Vehicle,
@@ -161,17 +173,16 @@ def fitted_model(
     """The model of a flight, all runs fitted, with the effects that a search finds.
 
     Args:
-        flight: as read.
+        flight: `calm`.
         vehicle: in the flight's air.
         settings: of the search.
         progress: called with a line of text.
     """
-    flight = flown_parts(flight, vehicle)
-    model = HeliModel(vehicle)
+    model = HeliModel(vehicle, stated(flight))
     records = [record_of(run) for run in flight.runs]
     candidates = namable((), vehicle, flight)
     problem = Problem.of(model, records, candidates, settings, progress)
-    fit = start(problem, starting_noise(flight, vehicle))
+    fit = start(problem, starting_noise(flight, vibration.without(vehicle)))
     fit, _ = search(problem, noise_fitted(problem, fitted(problem, fit)))
     return problem, fitted(problem, fit, settings.most_steps, settings.refinement_gain)
 
@@ -238,7 +249,10 @@ class _Logs:
 
     def difference(self, values: Mapping[str, float]) -> np.ndarray:
         """Whitened innovations (k,) of the log after at these values, less those of the one before."""
-        passes = self.engine.filter(values, self.fit.noise)
+        faster = 1.0 + values.get(ROTOR_SCALE, 0.0)
+        engine = self.engine if faster == 1.0 else _with_rotors(self.engine, faster)
+        own = {name: value for name, value in values.items() if name != ROTOR_SCALE}
+        passes = engine.filter(own, self.fit.noise)
         parts = [
             (run.innovations - before)[there]
             for run, before, there in zip(passes, self.before, self.there, strict=True)
@@ -260,6 +274,14 @@ class _Logs:
         here = self.difference(at)
         columns = [(self.difference(moved(at, {c.name: c.step})) - here) / c.step for c in of]
         return np.column_stack(columns) if columns else np.zeros((here.size, 0))
+
+
+def _with_rotors(engine: Engine, factor: float) -> Engine:
+    """Over the same records, their rotor commands times a factor."""
+    times = np.ones(N_COMMANDS)
+    times[list(ROTORS)] = factor
+    records = [replace(record, command=record.command * times) for record in engine.records]
+    return Engine(engine.model, records, engine.threads)
 
 
 @dataclass(frozen=True)
@@ -427,7 +449,8 @@ def _stated(
     nothing: np.ndarray,
 ) -> Changes:
     own = [c for e in best.effects for c in known[e]]
-    std = _std(logs, own, best, median_step(problem.engine.records))
+    unexpressed = math.sqrt(_nats(best.residual) / max(_nats(nothing), LEAST_DIFFERENT))
+    std = _std(logs, own, best, median_step(problem.engine.records), max(unexpressed, LEAST_STD))
     fit = logs.fit
     stated = []
     for effect in best.effects:
@@ -457,8 +480,13 @@ def _nats(residual: np.ndarray) -> float:
     return float(0.5 * residual @ residual)
 
 
-def _std(logs: _Logs, own: Sequence[Coordinate], best: _Trial, dt: float) -> dict[str, float]:
-    """Std of every move by the residual's scores, block by block; lags with half a sample."""
+def _std(
+    logs: _Logs, own: Sequence[Coordinate], best: _Trial, dt: float, least: float
+) -> dict[str, float]:
+    """Std of every move by the residual's scores, block by block; lags with half a sample.
+
+    At least a share of the effect's change, in usual sizes.
+    """
     if not own:
         return {}
     count = int(logs.block.max()) + 1
@@ -471,7 +499,7 @@ def _std(logs: _Logs, own: Sequence[Coordinate], best: _Trial, dt: float) -> dic
     for c in own:
         size[c.effect] = max(size.get(c.effect, 0.0), abs(best.moves[c.name]) / c.usual)
     return {
-        c.name: math.hypot(s, LEAST_STD * size[c.effect] * c.usual, half if c.timing else 0.0)
+        c.name: math.hypot(s, least * size[c.effect] * c.usual, half if c.timing else 0.0)
         for c, s in zip(own, np.sqrt(np.diag(covariance)), strict=True)
     }
 
@@ -496,7 +524,7 @@ def coordinates(problem: Problem, fit: Fit) -> list[Coordinate]:
     """
     found = [
         Coordinate(
-            ROTOR_SPEED, f"{ROTOR_SPEED}.scale", "1", USUAL_SPEED,
+            ROTOR_SPEED, ROTOR_SCALE, "1", USUAL_SPEED,
             -MOST_USUAL_SIZES * USUAL_SPEED, MOST_USUAL_SIZES * USUAL_SPEED, STEP * USUAL_SPEED,
         )
     ]  # fmt: skip
@@ -532,10 +560,7 @@ def moved(values: Mapping[str, float], moves: Mapping[str, float]) -> dict[str, 
     """
     after = dict(values)
     for name, move in moves.items():
-        if name == f"{ROTOR_SPEED}.scale":
-            for base in SPEED_SQUARED:
-                after[base] = after[base] * (1.0 + move) ** 2
-        elif _is_scale(name):
+        if name == ROTOR_SCALE or _is_scale(name):
             after[name] = (1.0 + after.get(name, 0.0)) * (1.0 + move) - 1.0
         else:
             after[name] = after.get(name, _off(name)) + move
@@ -557,8 +582,7 @@ def effective(problem: Problem, values: Mapping[str, float], effect: str) -> dic
     """
     file = problem.model.bare_values
     if effect == ROTOR_SPEED:
-        ratios = [values[base] / file[base] for base in SPEED_SQUARED]
-        return {f"{ROTOR_SPEED}.scale": float(np.prod(ratios) ** (0.5 / len(ratios))) - 1.0}
+        return {ROTOR_SCALE: values.get(ROTOR_SCALE, 0.0)}
     entry = effects.CATALOGUE[effect]
     found = {name: values.get(name, _off(name)) for name in entry.names()}
     for base in entry.replaces:

@@ -88,7 +88,7 @@ def sampled(
         dt: control period [s].
 
     Returns:
-        A (26, 26), B (26, 4), C (18, 26), D (18, 4), and the trim: state (26,), command (4,).
+        A (26, 26), B (26, 4), C (18, 26), D (18, 4), and the trim: full state (29,), command (4,).
     """
     vehicle = vehicle.without_effects(WITHOUT_SLOPE)
     state, command = hover_trim(vehicle)
@@ -105,7 +105,7 @@ def sampled(
     C = slopes(lambda x_: _readings(x_, u, vehicle), x, _STATE_SCALE)
     D = slopes(lambda u_: _readings(x, u_, vehicle), u, _COMMAND_SCALE)
     n = N_SAMPLED
-    return A[:n, :n], B[:n], C[:, :n], D, x[:n], command
+    return A[:n, :n], B[:n], C[:, :n], D, x, command
 
 
 def slopes(
