@@ -44,8 +44,7 @@ def main() -> None:
 def arguments() -> argparse.Namespace:
     """What was asked for on the command line."""
     parser = command_line.parser("check_edits", __doc__)
-    parser.add_argument("flight", type=Path, help="flight folder")
-    parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
+    command_line.add_flight(parser)
     usual = " ".join(f"{name}={size:g}" for name, size in STANDARD.items())
     parser.add_argument(
         "--edit", action="append", type=_edit, metavar="NAME=SIZE",

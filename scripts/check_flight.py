@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
 def main() -> None:
     parser = command_line.parser("check_flight", __doc__)
-    parser.add_argument("flight", type=Path, help="flight folder")
-    parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
+    command_line.add_flight(parser)
     parser.add_argument(
         "--draft", action="store_true",
         help="write a first card.toml for a folder of CSVs, guessed from their columns, and stop",

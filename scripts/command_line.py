@@ -48,6 +48,12 @@ def parser(name: str, description: str, *, seed: bool = False) -> Parser:
     return result
 
 
+def add_flight(parser: Parser) -> None:
+    """A flight folder, and ``--vehicle`` where not the card's."""
+    parser.add_argument("flight", type=Path, help="flight folder")
+    parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
+
+
 def add_workers(parser: Parser, what: str, default: int) -> None:
     """``--jobs`` and ``--backend``, for `coax_env.workers.each`.
 

@@ -52,8 +52,7 @@ def main() -> None:
 def arguments() -> argparse.Namespace:
     """What was asked for on the command line."""
     parser = command_line.parser("diagnose", __doc__)
-    parser.add_argument("flight", type=Path, help="flight folder")
-    parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
+    command_line.add_flight(parser)
     parser.add_argument(
         "--hold-out", metavar="RUN,RUN|none",
         help="runs on which the gain is measured (default: a quarter, chosen by signature)",

@@ -3,7 +3,6 @@
 import argparse
 import shlex
 import sys
-from pathlib import Path
 
 import command_line
 
@@ -73,8 +72,7 @@ def print_result(result: Identification | TwoStep) -> None:
 def arguments() -> argparse.Namespace:
     """What was asked for on the command line."""
     parser = command_line.parser("identify", __doc__)
-    parser.add_argument("flight", type=Path, help="flight folder")
-    parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
+    command_line.add_flight(parser)
     parser.add_argument("--method", choices=METHODS, default="ml", help="default: %(default)s")
     parser.add_argument(
         "--channels", metavar="C,C", help="use these measured channels only (default: all)"

@@ -2,7 +2,6 @@
 
 import shlex
 import sys
-from pathlib import Path
 
 import command_line
 
@@ -14,8 +13,7 @@ from coax_env.files import staged_folder, write_json, write_text
 
 def main() -> None:
     parser = command_line.parser("replay", __doc__)
-    parser.add_argument("flight", type=Path, help="flight folder")
-    parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
+    command_line.add_flight(parser)
     parser.add_argument("--horizon", type=float, default=1.0, help="seconds (default: 1.0)")
     options = parser.parse_args()
     if not 0.05 <= options.horizon <= 60.0:

@@ -10,7 +10,7 @@ from typing import Any
 
 import command_line
 import numpy as np
-from study import arm_table, arms, plan, store, table, threshold
+from study import arm_table, arms, classes, plan, store, table, threshold
 from study.one_flight import fly_and_diagnose
 from study.plan import PlannedFlight
 from tqdm import tqdm
@@ -118,15 +118,19 @@ def adopt(out: Path) -> None:
     measured = out / "threshold.json"
     if not measured.exists():
         raise InputError(f"no calibration in {out}: it takes {threshold.FEWEST} clean flights")
-    calibration.adopt(json.loads(measured.read_text(encoding="utf-8")))
+    for of_class in json.loads(measured.read_text(encoding="utf-8"))["classes"]:
+        calibration.adopt(of_class)
 
 
 def write_results(out: Path, rows: list[dict[str, Any]], command: str) -> None:
-    """table.md, summary.json, the confusion matrix, and the threshold where there is enough.
+    """table.md, summary.json, the confusion matrix; the threshold of each class where there is enough.
 
     Args:
         out: the study's folder. rows: results of flights, failures included. command: that made them.
     """
+    calibrated = classes.calibrations(rows, command)
+    if calibrated:
+        write_json(out / "threshold.json", {"classes": calibrated})
     if rows[0]["plan"]["arm"]:
         write_text(out / "table.md", arm_table.arm_text(rows, command))
         counted = arm_table.figures(rows)
@@ -152,9 +156,6 @@ def write_results(out: Path, rows: list[dict[str, Any]], command: str) -> None:
             out / "confusion.html",
             page("What was hidden, what was named", [], [Section("One effect", [drawn])]),
         )
-    calibrated = threshold.calibration(rows, command)
-    if calibrated:
-        write_json(out / "threshold.json", calibrated)
 
 
 if __name__ == "__main__":

@@ -3,9 +3,10 @@
 A likelihood that no model in reach makes white is spent on what happens within a few rows: with the
 readings of a motion capture it prefers numbers that fit the last tenth of a millimetre and fly the
 next second worse. So where innovations stay coloured and readings are finer than a rigid body is
-(LEAST_READING_STD), the search is done a second time with readings no finer than that, and the model
-whose open-loop flight over the horizon is nearer to the fitted runs is kept (the likelihood raised to
-a power less than 1, for a model that is wrong: Miller and Dunson 2019, J. Am. Stat. Assoc. 114).
+(LEAST_READING_STD), the search is done again with readings no finer than that, then than
+three times that, as long as the model's open-loop flight over the horizon comes nearer to the fitted
+runs (the likelihood raised to a power less than 1, for a model that is wrong: Miller and Dunson 2019,
+J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Identification, ch. 8).
 """
 
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import is_white
 
+COARSENESS = (1.0, 3.0)
+"""Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
 FINER = 2.0
 """Times finer than LEAST_READING_STD that a channel must be for a second search; ours."""
 
@@ -45,14 +48,19 @@ def searched(problem: Problem, noise: Noise) -> Searched:
     Args:
         problem: what may be free. noise: levels to start from.
     """
-    first = _searched(problem, noise)
-    coarser = _coarser(first.fit.noise)
-    passes = problem.engine.filter(first.fit.values, first.fit.noise)
+    best = _searched(problem, noise)
+    coarser = _coarser(best.fit.noise)
+    passes = problem.engine.filter(best.fit.values, best.fit.noise)
     if not coarser or is_white(passes, problem.model.channels):
-        return first
-    problem.report("the innovations stay coloured: searching again with readings believed less")
-    second = _searched(problem, noise.with_levels(coarser), coarse=True)
-    return second if _flies_better(problem, second.fit, first.fit) else first
+        return best
+    for factor in COARSENESS:
+        problem.report("the innovations stay coloured: searching again with readings believed less")
+        levels = {channel: factor * std for channel, std in coarser.items()}
+        other = _searched(problem, noise.with_levels(levels), coarse=True)
+        if not _flies_better(problem, other.fit, best.fit):
+            break
+        best = other
+    return best
 
 
 def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:

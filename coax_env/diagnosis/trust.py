@@ -20,7 +20,6 @@ from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.model import effects
 from coax_env.plain_words import and_list, channel_name, plain
@@ -191,23 +190,15 @@ def on_parts(of_parts: Replication, runs: int, chosen: Settings) -> Iterable[str
 
 
 def _sizes(problem: Problem, fit: Fit, effect: str) -> Iterable[str]:
-    for f in usual_sizes(problem, effect):
+    for f in problem.model.effect_parameters(
+        effect
+    ):  # usual sizes, however wide the priors are now
         size = abs(fit.values[f.name] - f.value)
         if size > AT_BOUND * MOST_USUAL_SIZES * f.std:
             limit = f"{plain(f.name)} stands at the limit of what is believed"
             yield f"{limit}: something else hides behind the name"
         elif size > UNUSUAL_FROM * f.std:
             yield f"{plain(f.name)} is {size / f.std:.1f} usual sizes"
-
-
-def usual_sizes(problem: Problem, effect: str) -> list[FreeParameter]:
-    """An effect's parameters with their usual sizes, however wide their priors were made.
-
-    Args:
-        problem: whose candidate it is.
-        effect: its name.
-    """
-    return problem.model.effect_parameters(effect)
 
 
 def _undetermined(problem: Problem, effect: str, known: Mapping[str, bool]) -> Iterable[str]:

@@ -65,7 +65,7 @@ def command(action, trim, scale, u):
 
     Args:
         action: (4,). trim, scale: command = trim + scale action, (4,) each [rad/s, rad/s, rad, rad].
-        u: commands and time, (5,); its commands are put here.
+        u: commands, time and battery, (6,); its commands are put here.
     """
     for k in range(4):
         a = action[k]
@@ -84,7 +84,7 @@ def give_command(u, last, limits, ring, row, dt):
     """The command of a row, in `u`, after the actuators' limits: on its way to them from now on.
 
     Args:
-        u: commands and time since the flight's start, (5,), in place.
+        u: commands, time since the flight's start and battery, (6,), in place.
         last: the command given in the row before, (4,); this one afterwards.
         limits: `actuators.limits`, (3, 4).
         ring: commands given in the last rows, (slots, 4), see `delay_slots`.

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from coax_env.logs.flight import Flight, Run
+from coax_env.logs.held_signal import integral_of_held
 from coax_env.logs.packets import stretches
 from coax_env.logs.repairs import hold_last
 from coax_env.model.layout import RPM_PER_RAD_S
@@ -194,7 +195,7 @@ def _speed(run: Run, column: int, rotor: str) -> np.ndarray:
 
 def _mean(t: np.ndarray, held: np.ndarray) -> np.ndarray:
     """Mean of a held signal over MEAN_TIME around each row, (n,)."""
-    area = np.concatenate([[0.0], np.cumsum(held[:-1] * np.diff(t))])
+    integral = integral_of_held(t, held)
     first = np.maximum(t - 0.5 * MEAN_TIME, t[0])
     last = np.minimum(t + 0.5 * MEAN_TIME, t[-1])
-    return (np.interp(last, t, area) - np.interp(first, t, area)) / (last - first)
+    return (integral(last) - integral(first)) / (last - first)

@@ -15,6 +15,7 @@ from coax_env.estimation import helicopter_noise
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
 from coax_env.logs.flight import Run
+from coax_env.logs.held_signal import integral_of_held
 from coax_env.model import dynamics, effects, usual_sizes
 from coax_env.model import inputs as U
 from coax_env.model import parameters as P
@@ -239,12 +240,7 @@ ROTORS, SWASH_PLATE = (U.OMEGA_U, U.OMEGA_L), (U.DELTA_LON, U.DELTA_LAT)
 
 def _delayed_mean(t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
     """Mean over each row's interval of a held command that arrives late."""
-    area = np.concatenate([[0.0], np.cumsum(command[:-1] * np.diff(t))])
-
-    def integral(time: np.ndarray) -> np.ndarray:
-        inside = np.interp(time, t, area)
-        return inside + np.minimum(time - t[0], 0.0) * command[0]
-
+    integral = integral_of_held(t, command)
     end = np.append(t[1:], t[-1] + (t[-1] - t[-2]))
     start = t - delay
     stop = np.minimum(end - delay, t[-1])

@@ -12,6 +12,7 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.logs.flight import Flight, Run
+from coax_env.logs.held_signal import integral_of_held
 
 UPPER, LOWER, LON, LAT = range(4)
 """Columns of `Run.command`."""
@@ -46,16 +47,10 @@ def _phase(run: Run, size: float, rows: np.ndarray) -> Run:
 def _sooner(run: Run, size: float, columns: slice) -> np.ndarray:
     """Commands (n, 4), some columns logged sooner: each row has the mean over its own interval."""
     t = run.t
+    ends = np.append(t[1:], t[-1] + (t[-1] - t[-2]))
     command = run.command.copy()
     for k in range(4)[columns]:
-        area = np.concatenate([[0.0], np.cumsum(run.command[:-1, k] * np.diff(t))])
-        ends = np.append(t[1:], t[-1] + (t[-1] - t[-2]))
-
-        def integral(at: np.ndarray, area: np.ndarray = area, k: int = k) -> np.ndarray:
-            beyond = np.maximum(at - t[-1], 0.0) * run.command[-1, k]
-            before = np.minimum(at - t[0], 0.0) * run.command[0, k]
-            return np.interp(at, t, area) + beyond + before
-
+        integral = integral_of_held(t, run.command[:, k])
         command[:, k] = (integral(ends + size) - integral(t + size)) / (ends - t)
     return command
 

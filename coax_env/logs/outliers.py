@@ -42,12 +42,9 @@ def find_outliers(channel: str, values: np.ndarray, noise: float | None = None) 
         (n,) bool.
     """
     flagged = np.zeros(len(values), dtype=bool)
-    present = np.flatnonzero(~np.isnan(values))
+    present, y = _present(channel, values)
     if len(present) < 2 * HALF_WINDOW + 1:
         return flagged
-    y = values[present]
-    if channel in ANGLES:
-        y = np.unwrap(y)
     padded = np.pad(y, HALF_WINDOW, mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * HALF_WINDOW + 1)
     centre = np.median(windows, axis=1)
@@ -74,12 +71,10 @@ def find_leaps(channel: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
         (n,) bool.
     """
     flagged = np.zeros(len(values), dtype=bool)
-    present = np.flatnonzero(~np.isnan(values))
+    present, y = _present(channel, values)
     if len(present) < 2 * HALF_WINDOW + 1:
         return flagged
-    y, at = values[present], t[present]
-    if channel in ANGLES:
-        y = np.unwrap(y)
+    at = t[present]
     low, high = np.quantile(y, [0.01, 0.99])
     step = np.diff(y)
     allowed = np.minimum(high - low, FASTEST.get(channel, np.inf) * np.diff(at))
@@ -92,6 +87,13 @@ def find_leaps(channel: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
             if abs(y[back + 1] - y[out]) < LEAP_REST * least:
                 flagged[present[out + 1 : back + 1]] = True
     return flagged
+
+
+def _present(channel: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the readings that are there, and the readings, angles without jumps of whole turns."""
+    present = np.flatnonzero(~np.isnan(values))
+    y = values[present]
+    return present, np.unwrap(y) if channel in ANGLES else y
 
 
 def _noise_level(y: np.ndarray) -> float:

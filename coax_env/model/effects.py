@@ -769,15 +769,19 @@ def attitude_delay(x, f, p, e):
 
 @effect(
     SENSOR,
-    EffectParameter("x", "m", usual=0.03, smallest=0.005, scale="length"),
-    EffectParameter("y", "m", usual=0.03, smallest=0.005, scale="length"),
-    EffectParameter("z", "m", usual=0.03, smallest=0.005, scale="length"),
+    EffectParameter("x", "m", usual=0.12, smallest=0.005, scale="length"),
+    EffectParameter("y", "m", usual=0.12, smallest=0.005, scale="length"),
+    EffectParameter("z", "m", usual=0.12, smallest=0.005, scale="length"),
     channels="pn pe h",
     source="rigid-body kinematics: p + R r, V + R (omega x r); whoever tracks the position"
     " differentiates it",
 )
 def marker_offset(x, f, p, e):
-    """Position, height and velocity are those of a point beside the centre of gravity."""
+    """Position, height and velocity are those of a point beside the centre of gravity.
+
+    A motion capture's point is anywhere on the frame its markers stand on: half a rotor's radius is
+    usual.
+    """
     rx, ry, rz = p[e], p[e + 1], p[e + 2]
     if rx != 0.0 or ry != 0.0 or rz != 0.0:
         attitude = f[_ATTITUDE : _ATTITUDE + 3]

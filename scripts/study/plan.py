@@ -145,6 +145,8 @@ SCALES = {
     "yaw_damping.coefficient": "yaw", "rate_damping.coefficient": "roll",
     "added_mass.mass": "mass", "cg_offset.x": "length", "cg_offset.y": "length",
     "hub_stiffness.upper": "stiffness", "hub_stiffness.lower": "stiffness",
+    "marker_offset.x": "length", "marker_offset.y": "length", "marker_offset.z": "length",
+    "position_spring.stiffness": "weight", "upper_blowback.gain": "per_speed",
     "imu_lever_arm.x": "length", "imu_lever_arm.y": "length", "imu_lever_arm.z": "length",
     "outside.heading_moment": "roll", "outside_patch.lift": "weight",
     "outside_sector.moment": "roll", "outside_resonance.moment": "roll",
