@@ -23,7 +23,10 @@ def main() -> NoReturn:
     import command_line
 
     command_line.called_as_verb = True
-    command_line.run(dispatch)
+    try:
+        command_line.run(dispatch)
+    finally:
+        command_line.called_as_verb = False
 
 
 def dispatch() -> None:
