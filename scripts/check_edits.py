@@ -4,7 +4,6 @@ import argparse
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import command_line
@@ -13,6 +12,7 @@ from coax_env.files import write_json
 
 if TYPE_CHECKING:
     from coax_env.diagnosis.changes import Before, Changes
+    from coax_env.logs.flight import Flight
 
 STANDARD = {
     "phase": 0.15, "delay": 0.03, "offset_lon": 0.03, "gain": 1.25, "rotor_scale": 1.04,
@@ -31,9 +31,12 @@ class Planted:
 
 
 def main() -> None:
+    from coax_env import read_flight
+
     options = arguments()
+    log = read_flight(options.flight)
     with command_line.progress("edits") as report_progress:
-        rows = check(options.flight, options.vehicle, dict(options.edit), report_progress)
+        rows = check(log, options.vehicle, dict(options.edit), report_progress)
     write_json(options.out / "edits.json", rows)
     show(rows)
     right = sum(row["found"] and not row["else"] for row in rows)
@@ -68,7 +71,7 @@ def _edit(text: str) -> tuple[str, float]:
 
 
 def check(
-    folder: Path,
+    log: "Flight",
     vehicle: str | None,
     edits: Mapping[str, float],
     report_progress: Callable[[str], None],
@@ -76,17 +79,16 @@ def check(
     """Every edit of a flight, one at a time, and what the difference says.
 
     Args:
-        folder: of the flight.
+        log: the flight as read.
         vehicle: shipped name or path; None: the card's.
         edits: name -> size.
         report_progress: called with a line of text.
     """
-    from coax_env import load_vehicle, read_flight
+    from coax_env import load_vehicle
     from coax_env.diagnosis.changes import Before, calm, changes, fitted_model
     from coax_env.estimation.helicopter import record_of
     from coax_env.logs.edits import edited
 
-    log = read_flight(folder)
     machine = load_vehicle(vehicle or log.vehicle).in_air(log.air)
     flight = calm(log, machine)
     before = Before.of(*fitted_model(flight, machine, progress=report_progress))
