@@ -180,7 +180,7 @@ def test_diagnosis_page_says_what_was_found(made):
     page = (made / "report.html").read_text(encoding="utf-8")
     text = Outline(page).text
     for words in (
-        "Ground effect and axial damping explain what the simulation got wrong",
+        "Ground effect and, doubtful, axial damping explain what the simulation got wrong",
         "71 % of the error of a 1 s prediction is gone on runs held out of the fit",
         "66 to 75 %, 95 % interval",
         "0 % by refitting alone",

@@ -72,16 +72,22 @@ def diagnosis_page(
 def headline(findings: Findings) -> str:
     """The verdict in one sentence."""
     names = [plain(c["effect"]) for c in findings["causes"]]
+    sure = [plain(c["effect"]) for c in findings["causes"] if c["trust"] == "sure"]
+    doubtful = [plain(c["effect"]) for c in findings["causes"] if c["trust"] != "sure"]
     verb = "explains" if len(names) == 1 else "explain"
-    if len(names) > MOST_CAUSES_NAMED:
+    if sure and doubtful and len(names) > MOST_CAUSES_NAMED:
+        named = and_list([*sure, f"{count_word(len(doubtful))} doubtful effects"])
+    elif sure and doubtful:
+        named = f"{and_list(sure)} and, doubtful, {and_list(doubtful)}"
+    elif len(names) > MOST_CAUSES_NAMED:
         named = f"{count_word(len(names))} effects, above all {and_list(names[:3])},"
     else:
         named = and_list(names) if names else ""
     if findings["verdict"] == "consistent":
         return "The simulation agrees with these flights"
-    if names and all(c["trust"] != "sure" for c in findings["causes"]):
-        doubtful = "the name is doubtful" if len(names) == 1 else "the names are doubtful"
-        return f"The model predicts better with {named.rstrip(',')}; {doubtful}"
+    if names and not sure:
+        said = "the name is doubtful" if len(names) == 1 else "the names are doubtful"
+        return f"The model predicts better with {named.rstrip(',')}; {said}"
     if findings["verdict"] == "explained":
         return f"{capital(named)} {verb} what the simulation got wrong"
     if findings["verdict"] == "partly explained":
