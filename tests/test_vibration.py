@@ -182,3 +182,17 @@ def test_a_tracked_pose_that_shakes_is_calmed(slip):
     left = vibration.taken_out(flight, lines).runs[0].measured
     for c in sizes:
         assert np.std(left[c] - calm[c]) < 1.3 * noise[c] + 0.1 * sizes[c], c
+
+
+def test_a_pose_read_less_than_twice_a_turn_is_only_motion():
+    """A motion of 8.3 Hz is the alias of 33.3 Hz at 25 Hz: in a pose it is what it looks like."""
+    t = np.arange(1000) / 25.0
+    rng = np.random.default_rng(0)
+    phi = 0.01 * np.sin((SPEEDS["upper"] - 2.0 * np.pi * 25.0) * t) + 1e-3 * rng.standard_normal(
+        t.size
+    )
+    command = np.tile([*SPEEDS.values(), 0.0, 0.0], (t.size, 1))
+    flight = Flight("lama400d", (Run("made up", t, command, {"phi": phi}),))
+    assert vibration.find(flight) == ()
+    shaken_by_it = Flight("lama400d", (Run("made up", t, command, {"ax": phi / 0.01}),))
+    assert [line.kind for line in vibration.find(shaken_by_it)] == ["amplitude"]

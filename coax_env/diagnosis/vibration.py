@@ -9,6 +9,9 @@ neighbouring frequencies of the same segments: noise that is merely louder than 
 there too, and is no vibration. Where no rotor speed is measured, the commanded one is taken, times the
 one factor near 1 with which the line is strongest.
 
+Accelerometers are shaken far beyond what the body moves, so that there an alias is a line as well. A
+pose is not: below half of its readings' rate it is all motion, and what looks like an alias is that.
+
 This comes before the search. A line of usual size would make every accelerometer reading look several
 sigmas off, and something else would be blamed for it; in a tracked pose, whose noise is far below the
 shaking, it would colour every innovation of attitude and height. So it is taken out of the readings
@@ -119,6 +122,12 @@ class _Segment:
     azimuth: np.ndarray
     ahead: float
 
+    @property
+    def resolved(self) -> bool:
+        """Whether the readings are more than two per turn of the rotor."""
+        turns = (self.azimuth[-1] - self.azimuth[0]) / (2.0 * np.pi)
+        return bool(2.0 * turns < self.t.size - 1)
+
     def _waves(self, beside: np.ndarray) -> np.ndarray:
         """Sines and cosines beside the rotor's frequency by so much (f,) [Hz], shape (f, 2, n)."""
         angle = self.azimuth + 2.0 * np.pi * beside[:, None] * self.t
@@ -156,7 +165,9 @@ def _segments(run: Run, channel: str, rotor: str, slip: float = 1.0) -> Iterator
         if rows.size >= LEAST_SAMPLES:
             ahead = float(np.median(other[rows] - speed[rows])) / (2.0 * np.pi)
             t = run.t[rows] - run.t[rows[0]] - 0.5 * SEGMENT
-            yield _Segment(rows, t, values[rows], azimuth[rows], ahead)
+            segment = _Segment(rows, t, values[rows], azimuth[rows], ahead)
+            if channel in KINDS["amplitude"] or segment.resolved:
+                yield segment
 
 
 def _unwrapped(values: np.ndarray, there: np.ndarray) -> np.ndarray:
