@@ -73,7 +73,8 @@ ARMS = {
 
 SENSED = {
     "gyro_bias": "p", "accel_bias": "ax", "accel_scale": "ax", "imu_lever_arm": "ax",
-    "imu_tilt": "ax", "vibration": "ax", "gyro_scale": "p",
+    "imu_tilt": "ax", "vibration": "ax", "gyro_scale": "p", "frame_yaw": "pn", "marker_offset": "pn",
+    "pose_delay": "pn", "position_spring": "pn",
 }  # fmt: skip
 """Effects of one sensor, and a channel of it; without the sensor they are not hidden."""
 ECHO = frozenset({"sonar_scale", "sonar_tilt", "sonar_delay"})

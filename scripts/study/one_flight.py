@@ -229,7 +229,7 @@ def expected_evidence(
         noise = noise.with_levels(levels)
     problem = Problem.of(model, _records(flight, held, within=False), listed)
     for effect in listed:
-        own = {name: 0.5 * values[name] for name in problem.acting_names(effect)}
+        own = {name: 0.5 * values.get(name, 0.0) for name in problem.acting_names(effect)}
         at = {**model.bare_values, **values, **own}
         _, _, quadratic = linearise(problem, Fit(tuple(listed), at, noise))
         result[effect] = _worth(problem, quadratic, listed, effect, values)
@@ -268,7 +268,7 @@ def _worth(
     own = problem.acting_names(effect)
     rest = [n for n in problem.free_names(listed) if not n.startswith(effect + ".")]
     S, _ = quadratic.projected(own, rest)
-    theta = np.array([values[name] for name in own])
+    theta = np.array([values.get(name, 0.0) for name in own])  # of a line, some kinds are not there
     return float(0.5 * theta @ S @ theta - quadratic.occam(own, rest))
 
 
