@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 
 from coax_env.diagnosis import vibration
-from coax_env.diagnosis.diagnose import namable
+from coax_env.diagnosis.diagnose import namable, stated
 from coax_env.diagnosis.fits import start
 from coax_env.diagnosis.problem import Problem
 from coax_env.estimation.helicopter import HeliModel, record_of
@@ -79,7 +79,7 @@ def learnable(flight: Flight, vehicle: Vehicle) -> Learnable:
     """What these flights would determine of effects and own numbers."""
     lines = vibration.find(flight)
     calm = vibration.taken_out(flight, lines)
-    model = HeliModel(vibration.without(vehicle) if lines else vehicle)
+    model = HeliModel(vibration.without(vehicle) if lines else vehicle, stated(flight))
     records = [record_of(run) for run in calm.runs]
     problem = Problem.of(model, records, namable((), vehicle, flight))
     fit = start(problem, starting_noise(calm, model.vehicle))
