@@ -219,7 +219,7 @@ def test_what_a_guess_knows_and_what_it_leaves():
     assert found == {
         "t": ("TimeUS", "us"), "phi": ("Roll (deg)", "deg"), "p": ("GyrX", "rad/s"),
         "r": ("wz", "rad/s"), "ax": ("accX_mss", "m/s2"), "rpm_upper": ("rpm1", "rev/min"),
-            "battery_v": ("battery", "V"),
+        "battery_v": ("battery", "V"),
     }  # fmt: skip
 
 

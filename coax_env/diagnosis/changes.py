@@ -160,8 +160,7 @@ def calm(flight: Flight, vehicle: Vehicle) -> Flight:
         flight: as read.
         vehicle: in the flight's air.
     """
-    flown = flown_parts(flight, vehicle)
-    return vibration.taken_out(flown, vibration.find(flown))
+    return vibration.calmed(flown_parts(flight, vehicle), vehicle)[1]
 
 
 def fitted_model(

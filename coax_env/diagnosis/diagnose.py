@@ -125,7 +125,9 @@ def diagnose(
     flight.select(hold_out or ())
     check_hold_out(hold_out, flight.run_names)
     flight = flown_parts(flight, vehicle)
-    lines, calm, calm_vehicle = _without_vibration(flight, vehicle, exclude)
+    lines, calm, calm_vehicle = (
+        ((), flight, vehicle) if "vibration" in exclude else vibration.calmed(flight, vehicle)
+    )
     new_lines = lines if "vibration" not in vehicle.effects else ()
     model = HeliModel(vehicle, stated(flight))
     noise = starting_noise(calm, calm_vehicle)
@@ -299,16 +301,6 @@ def _turns(flight: Flight) -> bool:
     around = around[np.isfinite(around)]
     gaps = np.diff(around, append=around[:1] + TURN)
     return bool(gaps.size) and TURN - float(gaps.max()) > TURN / 4.0
-
-
-def _without_vibration(
-    flight: Flight, vehicle: Vehicle, exclude: Collection[str]
-) -> tuple[tuple[vibration.Line, ...], Flight, Vehicle]:
-    """The lines at rotor speed, if there are some, and flight and vehicle without them."""
-    lines = vibration.find(flight) if "vibration" not in exclude else ()
-    if not lines:
-        return (), flight, vehicle
-    return lines, vibration.taken_out(flight, lines), vibration.without(vehicle)
 
 
 def _gain(

@@ -9,8 +9,9 @@ neighbouring frequencies of the same segments: noise that is merely louder than 
 there too, and is no vibration. Where no rotor speed is measured, the commanded one is taken, times the
 one factor near 1 with which the line is strongest.
 
-Accelerometers are shaken far beyond what the body moves, so that there an alias is a line as well. A
-pose is not: below half of its readings' rate it is all motion, and what looks like an alias is that.
+Accelerometers are shaken far beyond what the body moves, so that there an alias is a line as well.
+Gyros and poses are not: below half of their readings' rate all is motion, and what looks like an alias
+is that.
 
 This comes before the search. A line of usual size would make every accelerometer reading look several
 sigmas off, and something else would be blamed for it; in a tracked pose, whose noise is far below the
@@ -98,6 +99,17 @@ def taken_out(flight: Flight, lines: Sequence[Line]) -> Flight:
                 measured[channel] = values
         runs.append(replace(run, measured=measured))
     return replace(flight, runs=tuple(runs))
+
+
+def calmed(flight: Flight, vehicle: Vehicle) -> tuple[tuple[Line, ...], Flight, Vehicle]:
+    """The lines, if the flight has some, and flight and vehicle without them.
+
+    Args:
+        flight: what was flown.
+        vehicle: as given; its vibration is in the readings no longer once the lines are taken out.
+    """
+    lines = find(flight)
+    return (lines, taken_out(flight, lines), without(vehicle)) if lines else ((), flight, vehicle)
 
 
 def without(vehicle: Vehicle) -> Vehicle:

@@ -77,9 +77,8 @@ class Learnable:
 
 def learnable(flight: Flight, vehicle: Vehicle) -> Learnable:
     """What these flights would determine of effects and own numbers."""
-    lines = vibration.find(flight)
-    calm = vibration.taken_out(flight, lines)
-    model = HeliModel(vibration.without(vehicle) if lines else vehicle, stated(flight))
+    _, calm, calm_vehicle = vibration.calmed(flight, vehicle)
+    model = HeliModel(calm_vehicle, stated(flight))
     records = [record_of(run) for run in calm.runs]
     problem = Problem.of(model, records, namable((), vehicle, flight))
     fit = start(problem, starting_noise(calm, model.vehicle))
