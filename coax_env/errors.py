@@ -18,6 +18,10 @@ class InputError(ValueError):
         super().__init__(one_line(message))
 
 
+class MissingPackage(InputError):
+    """An optional package is not installed. The message says what to install."""
+
+
 def one_line(text: str) -> str:
     """Text that quotes a file, whatever was in it, as one printable line."""
     line = " ".join(text.split())
@@ -44,13 +48,13 @@ def require(module: str, extra: str) -> ModuleType:
         extra: the extra of this project that brings it, for instance ``"report"``.
 
     Raises:
-        InputError: it is not installed.
+        MissingPackage: it is not installed.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         package = module.split(".")[0]
-        raise InputError(
+        raise MissingPackage(
             f"this needs {package}, which is not installed:"
             f" pip install '{DISTRIBUTION}[{extra}]'{_packages_of(extra)}"
         ) from error

@@ -60,6 +60,8 @@ def makers(ppo: Controller | None) -> dict[str, Maker]:
     def trained(
         vehicle: Vehicle, nominal: Nominal, sensors: str, has_target: bool
     ) -> Controller | None:
+        if isinstance(ppo, policy.Policy):
+            return ppo.on(sensors) if sensors in ppo.suites.sights else None
         return ppo if ppo is not None and ppo.sensors == sensors else None
 
     return {

@@ -14,7 +14,8 @@ from coax_env.report import figures
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from controllers.loading import Controller
 from controllers.lqr import LQG
-from controllers.margins import InputMargins, frequency_responses
+from controllers.margins import InputMargins, WorstVehicle, frequency_responses, sensitivities
+from controllers.steps import StepResponse, step_responses
 
 MARGIN_HEADER = (
     "input", "gain margin down", "gain margin up", "phase margin", "least |1 + L|", "crossover",
@@ -53,6 +54,7 @@ def design_page(
     worst: dict[str, Any],
     spread: np.ndarray,
     command_line: str = "",
+    extreme: WorstVehicle | None = None,
 ) -> str:
     """The report as HTML text.
 
@@ -65,6 +67,7 @@ def design_page(
         worst: of `evaluate_spread` on it.
         spread: of `margins_over_spread` on it, (draws,).
         command_line: what was typed.
+        extreme: of `worst_over_spread` on it.
     """
     gain, phase = disk_in_words(disk)
     lead = [
@@ -73,10 +76,13 @@ def design_page(
         f"**{100 * score['success_rate']:.0f} % succeed**.",
         f"All four inputs at once may be off by {gain} in gain or by {phase} in phase.",
         spread_in_words(worst, spread),
+        *([extreme_in_words(extreme)] if extreme else []),
     ]
     response = figures.histories(*step_response(controller, vehicle))
     sections = [
         Section("Margins", _margin_blocks(controller, margins)),
+        Section("Sensitivity", _sensitivity_blocks(controller)),
+        Section("Steps of the setpoint", _step_blocks(controller)),
         Section("A flight", [figure(response, "From a start that is too low, turned, tilted")]),
         Section("The estimator", _estimator_blocks(controller)),
     ]
@@ -95,6 +101,69 @@ def _margin_blocks(controller: LQG, margins: list[InputMargins]) -> list[str]:
         figure(figures.bode(omega[band], loops), "The loop of each input, the others closed"),
         prose("Of the loop with the single-rate equivalent of the multi-rate filter."),
     ]
+
+
+def _sensitivity_blocks(controller: LQG) -> list[str]:
+    """S and T at the inputs over frequency, and their peaks."""
+    omega, L, _ = frequency_responses(controller)
+    S, T = sensitivities(L)
+    band = omega > LOWEST_SHOWN
+    curves = {"S": S[band], "T": T[band]}
+    peaks = [
+        f"{name}: largest {value.max():.2f} ({_decibels(value.max())}) at {hz:.1f} Hz"
+        for name, value in (("S", S), ("T", T))
+        for hz in (omega[value.argmax()] / (2.0 * np.pi),)
+    ]
+    crossings = omega[np.flatnonzero(np.diff(S >= 1.0))] / (2.0 * np.pi)
+    below = f"Disturbances below {crossings[0]:.2f} Hz are damped." if len(crossings) else ""
+    return [
+        figure(
+            figures.gains(omega[band], curves),
+            "Largest singular values of S = (1 + L)^-1 and T = L S, all four inputs, actions as units",
+        ),
+        bullets(peaks),
+        prose(below),
+    ]
+
+
+STEP_HEADER = ("setpoint", "step", "rise 10-90 %", "overshoot", "within 5 %")
+
+
+def step_rows(responses: list[StepResponse]) -> list[list[str]]:
+    """The steps in words, under STEP_HEADER."""
+
+    def after(seconds: float) -> str:
+        return f"{seconds:.2f} s" if np.isfinite(seconds) else "later"
+
+    return [
+        [
+            one.name, f"{one.size:g} {one.unit}", after(one.rise_s),
+            f"{one.overshoot_percent:.0f} %", after(one.settling_s),
+        ]
+        for one in responses
+    ]  # fmt: skip
+
+
+def _step_blocks(controller: LQG) -> list[str]:
+    """Responses to steps of what is held, and their figures."""
+    responses = step_responses(controller)
+    panels = [(f"{one.name} [{one.unit}]", {one.name: one.value}) for one in responses]
+    return [
+        table(STEP_HEADER, step_rows(responses)),
+        figure(figures.histories(responses[0].t, panels), "Linear plant, no noise"),
+    ]
+
+
+def extreme_in_words(extreme: WorstVehicle) -> str:
+    """The vehicle that was looked for on purpose."""
+    if not extreme.moves:
+        return "The file has no spread: there is no worse vehicle to look for."
+    gain, phase = disk_in_words(extreme.disk)
+    named = ", ".join(f"{name} {move:+.1f} std" for name, move in list(extreme.moves.items())[:3])
+    return (
+        f"The least disk margin found within {np.linalg.norm(list(extreme.moves.values())):.0f} std of "
+        f"the mean is {extreme.disk:.2f}: {gain} in gain or {phase} in phase ({named})."
+    )
 
 
 def _estimator_blocks(controller: LQG) -> list[str]:

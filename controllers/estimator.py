@@ -12,6 +12,7 @@ so there is one gain per row of that cycle, and one for the first reading of a f
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -55,12 +56,13 @@ DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; unlike the fly-bar's, to be
 FORCE_SHARE = 0.05  # std of the disturbing force, of the weight
 MOMENT_ARM = 0.002  # [m] std of the disturbing roll and pitch moment, of the weight
 TORQUE_SHARE = 0.07  # std of the disturbing yaw moment, of one rotor's torque
+GRAVITY = 9.81  # [m/s2] for the tilt that goes with an acceleration
 BIAS_STD = {"p": 0.03, "q": 0.03, "r": 0.03, "phi": 0.02, "theta": 0.02}
 """Readings whose bias is estimated, and its std [rad/s, rad]."""
 BIAS_MEMORY = 30.0  # [s]
 INTEGRAL_TIME = {"height": 1.5, "heading": 1.5, "position": 6.0}
 """[s]: an error of its limit for so long counts as much as the limit itself."""
-_WINDUP = 20.0  # integrals stop at so many
+WINDUP = 20.0  # integrals stop at so many
 _FREE_OF_NOISE = 1e-4  # std given to exact sensors, of their unit
 _ROWS_SEEN = 500
 _RUNS_ALONG = 0.05  # component of a unit direction from which it runs along a state
@@ -150,29 +152,35 @@ class EstimatorDesign:
             ]
         )
 
+    @cached_property
+    def first_state(self) -> np.ndarray:
+        """The estimate before the first reading, (n,): the actuators stand at the nominal trim."""
+        first = np.zeros(len(self.states))
+        for name, offset in zip(
+            _NAMES[ACTUATORS], self.action_trim - self.command_trim, strict=True
+        ):
+            if name in self.states:
+                first[self.index(name)] = offset
+        return first
+
 
 def design_estimator(
-    vehicle: Vehicle, nominal: Nominal = None, sensors: str = "onboard"
+    vehicle: Vehicle,
+    nominal: Nominal = None,
+    sensors: str = "onboard",
+    velocity: Sequence[float] = (0.0, 0.0),
 ) -> EstimatorDesign:
     """The filter for a vehicle and a sensor suite. A pure delay is taken as a lag.
 
     Args:
-        vehicle: the filter is designed on. sensors: name of the suite.
+        vehicle: the filter is designed on.
         nominal: whose trim and scale the actions have, see `action_map`.
+        sensors: name of the suite.
+        velocity: forward and right over ground [m/s], of the flight about which it is linear.
     """
     used = [s for s in suite(sensors, vehicle) if s.index != _SPEED]  # |V| has no slope at hover
-    A_flown, B_flown, C_channels, D_channels, x_trim, u_trim = sampled(delay_as_lag(vehicle), DT)
-    A, B = np.eye(len(_NAMES)), np.zeros((len(_NAMES), N_COMMANDS))
-    A[:N_SAMPLED, :N_SAMPLED], B[:N_SAMPLED] = A_flown, B_flown
-    A[GUSTS, GUSTS] = np.eye(6) * math.exp(-DT / DISTURBANCE_MEMORY)
-    A[N_SAMPLED:, N_SAMPLED:] *= math.exp(-DT / BIAS_MEMORY)
-    # readings of the channels, then, for the suite ``state``, the states as they are
-    C_all = np.eye(len(CHANNELS) + N_SAMPLED, len(_NAMES), k=-len(CHANNELS))
-    C_all[: len(CHANNELS), :N_SAMPLED] = C_channels
-    for k, name in enumerate(BIAS_STD):
-        C_all[CHANNELS.index(name), N_SAMPLED + k] = 1.0
-    D_all = np.vstack([D_channels, np.zeros((N_SAMPLED, N_COMMANDS))])
     rows = [s.index for s in used]
+    A, B, C_all, D_all, x_trim, u_trim = _linear(vehicle, velocity)
     y_trim = np.concatenate([_trim_readings(vehicle, x_trim, u_trim), x_trim[:N_SAMPLED]])[rows]
 
     first, process = _spreads(vehicle, u_trim)
@@ -199,6 +207,33 @@ def design_estimator(
         action_trim=trim,
         action_scale=scale,
     )  # fmt: skip
+
+
+def plant(vehicle: Vehicle, design: EstimatorDesign) -> tuple[np.ndarray, ...]:
+    """A, B, C, D of a vehicle at hover with a design's states and readings, see EstimatorDesign."""
+    A, B, C_all, D_all, *_ = _linear(vehicle, (0.0, 0.0))
+    keep = [_NAMES.index(name) for name in design.states]
+    place = {sensor.name: sensor.index for sensor in suite(design.sensors)}
+    rows = [place[name] for name in design.readings]
+    return A[np.ix_(keep, keep)], B[keep], C_all[np.ix_(rows, keep)], D_all[rows]
+
+
+def _linear(vehicle: Vehicle, velocity: Sequence[float]) -> tuple[np.ndarray, ...]:
+    """A, B, C, D of all states and readings, with disturbances and biases, and the trim."""
+    A_flown, B_flown, C_channels, D_channels, x_trim, u_trim = sampled(
+        delay_as_lag(vehicle), DT, velocity
+    )
+    A, B = np.eye(len(_NAMES)), np.zeros((len(_NAMES), N_COMMANDS))
+    A[:N_SAMPLED, :N_SAMPLED], B[:N_SAMPLED] = A_flown, B_flown
+    A[GUSTS, GUSTS] = np.eye(6) * math.exp(-DT / DISTURBANCE_MEMORY)
+    A[N_SAMPLED:, N_SAMPLED:] *= math.exp(-DT / BIAS_MEMORY)
+    # readings of the channels, then, for the suite ``state``, the states as they are
+    C_all = np.eye(len(CHANNELS) + N_SAMPLED, len(_NAMES), k=-len(CHANNELS))
+    C_all[: len(CHANNELS), :N_SAMPLED] = C_channels
+    for k, name in enumerate(BIAS_STD):
+        C_all[CHANNELS.index(name), N_SAMPLED + k] = 1.0
+    D_all = np.vstack([D_channels, np.zeros((N_SAMPLED, N_COMMANDS))])
+    return A, B, C_all, D_all, x_trim, u_trim
 
 
 def delay_as_lag(vehicle: Vehicle) -> Vehicle:
@@ -229,6 +264,13 @@ def integrated_readings(design: EstimatorDesign) -> dict[str, float]:
     return found | {n: limit["heading"] for n in ("psi",) if n in design.readings}
 
 
+def horizontal_pairs(design: EstimatorDesign) -> np.ndarray:
+    """Readings that are north and east of one vector, by their places, (k, 2)."""
+    names = design.readings
+    pairs = [(names.index(a), names.index(b)) for a, b in _PAIRS if a in names]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
 class Tracker:
     """The running filter, for one helicopter or many, and the integrals of some readings.
 
@@ -242,19 +284,15 @@ class Tracker:
         names = design.readings
         integrated = integrated_readings(design)
         self._integrated = [names.index(name) for name in integrated]
-        self._most = _WINDUP * np.array(list(integrated.values()))
-        pairs = [(names.index(a), names.index(b)) for a, b in _PAIRS if a in names]
-        self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+        self._most = WINDUP * np.array(list(integrated.values()))
+        self._pairs = horizontal_pairs(design)
         self._view = TargetView(design.sensors)
         self._asked = np.zeros((count, 4))
         self._there = np.ones(count, dtype=np.bool_)
         self._heading = names.index("psi") if "psi" in names else -1
         self._turn = design.index("psi") if "psi" in design.states else -1
         self.offset = design.action_trim - design.command_trim
-        self._first = np.zeros(len(design.states))
-        for k, name in enumerate(_NAMES[ACTUATORS]):
-            if name in design.states:
-                self._first[design.index(name)] = self.offset[k]
+        self._first = design.first_state
         self._A, self._B, self._C, self._D, self._first_gain, self._gains = (
             np.ascontiguousarray(np.swapaxes(matrix, -1, -2))  # the kernel adds up columns
             for matrix in (
@@ -287,6 +325,7 @@ class Tracker:
         design = self.design
         which = self._every if which is None else which
         observations = np.asarray(observations)
+        motion = self._view.motion(observations)
         if self._view.has_target(observations):
             observations = self._aimed(observations, which)
         _correct(
@@ -295,7 +334,28 @@ class Tracker:
             design.reading_trim, self._C, self._D, self._first_gain, self._gains, self.state,
             self._readings,
         )  # fmt: skip
-        return np.hstack([self.state, self.integrals])
+        known = np.hstack([self.state, self.integrals])
+        if motion is not None:
+            known[:, : len(design.states)] -= self._reference(motion)
+        return known
+
+    def _reference(self, motion: np.ndarray) -> np.ndarray:
+        """States (count, n) of a machine that moves with the target: its velocity, and the tilt of its
+        acceleration (small angles, discs and bar at rest); what is fed back is relative to them.
+
+        Args:
+            motion: of the target, tasks.MOTION (count, 7).
+        """
+        forward, right, up, turn, ahead, aside, _ = motion.T
+        found = np.zeros((len(motion), len(self.design.states)))
+        wanted = {
+            "u": forward, "v": right, "w": -up, "r": turn,
+            "theta": -ahead / GRAVITY, "phi": aside / GRAVITY,
+        }  # fmt: skip
+        for name, value in wanted.items():
+            if name in self.design.states:
+                found[:, self.design.index(name)] = value
+        return found
 
     def _aimed(self, observations: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Observations from the point asked for; where that has moved, the estimate moves too."""
@@ -538,5 +598,5 @@ def _single_rate_gain(
 
     rate = np.array([s.rate for s in sensors])
     R = np.diag(noise**2 * (BASE_RATE / rate))
-    _, P, _ = control.dlqe(A, np.eye(len(A)), C, np.diag(process**2), R)
+    _, P, _ = control.dlqe(A, np.eye(len(A)), C, np.diag(process**2), R, method="scipy")
     return _gain(np.asarray(P), C, R, np.ones(len(C), dtype=bool))

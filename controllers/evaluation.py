@@ -16,16 +16,18 @@ from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 from coax_env.workers import each
 from controllers.loading import Controller
+from controllers.own_controller import as_controller
 
 
 def evaluate(
-    controller: Controller,
+    controller: Controller | Any,
     vehicle: str | Vehicle,
     episodes: int = 100,
     seconds: float = 20.0,
     seed: int = 0,
     sensors: str | None = None,
     progress: Callable[[int], None] | None = None,
+    each_flight: bool = False,
     **env_arguments: Any,
 ) -> dict[str, Any]:
     """Fly ``episodes`` flights at once, seeds seed, seed + 1, ..., and score them.
@@ -34,18 +36,23 @@ def evaluate(
     first 3 s height rms < 0.10 m, speed rms < 0.25 m/s, heading rms < 10 deg, drift < 2 m, the
     largest horizontal distance from the position at 3 s (in ``position`` from the target); of
     ``waypoints`` those given must be reached, or the first of those drawn. The rms figures are
-    pooled over what was flown after 3 s. ``mean_cost`` is the mean of `hover.cost` about the target
-    over every step; steps not flown cost hover.CRASHED_COST. ``effort`` is the rms of the action
+    pooled over what was flown after 3 s; in ``trajectory`` the speed is relative to the path's, and
+    ``distance_rms_m`` is that to the moving target. ``mean_cost`` is the mean of `hover.cost` about the
+    target over every step; steps not flown cost hover.CRASHED_COST. ``effort`` is the rms of the action
     vector.
 
     Args:
-        controller: what flies.
+        controller: what flies: a `Controller`, or whatever `own_controller.as_controller` makes one
+            of: a function of an observation, a class, a Stable-Baselines3 model, a
+            python-control system.
         vehicle: what is flown.
         episodes: flights.
         seconds: duration of a flight.
         seed: of the first flight.
-        sensors: default the controller's own suite, which it must be.
+        sensors: default the controller's own suite, which it must be; for one without a suite of
+            its own: what it is given (default ``onboard``).
         progress: called with the number of steps flown.
+        each_flight: add ``flight_costs``, the mean cost of every flight.
         env_arguments: further ones of CoaxVectorEnv, such as ``wind``.
 
     Returns:
@@ -53,9 +60,10 @@ def evaluate(
     """
     if episodes < 1 or not seconds > tasks.SETTLED:
         raise InputError(f"need at least one episode of more than {tasks.SETTLED} s")
+    vehicle = load_vehicle(vehicle)
+    controller = as_controller(controller, vehicle, sensors)
     if sensors not in (None, controller.sensors):
         raise InputError(f"this controller needs sensors {controller.sensors!r}, not {sensors!r}")
-    vehicle = load_vehicle(vehicle)
     env = CoaxVectorEnv(
         episodes, vehicle, controller.nominal, controller.sensors,
         autoreset_mode=AutoresetMode.DISABLED, **env_arguments,
@@ -66,27 +74,32 @@ def evaluate(
     controller.reset(episodes)
     for step in range(steps):
         actions = np.nan_to_num(controller.act(observations))
-        targets = info.get("target", totals.targets)
+        targets, rates = info.get("target", totals.targets), info.get("target_rates")
         observations, rewards, terminated, _, info = env.step(actions)
         settled = step + 1 >= tasks.FIRST_JUDGED
-        totals.add(info, targets, np.clip(actions, -1.0, 1.0), rewards, settled)
+        totals.add(info, targets, np.clip(actions, -1.0, 1.0), rewards, settled, rates)
         totals.alive &= ~terminated
         if progress:
             progress(1)
-    return totals.score(steps) | {
-        "controller": controller.kind,
-        "vehicle": vehicle.name,
-        "episodes": episodes,
-        "seconds": seconds,
-        "seed": seed,
-        "sensors": controller.sensors,
-        "task": totals.task,
-        "cost": {
-            "weights": hover.COST_WEIGHTS,
-            "limits": hover.LIMITS,
-            "step_not_flown": hover.CRASHED_COST,
-        },
-    }
+    own = {"flight_costs": (totals.cost / steps).tolist()} if each_flight else {}
+    return (
+        totals.score(steps)
+        | own
+        | {
+            "controller": controller.kind,
+            "vehicle": vehicle.name,
+            "episodes": episodes,
+            "seconds": seconds,
+            "seed": seed,
+            "sensors": controller.sensors,
+            "task": totals.task,
+            "cost": {
+                "weights": hover.COST_WEIGHTS,
+                "limits": hover.LIMITS,
+                "step_not_flown": hover.CRASHED_COST,
+            },
+        }
+    )
 
 
 def evaluate_spread(
@@ -156,6 +169,10 @@ FIGURES = (
 """What a table of scores shows."""
 
 
+_POOLED = ("height", "speed", "heading", "distance")
+"""Errors whose squares are summed, see `hover.squared_errors`; ``distance``: to the target."""
+
+
 class _Totals:
     """Sums over every flight, updated every period."""
 
@@ -166,7 +183,7 @@ class _Totals:
         self.wanted = max(1, len(tasks.course(task, course)))
         self.cost, self.reward, self.effort = np.zeros(count), np.zeros(count), np.zeros(count)
         self.flown, self.judged = np.zeros(count), np.zeros(count)
-        self.squares = {name: np.zeros(count) for name in ("height", "speed", "heading")}
+        self.squares = {name: np.zeros(count) for name in _POOLED}
         self.drift, self.reached = np.zeros(count), np.zeros(count)
         self.place: np.ndarray | None = None
 
@@ -177,6 +194,7 @@ class _Totals:
         actions: np.ndarray,
         rewards: np.ndarray,
         settled: bool,
+        rates: np.ndarray | None = None,
     ) -> None:
         """Add one period.
 
@@ -186,11 +204,13 @@ class _Totals:
             actions: (count, 4).
             rewards: (count,).
             settled: whether errors count already.
+            rates: of the targets before it, (count, 4), where they move.
         """
         states = info["state"]
         finite = self.alive & np.isfinite(states).all(axis=1)
         states = np.where(finite[:, None], states, 0.0)
-        self.cost += np.where(finite, hover.cost(states, actions, targets), hover.CRASHED_COST)
+        cost = hover.cost(states, actions, targets, rates=rates)
+        self.cost += np.where(finite, cost, hover.CRASHED_COST)
         self.reward += np.where(finite, rewards, 0.0)
         self.effort += np.where(finite, (actions.astype(float) ** 2).sum(axis=1), 0.0)
         self.flown += finite
@@ -200,7 +220,8 @@ class _Totals:
         if self.place is None:
             self.place = states[:, PLACE].copy()
         place = self.place if self.task == "hover" else targets[:, hover.HORIZONTAL]
-        errors = hover.squared_errors(states, targets)
+        errors = hover.squared_errors(states, targets, rates)
+        errors["distance"] = errors["position"] + errors["height"]
         for name, total in self.squares.items():
             total += np.where(finite, errors[name], 0.0)
         self.judged += finite
@@ -238,4 +259,6 @@ class _Totals:
         }
         if tasks.task(self.task).moves_on:
             figures["mean_reached"] = float(self.reached.mean())
+        if tasks.task(self.task).follows_path:
+            figures["distance_rms_m"] = pooled("distance")
         return figures

@@ -16,7 +16,9 @@ KINDS = {
     "lqr": "linear feedback of the exact state (--sensors state); on noisy sensors: lqg",
     "lqi": "feedback of the exact state with integrals of height, heading and position",
     "lqg": "lqi's feedback on a Kalman filter's estimate from noisy sensors",
-    "ppo": "a trained policy on that filter's estimate; the shipped one",
+    "scheduled": "lqg's designs over forward speed, blended: flies fast to targets (mocap)",
+    "ppo": "a trained policy on that filter's estimate; shipped: hovers in still air on onboard",
+    "ppo_outdoor": "another, added to lqg's feedback: hover, position, waypoints in wind; or mocap",
     "pid": "cascaded loops on the raw sensors, tuned by hand",
 }
 """The controllers by name."""
@@ -25,6 +27,7 @@ _CLASSES = {
     "lqr": ("state_feedback", "StateFeedback"),
     "lqi": ("state_feedback", "StateFeedback"),
     "lqg": ("lqr", "LQG"),
+    "scheduled": ("schedule", "Schedule"),
     "pid": ("pid", "PID"),
 }
 
@@ -60,13 +63,14 @@ def make_controller(
     """A controller by a name of KINDS, designed on a vehicle for a suite, or read from a file.
 
     Args:
-        name: a key of KINDS, or the path of a controller.json or policy.zip.
+        name: a key of KINDS, the path of a controller.json or policy.zip, or a controller of your
+            own: ``my.py:NAME`` or a zip of Stable-Baselines3, which run what is in the file.
         vehicle: what it is designed on.
         nominal: vehicle whose trim centres the action, as in the env (default: the bare one).
-        sensors: suite to design for (default: ``onboard``); ``lqi`` is given the exact state, the
-            shipped policy of ``ppo`` and a file have suites of their own.
+        sensors: suite to design for (default: ``onboard``, ``mocap`` for ``scheduled``); ``lqi`` is
+            given the exact state, the shipped policy of ``ppo`` and a file have suites of their own.
     """
-    from controllers import lqr, pid, policy, state_feedback
+    from controllers import lqr, own_controller, pid, policy, schedule, state_feedback
 
     if (name in ("lqr", "lqi") and sensors == "state") or (name == "lqi" and sensors is None):
         return state_feedback.design(vehicle, nominal, integral=name == "lqi")
@@ -74,10 +78,18 @@ def make_controller(
         raise InputError(f"lqi needs sensors 'state', not {sensors!r}: lqg is for noisy ones")
     if name in ("lqr", "lqg"):
         return lqr.design(vehicle, nominal, sensors or "onboard")
+    if name == "scheduled":
+        return schedule.design(vehicle, nominal, sensors or "mocap")
     if name == "pid":
         return pid.design(vehicle, nominal, sensors or "onboard")
     if name == "ppo":
-        return policy.load_policy(policy.SHIPPED)
+        return policy.load_policy(policy.SHIPPED, sensors)
+    if name == "ppo_outdoor":
+        return policy.load_policy(policy.OUTDOOR, sensors)
+    if ".py:" in str(name) or own_controller.is_stable_baselines(Path(name)):
+        return own_controller.from_file(str(name), vehicle, sensors, nominal)
+    if sensors and Path(name).suffix == ".zip":
+        return policy.load_policy(name, sensors)
     return load_controller(name)
 
 
@@ -89,7 +101,9 @@ def load_controller(path: str | Path) -> Controller:
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"no controller {str(path)!r}: neither a file nor {', '.join(KINDS)}")
+        raise InputError(
+            f"no controller {str(path)!r}: neither a file, nor my.py:NAME, nor {', '.join(KINDS)}"
+        )
     if path.suffix == ".zip":
         from controllers.policy import load_policy
 

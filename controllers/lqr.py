@@ -1,14 +1,14 @@
 """LQG with integral action: python-control's LQR on the kernel's linearisation, and the estimator.
 
 The regulator minimises the quadratic cost by which every controller is compared (hover.LIMITS and
-COST_WEIGHTS), with integrals of the measured height, heading and position added, so that no error
-of trim or sensor model stays in them. Where position is not measured, the integral of the measured
-velocity stands for it: the machine then holds still, and its position drifts. Its stability margins
-are computed in margins.py.
+COST_WEIGHTS, or one's own), with integrals of the measured height, heading and position added, so
+that no error of trim or sensor model stays in them. Where position is not measured, the integral of
+the measured velocity stands for it: the machine then holds still, and its position drifts. Its
+stability margins are computed in margins.py.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from coax_env.env import hover
 from coax_env.env.actions import Nominal
 from coax_env.env.period import DT
+from coax_env.errors import InputError
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 from controllers.estimator import (
@@ -40,6 +41,7 @@ class LQG(Estimating, Designed):
     estimator: EstimatorDesign
     gain: np.ndarray  # (4, n + i), per state [SI], of the action
     cost_to_go: np.ndarray  # (n + i, n + i): x'Px is the cost of all further steps
+    cost: dict[str, dict[str, float]] = field(default_factory=lambda: quadratic_cost())
 
     kind = "lqg"
 
@@ -51,7 +53,7 @@ class LQG(Estimating, Designed):
         """What a file of this kind has of its own."""
         return {
             "control_period_s": DT,
-            "cost": {"weights": hover.COST_WEIGHTS, "limits": hover.LIMITS},
+            "cost": self.cost,
             "integral_time_s": INTEGRAL_TIME,
             "estimator": self.estimator.to_dict(),
             "gain": self.gain.tolist(),
@@ -66,6 +68,7 @@ class LQG(Estimating, Designed):
             estimator=EstimatorDesign.from_dict(content["estimator"]),
             gain=np.array(content["gain"], dtype=float),
             cost_to_go=np.array(content["cost_to_go"], dtype=float),
+            cost=quadratic_cost(content["cost"]["limits"], content["cost"]["weights"]),
         )
 
 
@@ -73,11 +76,38 @@ BRISK = {"position": 0.5, "speed": 1.0}
 """Limits [m, m/s] that make a design go to its target sooner than hover.LIMITS do."""
 
 
+def quadratic_cost(
+    limits: Mapping[str, float] | None = None, weights: Mapping[str, float] | None = None
+) -> dict[str, dict[str, float]]:
+    """What a regulator minimises: an error of its limit counts its weight.
+
+    Args:
+        limits: where not hover.LIMITS [SI]; all positive.
+        weights: where not hover.COST_WEIGHTS [1]; none negative, the effort's positive.
+
+    Raises:
+        InputError: an unknown name, or a number that no regulator has.
+    """
+    result = {"weights": dict(hover.COST_WEIGHTS), "limits": dict(hover.LIMITS)}
+    for kind, own in (("weights", weights), ("limits", limits)):
+        for name, value in (own or {}).items():
+            if name not in hover.LIMITS:
+                raise InputError(f"{kind}: no {name!r} in the cost: {', '.join(hover.LIMITS)}")
+            may_vanish = kind == "weights" and name != "effort"
+            if not (value > 0.0 or (may_vanish and value == 0.0)) or not np.isfinite(value):
+                least = "0 or more" if may_vanish else "more than 0"
+                raise InputError(f"{kind}: {name} must be {least}, found {value:g}")
+            result[kind][name] = float(value)
+    return result
+
+
 def design(
     vehicle: str | Vehicle,
     nominal: Nominal = None,
     sensors: str = "onboard",
     limits: Mapping[str, float] | None = None,
+    weights: Mapping[str, float] | None = None,
+    velocity: Sequence[float] = (0.0, 0.0),
 ) -> LQG:
     """Design a hover controller on a vehicle.
 
@@ -86,29 +116,36 @@ def design(
         nominal: whose trim centres the action, as in the env.
         sensors: the suite it will be given.
         limits: errors that count 1 in the cost, where not hover.LIMITS, such as BRISK.
+        weights: of the errors, where not hover.COST_WEIGHTS.
+        velocity: forward and right over ground [m/s], of the flight that it holds; 0: hover.
     """
     import control
 
     vehicle = load_vehicle(vehicle)
-    estimator = design_estimator(vehicle, nominal, sensors)
-    A, B, Q, R = regulator_problem(estimator, limits)
-    gain, cost_to_go, _ = control.dlqr(A, B, Q, R)
-    return LQG(vehicle.name, estimator, np.asarray(gain), np.asarray(cost_to_go))
+    cost = quadratic_cost(limits, weights)
+    estimator = design_estimator(vehicle, nominal, sensors, velocity)
+    A, B, Q, R = regulator_problem(estimator, cost["limits"], cost["weights"])
+    gain, cost_to_go, _ = control.dlqr(A, B, Q, R, method="scipy")
+    return LQG(vehicle.name, estimator, np.asarray(gain), np.asarray(cost_to_go), cost)
 
 
 def regulator_problem(
-    estimator: EstimatorDesign, limits: Mapping[str, float] | None = None
+    estimator: EstimatorDesign,
+    limits: Mapping[str, float] | None = None,
+    weights: Mapping[str, float] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The discrete regulator problem: `hover.cost` per control period, deviations from trim.
 
     Args:
         estimator: whose states, with the integrals of its readings, are fed back.
         limits: errors that count 1 in the cost, where not hover.LIMITS.
+        weights: of the errors, where not hover.COST_WEIGHTS.
 
     Returns:
         A (n + i, n + i), B (n + i, 4) per action, Q (n + i, n + i), R (4, 4).
     """
-    limits = hover.LIMITS | dict(limits or {})
+    cost = quadratic_cost(limits, weights)
+    limits, weights = cost["limits"], cost["weights"]
     integrated = integrated_readings(estimator)
     n = len(estimator.states)
     A, B = np.eye(n + len(integrated)), np.zeros((n + len(integrated), 4))
@@ -123,6 +160,6 @@ def regulator_problem(
     for error, names in errors.items():
         for name in set(names.split()) & set(estimator.states):
             at = estimator.index(name)
-            Q[at, at] += hover.COST_WEIGHTS[error] / limits[error] ** 2
-    R = np.eye(4) * hover.COST_WEIGHTS["effort"] / limits["effort"] ** 2
+            Q[at, at] += weights[error] / limits[error] ** 2
+    R = np.eye(4) * weights["effort"] / limits["effort"] ** 2
     return A, B, Q, R

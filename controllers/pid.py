@@ -5,8 +5,9 @@
     position -> speed demand -> speed -> tilt demand -> attitude -> swash
     height -> climb -> both rotors          heading -> turn rate -> one rotor against the other
 
-It knows no model: twelve gains tried out on lama400d. Slow and noisy speeds are smoothed by a first
-order lag. The position is held only where it is measured (suite ``mocap``).
+It knows no model but its trim, which is fed forward: gains tried out on lama400d. Slow and noisy
+speeds are smoothed by a first order lag. The position is held only where it is measured (suite
+``mocap``).
 """
 
 import math
@@ -19,6 +20,7 @@ from coax_env.env import hover
 from coax_env.env.actions import Nominal, action_map
 from coax_env.env.period import DT
 from coax_env.errors import InputError
+from coax_env.model.dynamics import hover_trim
 from coax_env.model.sensors import suite
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
@@ -58,6 +60,7 @@ class PID(Feedback, Designed):
     action_trim: np.ndarray  # (4,)
     action_scale: np.ndarray  # (4,)
     gains: Gains = field(default_factory=Gains)
+    feedforward: np.ndarray = field(default_factory=lambda: np.zeros(4))  # the trim, as an action
 
     kind = "pid"
 
@@ -73,6 +76,10 @@ class PID(Feedback, Designed):
         """New flights of `count` helicopters."""
         self._smooth = np.zeros((self.count, 3))  # forward, right, down [m/s]
         self._sums = np.zeros((self.count, 4))  # forward, right [m], height [m s], heading [rad s]
+
+    def forget(self, which: np.ndarray) -> None:
+        """New flights in the rows of a mask (count,)."""
+        self._smooth[which], self._sums[which] = 0.0, 0.0
 
     def compute_actions(self, observations: np.ndarray) -> np.ndarray:
         """Actions (count, 4), not yet clipped, to observations (count, n_obs)."""
@@ -94,7 +101,7 @@ class PID(Feedback, Designed):
         pitch, roll = (np.clip(tilt, -g.steepest, g.steepest) for tilt in (pitch, roll))
         lift = g.height * height + g.height_sum * self._sums[:, 2] + g.climb * down
         turn = g.heading * heading + g.heading_sum * self._sums[:, 3] - g.turn * y["r"]
-        return np.column_stack(
+        return self.feedforward + np.column_stack(
             [
                 lift + turn,
                 lift - turn,
@@ -119,6 +126,7 @@ class PID(Feedback, Designed):
             "action_trim": self.action_trim.tolist(),
             "action_scale": self.action_scale.tolist(),
             "gains": asdict(self.gains),
+            "feedforward": self.feedforward.tolist(),
         }
 
     @classmethod
@@ -128,16 +136,23 @@ class PID(Feedback, Designed):
             np.array(content[key], dtype=float) for key in ("action_trim", "action_scale")
         )
         gains = Gains(**content["gains"])
-        return cls(str(content["vehicle"]), str(content["sensors"]), trim, scale, gains)
+        feedforward = np.array(content.get("feedforward", [0.0] * 4), dtype=float)
+        if feedforward.shape != (4,):
+            raise ValueError("feedforward must have four numbers")
+        return cls(
+            str(content["vehicle"]), str(content["sensors"]), trim, scale, gains, feedforward
+        )
 
 
 def design(vehicle: str | Vehicle, nominal: Nominal = None, sensors: str = "onboard") -> PID:
-    """The cascade about a vehicle's nominal trim; nothing else of the vehicle is used.
+    """The cascade about a vehicle's trim; nothing else of the vehicle is used.
 
     Args:
-        vehicle: what flies.
+        vehicle: whose hover trim is fed forward.
         nominal: vehicle whose trim centres the action, as in the env (default: the bare one).
         sensors: suite that it is given; must measure rates, attitude, height and velocity.
     """
     vehicle = load_vehicle(vehicle)
-    return PID(vehicle.name, sensors, *action_map(vehicle, nominal))
+    trim, scale = action_map(vehicle, nominal)
+    feedforward = (hover_trim(vehicle, hover.HEIGHT)[1] - trim) / scale
+    return PID(vehicle.name, sensors, trim, scale, feedforward=feedforward)

@@ -9,15 +9,18 @@ Beside them `ppo.train` leaves what Stable-Baselines3 needs to go on training (`
 pickles, which may run anything, opened only by ``train(resume=...)``. A shipped policy has none.
 
 Single noisy observations do not show the velocity, so the policy gets the estimate and the
-integrals of controllers/estimator.py, scaled.
+integrals of controllers/estimator.py, scaled, and of a far target the way beyond the setpoint that the
+estimate is relative to. One network may have been trained on several sensor suites, each with its own
+estimator: its features go by name, and those that a suite does not have are zero. `Policy.on` gives the
+policy for one of its suites.
 """
 
 import io
 import json
 import zipfile
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +28,24 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.files import write_bytes
-from controllers.estimator import Estimating, EstimatorDesign, integrated_readings
+from controllers.estimator import Estimating, EstimatorDesign, Tracker, integrated_readings
+from controllers.target import TargetView
 
 FORMAT = "coax-policy"
-VERSION = 2
+VERSION = 3
 DESCRIPTION = "policy.json"
 WEIGHTS = "weights.npz"
 SHIPPED = Path(__file__).parent / "policies" / "hover.zip"
-"""Trained on vehicles drawn from lama400d, default sensors; its description has the command."""
+"""Trained to hover in still air on default sensors; its description has the command."""
+OUTDOOR = SHIPPED.with_name("outdoor.zip")
+"""Trained in wind to hover and to fly to targets, on the sensors ``onboard`` and ``mocap``."""
 
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "tanh": np.tanh,
     "relu": lambda x: np.maximum(x, 0.0),
 }
 _LARGEST = 16 * 2**20  # bytes of a member that is read; ours have some 200 kB
-_FEATURE_LIMIT = 10.0
+FEATURE_LIMIT = 10.0
 _INTEGRAL_SHARE = 0.25  # of what counts 1 in LQG's cost: a slow drift must show
 
 FEATURE_SCALES = {
@@ -50,6 +56,11 @@ FEATURE_SCALES = {
 }  # fmt: skip
 """Size of an estimate that becomes 1 for the policy, near what a good hover leaves; the rest by the
 filter's own figures. Coarser ones take several times longer to learn from."""
+
+BEYOND = {"beyond_forward": 1.0, "beyond_right": 1.0, "beyond_up": 0.5, "beyond_turn": 0.5}
+"""The way from the setpoint on to a far target, and the sizes that become 1 [m, m, m, rad]."""
+_AS_PLACE = {"vn": "x", "ve": "y"}
+"""Readings whose integral stands for a state, where nothing measures that."""
 
 
 @dataclass
@@ -72,46 +83,109 @@ class Network:
 class Policy(Estimating):
     """A trained policy with its estimator: a controller like any other."""
 
-    network: Network
+    network: Network  # of the features of this suite
     estimator: EstimatorDesign
-    scales: np.ndarray  # (n + i,), of estimates and integrals
+    scales: np.ndarray  # (n + i,) of estimates and integrals, then, with a position, BEYOND's
     content: dict[str, Any]  # of policy.json
+    base_gain: np.ndarray | None  # (4, n + i) of a linear feedback that its actions are added to
+    suites: "Suites"
 
     kind = "ppo"
 
+    def begin(self) -> None:
+        """New flights of `count` helicopters."""
+        super().begin()
+        self.view = TargetView(self.sensors)
+
+    def compute_actions(self, observations: np.ndarray) -> np.ndarray:
+        """Actions (count, 4), not yet clipped, to observations (count, n_obs)."""
+        self.known = seen(self.tracker, self.view, observations)
+        return self.actions_from_estimate(self.known)
+
     def actions_from_estimate(self, known: np.ndarray) -> np.ndarray:
-        """Actions (count, 4), not yet clipped, to estimates and integrals (count, n + i)."""
-        return self.network(features(known, self.scales))
+        """Actions (count, 4), not yet clipped, to what is `seen` (count, as many as scales)."""
+        actions = self.network(features(known, self.scales))
+        if self.base_gain is None:
+            return actions
+        return actions + linear_actions(self.tracker, self.base_gain, known)
+
+    def on(self, sensors: str) -> "Policy":
+        """This policy for another of the suites that it was trained on.
+
+        Raises:
+            InputError: it was not trained on that one.
+        """
+        if sensors not in self.suites.sights:
+            known = ", ".join(self.suites.sights)
+            raise InputError(f"this policy was trained on sensors {known}, not on {sensors!r}")
+        return _for_suite(self.suites, sensors, self.content)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a policy flies one sensor suite with: the filter, and the linear feedback of LQG's form."""
+
+    estimator: EstimatorDesign
+    base_gain: np.ndarray | None = None  # (4, n + i)
+
+
+@dataclass(frozen=True)
+class Suites:
+    """What a policy has for all the suites that it was trained on."""
+
+    network: Network  # of the features of all
+    sights: dict[str, Sight]  # by suite
+
+
+def linear_actions(tracker: Tracker, gain: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """LQG's actions (count, 4) to what is `seen` (count, n + i or more), not yet clipped."""
+    feedforward = -tracker.offset / tracker.design.action_scale
+    return feedforward - known[:, : gain.shape[1]] @ gain.T
+
+
+def seen(
+    tracker: Tracker, view: TargetView, observations: np.ndarray, which: np.ndarray | None = None
+) -> np.ndarray:
+    """What the features are made of, (count, as many as `feature_sizes`); arguments as Tracker.see."""
+    known = tracker.see(observations, which)
+    return np.hstack([known, view.beyond(observations)]) if view.aims else known
 
 
 def features(known: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Estimates and integrals (count, n + i) in units of their scales, float32, within [-10, 10]."""
+    """What is `seen` (count, n) in units of its scales, float32, within [-10, 10]."""
     found = (known * (1.0 / scales)).astype(np.float32)
-    return np.clip(found, -_FEATURE_LIMIT, _FEATURE_LIMIT, out=found)
+    return np.clip(found, -FEATURE_LIMIT, FEATURE_LIMIT, out=found)
 
 
-def feature_scales(design: EstimatorDesign) -> np.ndarray:
-    """Size of an estimate or integral that becomes 1 in its feature, (n + i,)."""
-    sizes = []
+def feature_sizes(design: EstimatorDesign) -> dict[str, float]:
+    """Name of everything `seen`, in order, and the size that becomes 1 in its feature.
+
+    The integral of a velocity stands for the place where that is not measured, and has its name.
+    """
+    found = {}
     for name, spread in zip(design.states, design.spread, strict=True):
         if name.startswith("omega_"):
-            sizes.append(float(design.action_scale[0 if name == "omega_u" else 1]))
+            found[name] = float(design.action_scale[0 if name == "omega_u" else 1])
         else:
-            sizes.append(FEATURE_SCALES.get(name, max(3.0 * float(spread), 1e-6)))
-    integrals = [_INTEGRAL_SHARE * size for size in integrated_readings(design).values()]
-    return np.array(sizes + integrals)
+            found[name] = FEATURE_SCALES.get(name, max(3.0 * float(spread), 1e-6))
+    for name, size in integrated_readings(design).items():
+        found[_AS_PLACE.get(name, f"sum_{name}")] = _INTEGRAL_SHARE * size
+    return found | (BEYOND if TargetView(design.sensors).aims else {})
 
 
-def n_features(design: EstimatorDesign) -> int:
-    """Number of features: estimate and integrals."""
-    return len(design.states) + len(integrated_readings(design))
+def all_features(designs: Iterable[EstimatorDesign]) -> dict[str, float]:
+    """Name and size of every feature of a network for several suites; the first's sizes count."""
+    found: dict[str, float] = {}
+    for design in designs:
+        found = found | {k: v for k, v in feature_sizes(design).items() if k not in found}
+    return found
 
 
 def save_policy(
     path: str | Path,
     network: Network,
-    design: EstimatorDesign,
-    scales: np.ndarray,
+    sights: Sequence["Sight"],
+    sizes: Mapping[str, float],
     content: dict[str, Any],
     training: bytes = b"",
 ) -> Path:
@@ -120,8 +194,8 @@ def save_policy(
     Args:
         path: where to.
         network: its input are the features.
-        design: the estimator whose estimate they are made of.
-        scales: of the features, (n + i,).
+        sights: the estimators whose estimates they are made of, one per suite.
+        sizes: of the features by name, see `all_features`.
         content: further entries of the description.
         training: a zip file of Stable-Baselines3, whose members join the plain ones.
     """
@@ -134,8 +208,9 @@ def save_policy(
         **content,
         "format": FORMAT, "version": VERSION, "kind": Policy.kind,
         "activation": network.activation,
-        "feature_scales": scales.tolist(),
-        "estimator": design.to_dict(),
+        "features": dict(sizes),
+        "estimators": [sight.estimator.to_dict() for sight in sights],
+        "base_gains": [None if s.base_gain is None else s.base_gain.tolist() for s in sights],
     }  # fmt: skip
     with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(_undated(DESCRIPTION), json.dumps(content, allow_nan=False))
@@ -150,8 +225,12 @@ def _undated(name: str) -> zipfile.ZipInfo:
     return member
 
 
-def load_policy(path: str | Path) -> Policy:
+def load_policy(path: str | Path, sensors: str | None = None) -> Policy:
     """Read the plain members of a policy.zip; nothing in the file is run.
+
+    Args:
+        path: of the file.
+        sensors: one of the suites it was trained on; None: the first.
 
     Raises:
         InputError: no such file, or not a policy of this project.
@@ -165,19 +244,46 @@ def load_policy(path: str | Path) -> Policy:
             weights = _member(archive, WEIGHTS)
         if content.get("format") != FORMAT or content.get("version") != VERSION:
             raise InputError(f"{path}: version {content.get('version')!r} of a policy is unknown")
-        design = EstimatorDesign.from_dict(content["estimator"])
-        scales = np.array(content["feature_scales"], dtype=float)
-        if scales.shape != (n_features(design),) or not (scales > 0.0).all():
-            raise ValueError("feature_scales do not fit the estimator")
-        network = _network(weights, content["activation"], n_features(design))
+        sights = _sights(content["estimators"], content["base_gains"])
+        sizes = np.array(list(content["features"].values()), dtype=float)
+        if not (np.isfinite(sizes) & (sizes > 0.0)).all():
+            raise ValueError("a feature has no size")
+        network = _network(weights, content["activation"], len(sizes))
+        suites = Suites(network, {sight.estimator.sensors: sight for sight in sights})
+        policies = [_for_suite(suites, name, content) for name in suites.sights]
     except InputError:
         raise
     except (
         OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RecursionError,
-        NotImplementedError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
+        NotImplementedError, RuntimeError, MemoryError, IndexError, zipfile.BadZipFile, zlib.error,
     ) as error:  # fmt: skip
         raise InputError(f"{path}: not a policy of this project") from error
-    return Policy(network, design, scales, content)
+    return policies[0] if sensors is None else policies[0].on(sensors)
+
+
+def _sights(estimators: list[Any], gains: list[Any]) -> list[Sight]:
+    """Sights of a description, their shapes checked."""
+    found = []
+    for one, gain in zip(estimators, gains, strict=True):
+        design = EstimatorDesign.from_dict(one)
+        known = len(design.states) + len(integrated_readings(design))
+        matrix = None if gain is None else np.array(gain, dtype=float)
+        if matrix is not None and (matrix.shape != (4, known) or not np.isfinite(matrix).all()):
+            raise ValueError(f"a gain has shape {matrix.shape}")
+        found.append(Sight(design, matrix))
+    return found
+
+
+def _for_suite(suites: Suites, sensors: str, content: dict[str, Any]) -> Policy:
+    """The policy for one suite: the features that it does not have are zero, and left out."""
+    sizes, sight = content["features"], suites.sights[sensors]
+    names = list(feature_sizes(sight.estimator))
+    places = [list(sizes).index(name) for name in names]
+    (weight, bias), *others = suites.network.layers
+    layers = [(np.ascontiguousarray(weight[:, places]), bias), *others]
+    own = replace(suites.network, layers=layers)
+    scales = np.array([float(sizes[name]) for name in names])
+    return Policy(own, sight.estimator, scales, content, sight.base_gain, suites)
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:

@@ -110,7 +110,9 @@ def design(
     n = len(model.states)
     kept = [model.index(name) for name in NAMES] + list(range(n, n + len(integrated)))
     A, B, Q, R = regulator_problem(model, limits)
-    gain, cost_to_go, _ = control.dlqr(A[np.ix_(kept, kept)], B[kept], Q[np.ix_(kept, kept)], R)
+    gain, cost_to_go, _ = control.dlqr(
+        A[np.ix_(kept, kept)], B[kept], Q[np.ix_(kept, kept)], R, method="scipy"
+    )
     return StateFeedback(
         vehicle=vehicle.name,
         kind="lqi" if integral else "lqr",

@@ -16,7 +16,7 @@ from coax_env.env.hover import DOWN, HEADING, HORIZONTAL
 from coax_env.env.tasks import FORWARD, RIGHT, TURN, UP
 from coax_env.model.sensors import slow_instruments, suite
 
-REACH = {"place": 0.5, "height": 0.15, "heading": math.radians(10.0)}
+REACH = {"place": 0.5, "height": 0.4, "heading": math.radians(10.0)}
 """Farthest setpoint at once [m, m, rad]."""
 
 
@@ -28,13 +28,18 @@ class TargetView:
         self.names = [sensor.name for sensor in own]
         self.width = len(own) + len(slow_instruments(own))
         aims = {"psi", "pn", "pe", "h"} <= set(self.names) or {"psi", "x", "y"} <= set(self.names)
-        self._places = tasks.places("position", own) if aims else None
-        self._up = -tasks.height_sign("position", own) if aims else 1.0
+        self.places = tasks.places("position", own) if aims else None
+        self.up = -tasks.height_sign("position", own) if aims else 1.0
         self._speed = [self.names.index(n) for n in ("vn", "ve") if n in self.names]
 
     def has_target(self, observations: np.ndarray) -> bool:
         """Whether observations (count, n) have a target in them."""
-        return observations.shape[1] == self.width + tasks.N_WAY
+        return observations.shape[1] >= self.width + tasks.N_WAY
+
+    def motion(self, observations: np.ndarray) -> np.ndarray | None:
+        """How the target moves, MOTION (count, 7), in the measured heading's axes; None: it rests."""
+        end = self.width + tasks.N_WAY
+        return observations[:, end:].astype(float) if observations.shape[1] > end else None
 
     def as_hover(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Observations (count, n), with or without a target, as those of a hover.
@@ -45,8 +50,36 @@ class TargetView:
         """
         if self.has_target(observations):
             seen, _, there = self.relative_to_target(observations)
+            self._subtract_motion(seen, observations)
             return seen, there
         return observations.astype(float), np.ones(len(observations), dtype=bool)
+
+    @property
+    def aims(self) -> bool:
+        """Whether the suite shows what a target is seen by: position and heading."""
+        return self.places is not None
+
+    def beyond(self, observations: np.ndarray) -> np.ndarray:
+        """The way from the setpoint on to the target, WAY (count, 4); zero without a target."""
+        if not self.has_target(observations):
+            return np.zeros((len(observations), tasks.N_WAY))
+        way = self._way(observations)
+        return way - _within_reach(way)
+
+    def _way(self, observations: np.ndarray) -> np.ndarray:
+        return np.array(observations[:, self.width : self.width + tasks.N_WAY], dtype=float)
+
+    def _subtract_motion(self, seen: np.ndarray, observations: np.ndarray) -> None:
+        """The target's velocity taken from the readings of velocity, in place."""
+        motion = self.motion(observations)
+        if motion is None:
+            return
+        level = motion[:, :2]
+        if self._speed:  # north and east, turned to the target's heading by now
+            level = turned(level, seen[:, self.names.index("psi")])
+        for k, names in enumerate((("vn", "u"), ("ve", "v"), ("vd", "w"))):
+            for name in set(names) & set(self.names):
+                seen[:, self.names.index(name)] -= -motion[:, 2] if k == 2 else level[:, k]
 
     def relative_to_target(
         self, observations: np.ndarray
@@ -57,26 +90,32 @@ class TargetView:
             observations (count, width); the setpoint, x y z psi (count, 4); whether it is
             the target itself, (count,) bool.
         """
-        assert self._places is not None
+        assert self.places is not None
         seen = np.array(observations[:, : self.width], dtype=float)
-        way = np.array(observations[:, self.width :], dtype=float)
-        whole = way.copy()
-        distance = np.maximum(np.hypot(way[:, FORWARD], way[:, RIGHT]), 1e-9)
-        way[:, HORIZONTAL] *= np.minimum(1.0, REACH["place"] / distance)[:, None]
-        way[:, UP] = np.clip(way[:, UP], -REACH["height"], REACH["height"])
-        way[:, TURN] = np.clip(way[:, TURN], -REACH["heading"], REACH["heading"])
-        x, y, z, psi = self._places
+        whole = self._way(observations)
+        way = _within_reach(whole)
+        x, y, z, psi = self.places
         heading = seen[:, psi].copy()
         setpoint = np.empty((len(seen), 4))
         setpoint[:, HORIZONTAL] = seen[:, [x, y]] + turned(way[:, HORIZONTAL], heading)
-        setpoint[:, DOWN] = -self._up * seen[:, z] - way[:, UP]
+        setpoint[:, DOWN] = -self.up * seen[:, z] - way[:, UP]
         setpoint[:, HEADING] = heading + way[:, TURN]
         seen[:, psi] = -way[:, TURN]
         seen[:, [x, y]] = -turned(way[:, HORIZONTAL], seen[:, psi])
-        seen[:, z] = self._up * (hover.HEIGHT - way[:, UP])
+        seen[:, z] = self.up * (hover.HEIGHT - way[:, UP])
         if self._speed:
             seen[:, self._speed] = turned(seen[:, self._speed], -setpoint[:, HEADING])
         return seen, setpoint, (way == whole).all(axis=1)
+
+
+def _within_reach(way: np.ndarray) -> np.ndarray:
+    """A way (count, 4), or its beginning where it is longer than REACH."""
+    way = way.copy()
+    distance = np.maximum(np.hypot(way[:, FORWARD], way[:, RIGHT]), 1e-9)
+    way[:, HORIZONTAL] *= np.minimum(1.0, REACH["place"] / distance)[:, None]
+    way[:, UP] = np.clip(way[:, UP], -REACH["height"], REACH["height"])
+    way[:, TURN] = np.clip(way[:, TURN], -REACH["heading"], REACH["heading"])
+    return way
 
 
 def turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:

@@ -1,10 +1,11 @@
 """Ratios measured in one run: speed of the env against others, its start, and what effects cost.
 
-Without --peers in under two minutes; --diagnosis takes two more. With --peers other simulators are
-installed, each into a venv of its own (a gigabyte each, once), and flown in turns with ours: ours,
-peer, ours, peer; the best of all rounds counts. Everyone flies random actions in their own vector env
-with their own settings, which the table states. Absolute times depend on the machine and its
-neighbours; compare ratios only.
+Without --peers in under three minutes; --diagnosis and --training take two more each. With --peers
+other simulators are installed, each into a venv of its own (a gigabyte each, once), and flown in turns
+with ours: ours, peer, ours, peer; the best of all rounds counts. Everyone flies random actions in their
+own vector env with their own settings, which the table states. Vehicles with effects, in wind, and
+drawn fly in turns with the bare one. Absolute times depend on the machine and its neighbours; compare
+ratios only.
 """
 
 import json
@@ -94,6 +95,8 @@ def main() -> None:
     )
     parser.add_argument("--diagnosis", action="store_true",
                         help="time diagnoses of 12 runs in gusts too")  # fmt: skip
+    parser.add_argument("--training", action="store_true",
+                        help="time PPO from nothing on each vehicle too")  # fmt: skip
     parser.add_argument("--only", nargs="+", metavar="PEER", help="only these (with --peers)")
     parser.add_argument("--venvs", type=Path, default=Path("runs/peers"), metavar="DIR",
                         help="where the peers' venvs are kept (default: %(default)s)")  # fmt: skip
@@ -117,11 +120,16 @@ def main() -> None:
         kernel = in_turns([ours], Row("kernel", "kernel"), options, report_progress)[OURS]
         cold = cold_start()
         steps = effects_off()
+        report_progress("vehicles with effects, in wind, drawn")
+        vehicles = in_one_process("fly", options.envs, 4 * options.rounds)
+        if options.training:
+            report_progress("PPO on each of them")
+        trained = in_one_process("train", 1, options.rounds) if options.training else {}
         diagnoses = diagnosis_times.measure(report_progress) if options.diagnosis else []
     result = {
         "load_average": load, "processors": os.cpu_count(), "envs": options.envs, "rows": rows,
         "kernel": kernel, "cold_start_s": cold, "absent": absent,
-        "diagnoses": diagnoses, **steps,
+        "vehicles": vehicles, "training": trained, "diagnoses": diagnoses, **steps,
     }  # fmt: skip
     write_json(options.out / "benchmark.json", result)
     command_line.print_columns(table(result))
@@ -222,6 +230,11 @@ def table(result: dict[str, Any]) -> list[list[str]]:
     lines.append(["import to first step, cold", OURS, figure(cold, "s"), *[""] * 5])
     off = 100.0 * (result["effects_off_ratio"] - 1.0)
     lines.append(["effects off, against cut out", OURS, f"{off:+.1f} %", *[""] * 5])
+    for what, flown in (("env-steps", result["vehicles"]), ("PPO", result["training"])):
+        bare = flown.get("bare")
+        for name, value in flown.items():
+            share = f"{value / bare:.2f} of bare"
+            lines.append([f"{what}, {name}", OURS, figure(value, "/s"), *[""] * 4, share])
     for row in result["diagnoses"]:
         lines.append([
             f"diagnosis, {len(row['hidden'])} hidden, {len(row['named'])} named", OURS,
@@ -251,6 +264,20 @@ def cold_start() -> float:
             env=environment, capture_output=True, text=True, check=True,
         )  # fmt: skip
     return json.loads(done.stdout.splitlines()[-1])["value"]
+
+
+def in_one_process(mode: str, envs: int, rounds: int) -> dict[str, float]:
+    """Steps per second of the vehicles of speed/fly_vehicles.py, in turns.
+
+    Args:
+        mode: "fly" or "train". envs: in a vector env. rounds: turns each.
+    """
+    call = [sys.executable, PROGRAMS / "fly_vehicles.py", mode, str(envs), str(rounds)]
+    done = subprocess.run(
+        list(map(str, call)), capture_output=True, text=True, check=True,
+        env=peers.clean_environment() | {"PYTHONPATH": str(PACKAGE.parent)},
+    )  # fmt: skip
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def effects_off() -> dict[str, Any]:

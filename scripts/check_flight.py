@@ -64,6 +64,10 @@ def show(found: "FlightCheck") -> None:
         print("repaired:", note)
     if found.unread:
         print("columns not read:", ", ".join(found.unread))
+    if found.unseen:
+        print("sign not seen by any check:", " ".join(found.unseen))
+    for waived in found.waived:
+        print("waived:", waived)
     for suspicion in found.suspicions:
         print("SUSPICIOUS:", suspicion)
     print()

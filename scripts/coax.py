@@ -12,7 +12,7 @@ from coax_env.errors import InputError
 FOLDER = Path(__file__).resolve().parent
 VERBS = (
     "demo", "simulate", "import_log", "check_flight", "replay", "diagnose", "identify",
-    "plan_flight", "design_lqr", "train_ppo", "evaluate", "compare_models",
+    "plan_flight", "design_lqr", "train_ppo", "evaluate", "compare_models", "export",
 )  # fmt: skip
 """Scripts that need nothing but the package; studies and benchmark also need its sources."""
 

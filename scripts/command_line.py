@@ -8,11 +8,12 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from tqdm import tqdm
 
-from coax_env.errors import InputError
+from coax_env.errors import InputError, MissingPackage
+from coax_env.files import read_toml, write_text
 from coax_env.workers import BACKENDS
 
 BAD_INPUT = 2
@@ -54,6 +55,29 @@ def add_flight(parser: Parser) -> None:
     parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
 
 
+def add_waive(parser: Parser) -> None:
+    """``--waive``, for a log that contradicts itself and is right all the same."""
+    parser.add_argument(
+        "--waive", action=Waived, default=[], metavar="CHECK,CHECK",
+        help="checks of the log with itself to pass over (check_flight names those that fail)",
+    )  # fmt: skip
+
+
+class Waived(argparse.Action):
+    """Names parted by commas; the option may be given several times."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[object] | None,
+        option_string: str | None = None,
+    ) -> None:
+        """Add the names."""
+        names = [name.strip() for name in str(values).split(",") if name.strip()]
+        setattr(namespace, self.dest, [*getattr(namespace, self.dest), *names])
+
+
 def add_workers(parser: Parser, what: str, default: int) -> None:
     """``--jobs`` and ``--backend``, for `coax_env.workers.each`.
 
@@ -70,6 +94,60 @@ def add_workers(parser: Parser, what: str, default: int) -> None:
         "--backend", choices=BACKENDS, default="loky",
         help="joblib's own processes, or a Ray cluster (RAY_ADDRESS; else a local one)",
     )  # fmt: skip
+
+
+def numbers(words: Sequence[str], option: str) -> dict[str, float]:
+    """Numbers by name, from NAME=VALUE and TOML files of such lines.
+
+    Args:
+        words: of the command line.
+        option: they were given to, for what is said where they are wrong.
+    """
+    found: dict[str, float] = {}
+    for word in words:
+        name, sign, value = word.partition("=")
+        items = {name: value}.items() if sign else read_toml(word).items()
+        for key, number in items:
+            try:
+                if isinstance(number, bool):
+                    raise TypeError
+                found[key] = float(number)
+            except (TypeError, ValueError) as error:
+                place = option if sign else f"{option} {word}"
+                raise InputError(f"{place}: {key} must be a number, found {number!r}") from error
+    return found
+
+
+def add_air(parser: Parser) -> None:
+    """``--wind`` and ``--turbulence``, for `air`."""
+    parser.add_argument(
+        "--wind", nargs="+", metavar="M/S",
+        help="north east; a speed from anywhere; or LOWEST..HIGHEST, drawn for every flight",
+    )  # fmt: skip
+    parser.add_argument("--turbulence", help="Dryden's: light, moderate, severe, or m/s at 6 m")
+
+
+def air(options: argparse.Namespace) -> dict[str, Any]:
+    """The env's ``wind`` and ``turbulence``, where they were asked for."""
+    found: dict[str, Any] = {}
+    if options.wind:
+        low, dots, high = options.wind[0].partition("..")
+        words = [low, high] if dots else options.wind
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            numbers = []
+        if not numbers or len(numbers) > 2 or (dots and len(options.wind) > 1):
+            raise InputError(
+                f"--wind is NORTH EAST, a speed, or LOWEST..HIGHEST, found {' '.join(options.wind)!r}"
+            )
+        found["wind"] = {"speed": tuple(numbers)} if dots else numbers
+    if options.turbulence:
+        try:
+            found["turbulence"] = float(options.turbulence)
+        except ValueError:
+            found["turbulence"] = options.turbulence
+    return found
 
 
 def _jobs(text: str) -> int:
@@ -90,6 +168,20 @@ def print_columns(rows: Sequence[Sequence[str]]) -> None:
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for row in rows:
         print("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip())
+
+
+def write_report(path: Path, make: Callable[[], str]) -> str:
+    """Write a report after all other results, and say where; or why there is none.
+
+    Args:
+        path: of the page.
+        make: the page; what it needs may not be installed.
+    """
+    try:
+        write_text(path, make())
+    except MissingPackage as error:
+        return f"no report: {error}"
+    return f"report {path}"
 
 
 @contextmanager

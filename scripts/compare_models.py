@@ -8,15 +8,19 @@ from pathlib import Path
 
 import command_line
 
+from coax_env.errors import InputError
 from coax_env.files import make_folder, write_json, write_text
 from coax_env.model.vehicle_file import load_vehicle, vehicle_toml
-from controllers import model_comparison
+from controllers import machines, model_comparison
 
 
 def main() -> None:
     options = arguments()
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
 
+    if options.machines:
+        compare_machines(options)
+        return
     model_comparison.check_machine(options.machine, options.flight)
     bare = load_vehicle(options.model)
     machine = (
@@ -42,6 +46,36 @@ def main() -> None:
     print(f"report {options.out / 'report.html'}")
 
 
+def compare_machines(options: argparse.Namespace) -> None:
+    """Many machines, drawn; results that are already in the folder are kept.
+
+    Args:
+        options: of the command line.
+    """
+    if options.machine or options.flight:
+        raise InputError(
+            "--machines draws the machines: it goes with neither --machine nor --flight"
+        )
+    if options.machines < 1:
+        raise InputError(f"--machines must be at least 1, found {options.machines}")
+    make_folder(options.out)
+    kind = "truth" if options.truth else "machines"
+    seeds = range(options.seed, options.seed + options.machines)
+    results = []
+    with command_line.progress("compare_models") as report_progress:
+        for found in machines.fly_machines(
+            seeds, options.model, options.out, options.episodes, round(options.steps),
+            options.truth, report_progress,
+        ):  # fmt: skip
+            results.append(found)
+            write_json(options.out / f"{kind}.json", machines.summary(results))
+    words = "scripts/compare_models.py " + shlex.join(sys.argv[1:])
+    write_text(options.out / "report.html", machines.machines_page(results, words))
+    command_line.print_columns([machines.HEADER, *machines.rows(results)])
+    print("\n".join(machines.in_words(machines.summary(results))))
+    print(f"report {options.out / 'report.html'}")
+
+
 def arguments() -> argparse.Namespace:
     """What was asked for on the command line."""
     parser = command_line.parser("compare_models", __doc__, seed=True)
@@ -49,13 +83,21 @@ def arguments() -> argparse.Namespace:
         "--machine", metavar="FILE",
         help="the true vehicle (default: --model with motor lag, torque out of balance, rotor drag)",
     )  # fmt: skip
+    parser.add_argument(
+        "--machines", type=int, default=0, metavar="N",
+        help="instead: N machines from --seed on, with two to four hidden effects each; resumable",
+    )  # fmt: skip
+    parser.add_argument(
+        "--truth", action="store_true",
+        help="with --machines: the machine itself for its corrected model, the most there is to gain",
+    )  # fmt: skip
     parser.add_argument("--model", default="lama400d", help="the bare model (default: %(default)s)")
     parser.add_argument(
         "--flight", type=Path, metavar="FOLDER", help="its flights (default: simulated)"
     )
     parser.add_argument("--episodes", type=int, default=100, help="(default: %(default)s)")
     parser.add_argument(
-        "--steps", type=float, default=4e6, help="of each policy's training; 0: LQG only"
+        "--steps", type=float, default=4e6, help="of each policy's training; 0: no PPO"
     )
     return parser.parse_args()
 

@@ -79,8 +79,7 @@ def save(result: Diagnosis, out: Path, scores: ControllerScores | None = None) -
         scores: of controllers designed on both models.
     """
     command = f"scripts/diagnose.py {result.flight.path} --out {out}"
-    diagnose_script.save(result, out, command, scores)
-    print(f"   report: {out / 'report.html'}")
+    print(f"   {diagnose_script.save(result, out, command, scores)}")
 
 
 def print_errors(result: Diagnosis) -> None:

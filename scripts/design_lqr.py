@@ -6,34 +6,49 @@ import sys
 
 import command_line
 
+from coax_env.env import hover
 from coax_env.files import make_folder, write_text
 from coax_env.model.sensors import SUITES
 from coax_env.model.vehicle_file import load_vehicle
-from controllers import lqr, margins
+from controllers import lqr, margins, schedule
 from controllers.design_report import (
     MARGIN_HEADER,
+    STEP_HEADER,
     design_page,
     disk_in_words,
+    extreme_in_words,
     margin_rows,
     spread_in_words,
+    step_rows,
 )
 from controllers.evaluation import evaluate, evaluate_spread
+from controllers.steps import step_responses
 
 
 def main() -> None:
     options = arguments()
     vehicle = load_vehicle(options.vehicle)
-    controller = lqr.design(vehicle, options.nominal, options.sensors)
+    limits = command_line.numbers(options.limits, "--limits")
+    weights = command_line.numbers(options.weights, "--weights")
+    controller = lqr.design(vehicle, options.nominal, options.sensors, limits, weights)
+    scheduled = (
+        schedule.design(vehicle, options.nominal, options.sensors, options.speeds, limits, weights)
+        if options.speeds
+        else None
+    )
     inputs, disk = margins.stability_margins(controller)
     score = evaluate(controller, vehicle, episodes=50, seed=options.seed)
     worst = evaluate_spread(controller, vehicle, options.vehicles, 5, seed=options.seed)
     spread = margins.margins_over_spread(controller, vehicle, options.vehicles, options.seed)
+    extreme = margins.worst_over_spread(controller, vehicle, seed=options.seed)
     page = design_page(
         controller, vehicle, inputs, disk, score, worst, spread,
-        "scripts/design_lqr.py " + shlex.join(sys.argv[1:]),
+        "scripts/design_lqr.py " + shlex.join(sys.argv[1:]), extreme,
     )  # fmt: skip
     make_folder(options.out)
     path = controller.save(options.out / "controller.json")
+    if scheduled is not None:
+        print(f"gain schedule {scheduled.save(options.out / 'schedule.json')}")
     write_text(options.out / "report.html", page)
 
     print_margins(controller, inputs, disk)
@@ -42,6 +57,8 @@ def main() -> None:
         f"{100 * score['success_rate']:.0f} % succeed, mean cost {score['mean_cost']:.3g}"
     )
     print(spread_in_words(worst, spread))
+    print(extreme_in_words(extreme))
+    command_line.print_columns([STEP_HEADER, *step_rows(step_responses(controller))])
     print(f"controller {path}, report {options.out / 'report.html'}")
 
 
@@ -69,6 +86,23 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--nominal", help="vehicle whose trim centres the action (default: bare)")
     parser.add_argument(
         "--sensors", default="onboard", help=f"{', '.join(SUITES)} (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--weights", nargs="+", default=[], metavar="FILE|NAME=VALUE",
+        help="of the squared errors; a TOML file of such lines, or one by one (default: "
+        + ", ".join(f"{name}={value:g}" for name, value in hover.COST_WEIGHTS.items()) + ")",
+    )  # fmt: skip
+    parser.add_argument(
+        "--limits", nargs="+", default=[], metavar="FILE|NAME=VALUE",
+        help="errors that count their weight, SI (default: "
+        + ", ".join(f"{name}={value:.3g}" for name, value in hover.LIMITS.items()) + ")",
+    )  # fmt: skip
+    parser.add_argument(
+        "--speeds",
+        type=float,
+        nargs="+",
+        metavar="M/S",
+        help="also a gain schedule over forward speed, rising from 0: DIR/schedule.json",
     )
     parser.add_argument(
         "--vehicles", type=int, default=20,

@@ -9,11 +9,13 @@ import command_line
 from tqdm import tqdm
 
 from coax_env.env.hover import CONTROL_PERIOD
+from coax_env.env.paths import SHAPES
 from coax_env.env.tasks import TASKS
+from coax_env.errors import InputError
 from coax_env.files import make_folder, write_json, write_text
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from controllers import comparison, load_controller
+from controllers import comparison
 from controllers.evaluation import evaluate, evaluate_spread
 from controllers.loading import KINDS, Controller, make_controller
 
@@ -38,7 +40,8 @@ def arguments() -> argparse.Namespace:
     parser = command_line.parser("evaluate", __doc__, seed=True)
     parser.add_argument(
         "--controller", default="lqr", metavar="NAME|PATH",
-        help="a controller.json, a policy.zip, or "
+        help="a controller.json, a policy.zip, a function, class or python-control system of your own "
+        "(my.py:NAME), a zip of Stable-Baselines3 (both run what is in the file), or "
         + "; ".join(f"{name}: {words}" for name, words in KINDS.items()),
     )  # fmt: skip
     parser.add_argument(
@@ -47,9 +50,12 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=100, help="(default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=20.0, help="(default: %(default)s)")
     parser.add_argument("--sensors", help="to design for (default: onboard); a file has its own")
-    parser.add_argument("--wind", type=float, nargs="+", metavar="M/S", help="north east, or speed")
-    parser.add_argument("--turbulence", help="Dryden's: light, moderate, severe, or m/s at 6 m")
+    command_line.add_air(parser)
     parser.add_argument("--task", default="hover", choices=list(TASKS), help="(default: hover)")
+    parser.add_argument(
+        "--path", metavar="NAME|CSV",
+        help=f"of --task trajectory: {', '.join(SHAPES)}, or columns t, north, east, height, heading",
+    )  # fmt: skip
     parser.add_argument(
         "--randomize", choices=["posterior"],
         help="fly vehicles drawn from the file's spread; the score is of the worst",
@@ -72,9 +78,11 @@ def fly(options: argparse.Namespace, vehicle: Vehicle, controller: Controller) -
         vehicle: what is flown.
         controller: what flies.
     """
-    env: dict[str, Any] = {"wind": options.wind, "task": options.task}
-    if options.turbulence:
-        env["turbulence"] = strength(options.turbulence)
+    env: dict[str, Any] = command_line.air(options) | {"task": options.task}
+    if options.path:
+        if options.task != "trajectory":
+            raise InputError("--path is for --task trajectory")
+        env["target"] = options.path
     if options.randomize:
         with tqdm(total=options.vehicles, unit="vehicle", leave=False, disable=None) as bar:
             return evaluate_spread(
@@ -91,7 +99,8 @@ def fly(options: argparse.Namespace, vehicle: Vehicle, controller: Controller) -
 
 def compare(options: argparse.Namespace, vehicle: Vehicle) -> None:
     """The comparison's table, compare.json and report.html."""
-    policy = None if options.controller in KINDS else load_controller(options.controller)
+    named = options.controller in KINDS and options.controller != "ppo_outdoor"
+    policy = None if named else make_controller(options.controller)
     with command_line.progress("compare") as report_progress:
         content = comparison.compare(
             vehicle, policy, options.episodes, options.seconds, options.vehicles, options.seed,
@@ -105,14 +114,6 @@ def compare(options: argparse.Namespace, vehicle: Vehicle) -> None:
     rows = comparison.rows(content["conditions"])
     command_line.print_columns(comparison.without_repeats(comparison.HEADER, rows))
     print(f"scores {path}, report {page}")
-
-
-def strength(text: str) -> float | str:
-    """A strength of turbulence as a number where it is one."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def words(value: object) -> str:

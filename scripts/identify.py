@@ -8,7 +8,7 @@ import command_line
 
 from coax_env import report
 from coax_env.estimation.prediction import pooled_rms
-from coax_env.files import staged_folder, write_text
+from coax_env.files import make_folder, write_text
 from coax_env.identification.identify import METHODS, Identification, identify
 from coax_env.identification.two_step.method import TwoStep
 from coax_env.model.vehicle_file import vehicle_toml
@@ -25,13 +25,16 @@ def main() -> None:
             channels=None if options.channels is None else options.channels.split(","),
             also=[name for name in options.also.split(",") if name],
             hold_out=[name for name in options.hold_out.split(",") if name],
+            waive=options.waive,
         )
-    page = report_page(result, "scripts/identify.py " + shlex.join(sys.argv[1:]))
-    with staged_folder(options.out) as folder:
-        write_text(folder / "vehicle.toml", vehicle_toml(result.after))
-        write_text(folder / "report.html", page)
+    make_folder(options.out)
+    path = write_text(options.out / "vehicle.toml", vehicle_toml(result.after))
     print_result(result)
-    print(f"vehicle {options.out / 'vehicle.toml'}, report {options.out / 'report.html'}")
+    command = "scripts/identify.py " + shlex.join(sys.argv[1:])
+    page = command_line.write_report(
+        options.out / "report.html", lambda: report_page(result, command)
+    )
+    print(f"vehicle {path}, {page}")
 
 
 def report_page(result: Identification | TwoStep, command: str) -> str:
@@ -73,6 +76,7 @@ def arguments() -> argparse.Namespace:
     """What was asked for on the command line."""
     parser = command_line.parser("identify", __doc__)
     command_line.add_flight(parser)
+    command_line.add_waive(parser)
     parser.add_argument("--method", choices=METHODS, default="ml", help="default: %(default)s")
     parser.add_argument(
         "--channels", metavar="C,C", help="use these measured channels only (default: all)"

@@ -8,23 +8,28 @@ import command_line
 from coax_env import report
 from coax_env.errors import InputError
 from coax_env.estimation.prediction import replay
-from coax_env.files import staged_folder, write_json, write_text
+from coax_env.files import make_folder, write_json
 
 
 def main() -> None:
     parser = command_line.parser("replay", __doc__)
     command_line.add_flight(parser)
+    command_line.add_waive(parser)
     parser.add_argument("--horizon", type=float, default=1.0, help="seconds (default: 1.0)")
     options = parser.parse_args()
     if not 0.05 <= options.horizon <= 60.0:
         raise InputError(f"--horizon must be between 0.05 and 60 s, found {options.horizon:g}")
 
     with command_line.progress("replay") as report_progress:
-        result = replay(options.flight, options.vehicle, options.horizon, report_progress)
-    page = report.replay_page(result, "scripts/replay.py " + shlex.join(sys.argv[1:]))
-    with staged_folder(options.out) as folder:
-        write_json(folder / "replay.json", result.findings)
-        write_text(folder / "report.html", page)
+        result = replay(
+            options.flight,
+            options.vehicle,
+            options.horizon,
+            report_progress,
+            waive=options.waive,
+        )
+    make_folder(options.out)
+    path = write_json(options.out / "replay.json", result.findings)
     for run, table in result.findings["runs"].items():
         cells = (
             f"{c} " + ("diverged" if e.get("diverged") else f"{e['rms']:.3g} {e['unit']}")
@@ -32,7 +37,11 @@ def main() -> None:
             if e.get("diverged") or e["rms"] is not None
         )
         print(f"{run}: {', '.join(cells)}")
-    print(f"replay {options.out / 'replay.json'}, report {options.out / 'report.html'}")
+    command = "scripts/replay.py " + shlex.join(sys.argv[1:])
+    page = command_line.write_report(
+        options.out / "report.html", lambda: report.replay_page(result, command)
+    )
+    print(f"replay {path}, {page}")
 
 
 if __name__ == "__main__":

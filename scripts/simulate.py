@@ -9,7 +9,7 @@ from pathlib import Path
 import command_line
 
 from coax_env import report
-from coax_env.files import make_folder, write_text
+from coax_env.files import make_folder
 from coax_env.logs.flight import write_flight
 from coax_env.model.sensors import SUITES, log_suite
 from coax_env.model.vehicle_file import load_vehicle, shipped_vehicles
@@ -29,14 +29,10 @@ def main() -> None:
     papers = names == ["lon_doublet"] and vehicle.name == "lama400d" and not vehicle.effects
     table = doublet_table(vehicle) if papers else ()
     remarks = doublet_remarks(vehicle) if papers else ()
-    page = report.simulation_page(
-        tracks, vehicle, table, remarks, "scripts/simulate.py " + shlex.join(sys.argv[1:])
-    )
     if vehicle.name not in shipped_vehicles():
         flight = replace(flight, vehicle=str(Path(options.vehicle).resolve()))
     make_folder(options.out)
     write_flight(flight, options.out / "flight")
-    write_text(options.out / "report.html", page)
 
     if papers:
         command_line.print_columns([report.DOUBLET_HEADER, *report.doublet_rows(table)])
@@ -44,7 +40,12 @@ def main() -> None:
             print("holds:" if remark.holds else "DOES NOT HOLD:", remark.statement)
     for track in tracks:
         print(track.maneuver.name + ":", f"{track.t[-1]:.1f} s", track.ended)
-    print(f"flight {options.out / 'flight'}, report {options.out / 'report.html'}")
+    command = "scripts/simulate.py " + shlex.join(sys.argv[1:])
+    page = command_line.write_report(
+        options.out / "report.html",
+        lambda: report.simulation_page(tracks, vehicle, table, remarks, command),
+    )
+    print(f"flight {options.out / 'flight'}, {page}")
 
 
 def arguments() -> argparse.Namespace:

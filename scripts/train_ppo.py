@@ -1,4 +1,4 @@
-"""Train a hover policy with PPO on the Kalman filter's estimate. Ctrl-C keeps the policy so far."""
+"""Train a policy with PPO on the Kalman filter's estimate. Ctrl-C keeps the policy so far."""
 
 import argparse
 import json
@@ -11,13 +11,16 @@ from typing import Any
 import command_line
 from tqdm import tqdm
 
+from coax_env.env.tasks import TASKS
 from coax_env.errors import InputError
 from coax_env.files import write_bytes, write_json
 from coax_env.model.sensors import SUITES
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from controllers import load_controller, ppo
+from controllers import ppo
 from controllers.evaluation import evaluate
+from controllers.policy import load_policy
+from controllers.target import TargetView
 
 FLIGHTS = 100
 SELECTION_SEED, TEST_SEED = 10_000, 20_000
@@ -37,14 +40,16 @@ def main() -> None:
         "command_line": shlex.join(["scripts/train_ppo.py", *sys.argv[1:]]),
         "settings": dict(setting(text) for text in options.set),
     }  # fmt: skip
+    world: dict[str, Any] = command_line.air(options)
     if options.randomize:
-        training["randomize"] = options.randomize
+        world["randomize"] = options.randomize
+    training |= world | {"task": options.task, "hidden": options.hidden}
     if options.seeds == 1:
         path = train_one(vehicle, options, training)
-        score = score_of(path, vehicle, SELECTION_SEED + options.seed)
+        score = score_of(path, vehicle, SELECTION_SEED + options.seed, options.task[0], world)
     else:
-        path = train_several(vehicle, options, training)
-        score = score_of(path, vehicle, TEST_SEED + options.seed)
+        path = train_several(vehicle, options, training, world)
+        score = score_of(path, vehicle, TEST_SEED + options.seed, options.task[0], world)
     write_json(options.out / "score.json", score)
     print(in_words(score))
     print(f"policy {path}, score {options.out / 'score.json'}")
@@ -56,8 +61,18 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--vehicle", default="lama400d", help="shipped name or TOML file")
     parser.add_argument("--nominal", help="vehicle whose trim centres the action (default: bare)")
     parser.add_argument(
-        "--sensors", default="onboard", help=f"{', '.join(SUITES)} (default: %(default)s)"
-    )
+        "--task", nargs="+", default=["hover"], choices=list(TASKS),
+        help="one or several, learnt by one policy; the score is of the first (default: hover)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--sensors", nargs="+", default=["onboard"], choices=list(SUITES),
+        help="one suite or several; tasks with a target fly on those that show it (default: onboard)",
+    )  # fmt: skip
+    command_line.add_air(parser)
+    parser.add_argument(
+        "--hidden", action="store_true",
+        help="half the flights on machines with lags and trims that the filter does not know",
+    )  # fmt: skip
     parser.add_argument(
         "--steps", type=float, default=3e6, help="of all helicopters (default: 3e6)"
     )
@@ -97,13 +112,19 @@ def train_one(vehicle: Vehicle, options: argparse.Namespace, training: dict[str,
         return ppo.train(vehicle, options.out, seed=options.seed, progress=progress, **training)
 
 
-def train_several(vehicle: Vehicle, options: argparse.Namespace, training: dict[str, Any]) -> Path:
+def train_several(
+    vehicle: Vehicle,
+    options: argparse.Namespace,
+    training: dict[str, Any],
+    world: dict[str, Any],
+) -> Path:
     """DIR/seed_K/policy.zip and score.json of every seed, and a copy of the best in DIR.
 
     Args:
         vehicle: what flies.
         options: of the command line.
         training: further arguments of `ppo.train_seeds`.
+        world: arguments of the env in which they are scored.
     """
     seeds = range(options.seed, options.seed + options.seeds)
     found: dict[int, tuple[Path, dict[str, Any]]] = {}
@@ -111,7 +132,8 @@ def train_several(vehicle: Vehicle, options: argparse.Namespace, training: dict[
         vehicle, options.out, seeds, options.jobs, options.backend, **training
     )
     for seed, path in tqdm(trained, total=len(seeds), unit="policy", disable=None):
-        found[seed] = path, score_of(path, vehicle, SELECTION_SEED + options.seed)
+        first = SELECTION_SEED + options.seed
+        found[seed] = path, score_of(path, vehicle, first, options.task[0], world)
         write_json(path.with_name("score.json"), found[seed][1])
     for seed in seeds:
         print(f"seed {seed}: {in_words(found[seed][1])}")
@@ -120,15 +142,21 @@ def train_several(vehicle: Vehicle, options: argparse.Namespace, training: dict[
     return write_bytes(options.out / "policy.zip", found[best][0].read_bytes())
 
 
-def score_of(path: Path, vehicle: Vehicle, seed: int) -> dict[str, Any]:
+def score_of(
+    path: Path, vehicle: Vehicle, seed: int, task: str, world: dict[str, Any]
+) -> dict[str, Any]:
     """The score of a policy.
 
     Args:
         path: of its policy.zip.
         vehicle: what is flown.
         seed: of the first flight.
+        task: that is flown, on the first suite that shows its target.
+        world: arguments of the env.
     """
-    return evaluate(load_controller(path), vehicle, episodes=FLIGHTS, seed=seed)
+    policy = load_policy(path)
+    suites = [s for s in policy.suites.sights if task == "hover" or TargetView(s).aims]
+    return evaluate(policy.on(suites[0]), vehicle, FLIGHTS, seed=seed, task=task, **world)
 
 
 def in_words(score: dict[str, Any]) -> str:

@@ -11,8 +11,8 @@ from coax_env import read_flight
 from coax_env.errors import InputError
 from coax_env.logs.autopilot_logs import import_log
 from coax_env.logs.flight import write_flight
+from coax_env.logs.frames import attitude
 from coax_env.logs.signals import Taken
-from coax_env.logs.ulog import euler_angles
 from coax_env.model.layout import RPM_PER_RAD_S
 
 TAKE = {"delta_lon": Taken("actuator_servos.control[0]", 0.2)}
@@ -146,4 +146,5 @@ def test_euler_angles_of_a_quaternion():
             c[0] * s[1] * c[2] + s[0] * c[1] * s[2],
             c[0] * c[1] * s[2] - s[0] * s[1] * c[2],
         )
-        np.testing.assert_allclose(euler_angles(*map(np.array, q)), (phi, theta, psi), atol=1e-9)
+        found = np.ravel(attitude(np.array([q]), "body to NED"))
+        np.testing.assert_allclose(found, (phi, theta, psi), atol=1e-9)

@@ -16,12 +16,12 @@ from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.hold_out import split
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
-from coax_env.estimation.flown import flown_parts
+from coax_env.estimation.flown import flown_parts, jumps_in_gaps
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import replay_runs
 from coax_env.logs.flight import Flight, Run, read_flight
-from coax_env.logs.held import repeats
+from coax_env.logs.held import interpolated, repeats
 from coax_env.logs.outliers import find_leaps
 from coax_env.model.vehicle_file import load_vehicle
 
@@ -197,6 +197,26 @@ def test_commands_that_seldom_change_are_not_frozen():
     assert flown_parts(flight, load_vehicle(flight.vehicle)) is flight
 
 
+# --- commands that jump where rows are missing ------------------------------------------------------
+
+
+def test_a_run_is_cut_where_a_command_jumped_in_a_gap():
+    """A step within three missing rows of a 25 Hz log; other steps and other gaps cut nothing."""
+    rng = np.random.default_rng(0)
+    t = 0.04 * np.arange(300)
+    command = 0.003 * rng.standard_normal((300, 4))
+    command[100:150, 2] += 0.1
+    command[200:250, 3] -= 0.1
+    kept = np.ones(300, bool)
+    kept[40:43] = kept[98:101] = False  # nothing happens; the first step
+    kept[199:200] = False  # one row: 0.08 s
+    (found,) = jumps_in_gaps([t[kept]], [command[kept]])
+    assert t[kept][found].tolist() == pytest.approx([t[101]])
+    (found,) = jumps_in_gaps([t], [command])
+    assert not found.any()
+    assert not any(jumped.any() for jumped in jumps_in_gaps([t[:0], t], [command[:0], command]))
+
+
 # --- held samples ---------------------------------------------------------------------------------
 
 
@@ -225,6 +245,62 @@ def test_a_coarse_or_quiet_sensor_is_not_held():
     for values in (ramp, rest, dithered, np.full(t.size, 0.3), rng.normal(0.0, 1.0, t.size)):
         assert not repeats(values).any()
     assert repeats(ramp, hold=True).sum() == t.size - np.unique(ramp).size
+
+
+@pytest.mark.parametrize("rate", [20.0, 40.0, 60.0, 80.0])
+def test_any_slower_sensor_written_on_every_row_is_held(rate):
+    """Up to four of five rows have a new reading, so that most values show only once."""
+    rng = np.random.default_rng(8)
+    t = np.arange(0.0, 20.0, 0.01)
+    number = np.floor(t * rate + 1e-9).astype(int)
+    readings = np.round(np.sin(0.7 * np.arange(2000) / rate) + rng.normal(0.0, 0.01, 2000), 4)
+    found = repeats(readings[number])
+    again = np.concatenate([[False], np.diff(number) == 0])
+    assert np.mean(found == again) > 0.99
+
+
+@pytest.mark.parametrize("rounded", [None, 4])
+@pytest.mark.parametrize("every", [2, 5, 10])
+def test_a_line_between_readings_is_no_reading(every, rounded):
+    rng = np.random.default_rng(9)
+    t = np.arange(0.0, 20.0, 0.01)
+    readings = np.sin(0.7 * t[::every]) + rng.normal(0.0, 0.02, t[::every].size)
+    y = np.interp(t, t[::every], readings)
+    y = y if rounded is None else np.round(y, rounded)
+    found = interpolated(t, y)
+    new = np.zeros(t.size, bool)
+    new[::every] = True
+    assert np.mean(found[:-every] == ~new[:-every]) > 0.97
+
+
+def test_a_line_over_a_gap_is_no_reading_and_a_sound_signal_has_none():
+    rng = np.random.default_rng(10)
+    t = np.arange(0.0, 20.0, 0.01)
+    y = np.round(np.sin(t) + rng.normal(0.0, 0.03, t.size), 4)
+    ramp = np.round(0.25 * t, 2)
+    rest = np.round(np.where(t < 10.0, 0.5, 0.5 + 0.3 * np.sin(t)), 2)
+    for sound in (y, ramp, rest, np.zeros(t.size), np.round(y, 1), np.sin(t), 0.1 * t):
+        assert not interpolated(t, sound).any()
+    y[700:730] = np.round(np.linspace(y[699], y[730], 32)[1:-1], 4)
+    found = interpolated(t, y)
+    assert found[700:730].all() and np.count_nonzero(found) < 40
+
+
+def test_an_interpolated_log_becomes_what_it_was(tmp_path):
+    """pandas' interpolate() over a log of sensors of several rates, at full precision."""
+
+    def drawn(table: Table) -> None:
+        t = np.array(table["t"], float)
+        for column in ("psi", "h", "vn"):
+            given = np.array([cell != "" for cell in table[column]])
+            values = [float(cell) for cell in table[column] if cell]
+            table[column] = [repr(float(x)) for x in np.interp(t, t[given], values)]
+
+    found, expected = edited(tmp_path / "f", drawn).run(RUN), sound().run(RUN)
+    for channel in ("psi", "h", "vn"):
+        new, known = (np.isfinite(run.measured[channel]) for run in (found, expected))
+        assert np.count_nonzero(new & ~known) <= 0.05 * known.sum(), channel
+        assert np.count_nonzero(known & ~new) <= 0.05 * known.sum(), channel
 
 
 def test_the_card_forces_and_forbids():

@@ -113,7 +113,63 @@ def test_the_closed_loop_is_stable_and_has_the_margins_it_states(onboard):
         assert stable(factor ** rng.choice([-1.0, 1.0], 4))
 
 
-@pytest.mark.slow
+def test_weights_and_limits_make_the_cost():
+    """An error counts weight / limit^2: a double limit is a quarter of the weight."""
+    wide = lqr.design(LAMA, limits={"height": 0.2})
+    light = lqr.design(LAMA, weights={"height": 0.25})
+    assert wide.gain == pytest.approx(light.gain)
+    assert not np.allclose(wide.gain, lqr.design(LAMA).gain)
+    assert wide.to_dict()["cost"]["limits"]["height"] == 0.2
+    again = lqr.LQG.from_dict(wide.to_dict())
+    assert again.cost == wide.cost
+
+
+def test_the_worst_vehicle_is_worse_than_any_drawn_and_no_farther_than_asked(onboard):
+    worst = margins.worst_over_spread(onboard, LAMA, distance=2.0, rounds=2, draws=6)
+    z = np.array(list(worst.moves.values()))
+    assert np.linalg.norm(z) == pytest.approx(2.0)
+    assert worst.disk == margins.disk_margin(onboard, worst.vehicle)
+    rng = np.random.default_rng(8)
+    spread = LAMA.spread()
+    for _ in range(6):
+        z = rng.standard_normal(len(spread.names)) * (spread.std > 0.0)
+        assert worst.disk < margins.disk_margin(onboard, LAMA.at(2.0 * z / np.linalg.norm(z)))
+
+
+def test_mu_is_that_of_slycot():
+    """An upper bound by another way of scaling: AB13MD."""
+    slycot = pytest.importorskip("slycot")
+    rng = np.random.default_rng(3)
+    matrices = rng.standard_normal((6, 4, 4)) + 1j * rng.standard_normal((6, 4, 4))
+    ours = margins._mu_upper_bounds(matrices)
+    theirs = [slycot.ab13md(m, np.ones(4, int), 2 * np.ones(4, int))[0] for m in matrices]
+    assert ours == pytest.approx(theirs, rel=0.1)
+    assert (ours >= np.array(theirs) * 0.999).all()
+
+
+def test_sensitivities_add_up_to_one_and_peak_where_the_margin_is_least(onboard):
+    _, L, _ = margins.frequency_responses(onboard)
+    S, T = margins.sensitivities(L)
+    assert (S + T >= 1.0 - 1e-9).all() and (np.abs(S - T) <= 1.0 + 1e-9).all()
+    assert S[0] < 0.05 and T[0] == pytest.approx(1.0, abs=0.05)
+    _, disk = margins.stability_margins(onboard)
+    # |S| <= |S - 1/2| + 1/2, and the disk margin is one over what bounds the first
+    assert S.max() >= 1.0 / disk - 0.5 - 0.2
+
+
+def test_a_step_is_followed():
+    from controllers import steps
+
+    found = {r.name: r for r in steps.step_responses(lqr.design(LAMA, sensors="mocap"))}
+    assert set(found) == {"height", "heading", "north", "east"}
+    for one in found.values():
+        assert one.value[0] == pytest.approx(0.0, abs=1e-12)
+        assert one.value[-1] == pytest.approx(one.size, rel=0.3), one.name
+        assert 0.1 < one.rise_s < 15.0
+    assert found["height"].unit == "m" and found["heading"].unit == "rad"
+    assert {r.name for r in steps.step_responses(lqr.design(LAMA))} == {"height", "heading"}
+
+
 def test_margins_on_a_vehicle_without_spread_are_those_of_the_design(onboard):
     exact = LAMA.with_parameters({n: replace(p, std=0.0) for n, p in LAMA.parameters.items()})
     _, disk = margins.stability_margins(onboard)
@@ -550,15 +606,16 @@ def test_a_strangers_policy_runs_no_code(where, tmp_path, monkeypatch):
 @pytest.mark.parametrize("change", ["shape", "activation", "scales", "version", "huge"])
 def test_a_policy_that_does_not_fit_gets_one_line(change, tmp_path):
     known = policy.load_policy(policy.SHIPPED)
-    layers, scales, content = list(known.network.layers), known.scales, {}
+    layers, sizes, content = list(known.suites.network.layers), dict(known.content["features"]), {}
+    sights = list(known.suites.sights.values())
     if change == "shape":
         layers[0] = (layers[0][0][:, :-1], layers[0][1])
     network = Network(layers, "exec" if change == "activation" else "tanh")
     if change == "scales":
-        scales = scales[:-1]
+        sizes.popitem()
     if change == "huge":
         content["note"] = "x" * (17 * 2**20)
-    path = policy.save_policy(tmp_path / "p.zip", network, known.estimator, scales, content)
+    path = policy.save_policy(tmp_path / "p.zip", network, sights, sizes, content)
     if change == "version":
         path.write_bytes(_with_version(path, 7))
     with pytest.raises(InputError) as error:
@@ -584,10 +641,10 @@ def _with_version(path, version):
 @pytest.mark.slow
 def test_ppo_hands_each_env_its_own_end(tmp_path):
     pytest.importorskip("stable_baselines3")
-    from controllers.hover_vec_env import HoverVecEnv
+    from controllers.task_vec_env import TaskVecEnv
 
     design = design_estimator(LAMA)
-    env = HoverVecEnv(LAMA, design, 3, episode_s=0.3)
+    env = TaskVecEnv(LAMA, design, 3, episode_s=0.3)
     env.seed(4)
     env.reset()
     ends = 0
@@ -626,10 +683,10 @@ def test_ppo_trains_saves_resumes_and_is_judged(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_held_action_earns_the_sum_of_its_periods_and_ends_in_its_own_flight():
     pytest.importorskip("stable_baselines3")
-    from controllers.hover_vec_env import HoverVecEnv
+    from controllers.task_vec_env import TaskVecEnv
 
     design = design_estimator(LAMA)
-    held, each = (HoverVecEnv(LAMA, design, 2, episode_s=0.1, hold=k) for k in (4, 1))
+    held, each = (TaskVecEnv(LAMA, design, 2, episode_s=0.1, hold=k) for k in (4, 1))
     for env in (held, each):
         env.seed(3)
         env.reset()
@@ -681,3 +738,96 @@ def test_a_policy_that_is_none_gets_one_line(tmp_path):
     path.write_bytes(b"PK")
     with pytest.raises(InputError, match="not a policy"):
         load_controller(path)
+
+
+# --- many machines --------------------------------------------------------------------------------
+
+
+def test_a_machine_is_its_seeds_and_hides_two_to_four_effects():
+    from controllers import machines
+
+    drawn = [machines.draw_machine(LAMA, seed) for seed in range(40)]
+    counts = {len(one.effects) for one in drawn}
+    assert counts == {2, 3, 4}
+    assert drawn[7].values() == machines.draw_machine(LAMA, 7).values()
+    assert len({one for m in drawn for one in m.effects}) > 15
+
+
+def test_ratios_and_their_intervals_are_those_of_paired_flights():
+    from controllers import machines
+
+    costs = np.random.default_rng(0).uniform(1.0, 3.0, 50)
+    scores = {
+        "bare": {"flight_costs": costs.tolist()},
+        "corrected": {"flight_costs": (costs / 2).tolist()},
+    }
+    assert machines.cost_ratio(scores) == pytest.approx((0.5, 0.5, 0.5))
+    noisy = costs * np.random.default_rng(1).uniform(0.3, 0.7, 50)
+    scores["corrected"]["flight_costs"] = noisy.tolist()
+    ratio, low, high = machines.cost_ratio(scores)
+    assert low < ratio < high and low > 0.4 and high < 0.6
+    dear = {
+        "seed": 3,
+        "scores": {"lqg": {"bare": scores["corrected"], "corrected": scores["bare"]}},
+    }
+    cheap = {"seed": 4, "scores": {"lqg": scores}}
+    found = machines.summary([dear, cheap, cheap])["lqg"]
+    assert (found["machines"], found["dearer"], found["worst_seed"]) == (3, 1, 3)
+    assert found["median_ratio"] == pytest.approx(ratio)
+
+
+def test_machines_are_flown_once(tmp_path):
+    from controllers import machines
+
+    first = list(machines.fly_machines([2], LAMA, tmp_path, 2, truth=True))
+    said: list[str] = []
+    again = list(machines.fly_machines([2], LAMA, tmp_path, 2, truth=True, progress=said.append))
+    assert again == first and not said
+    assert (
+        machines.rows(first)[0][0] == "2"
+        and "LQG, 1 machines" in machines.in_words(machines.summary(first))[0]
+    )
+    assert "machine 2" in machines.machines_page(first)
+
+
+@pytest.mark.parametrize(("task", "sensors"), [("hover", "onboard"), ("position", "mocap")])
+def test_the_outdoor_policy_flies_in_wind_on_two_suites(task, sensors):
+    controller = make_controller("ppo_outdoor", sensors=sensors)
+    arguments = {"task": task, "wind": 3.0, "turbulence": "light", "randomize": "posterior"}
+    score = evaluate(controller, "lama400d_outdoor", 8, 10.0, **arguments)
+    assert score["survival_rate"] == 1.0 and score["success_but_drift_rate"] > 0.8
+
+
+def test_a_policy_flies_only_what_it_was_trained_on():
+    with pytest.raises(InputError, match="onboard, mocap"):
+        make_controller("ppo_outdoor", sensors="paper")
+
+
+@pytest.mark.slow
+def test_several_batches_are_flown_as_each_alone():
+    pytest.importorskip("stable_baselines3")
+    from controllers.policy import feature_sizes
+    from controllers.task_vec_env import SeveralVecEnvs, TaskVecEnv
+
+    designs = [design_estimator(LAMA, sensors=s) for s in ("onboard", "mocap")]
+    sizes = policy.all_features(designs)
+
+    def part(design):
+        task = "hover" if design.sensors == "onboard" else "waypoints"
+        return TaskVecEnv(LAMA, design, 2, 0.2, hold=4, sizes=sizes, task=task)
+
+    parts, both = [part(d) for d in designs], SeveralVecEnvs([part(d) for d in designs])
+    both.seed(3)
+    for k, alone in enumerate(parts):
+        alone.seed(3 + 2 * k)
+    seen, each = both.reset(), np.concatenate([alone.reset() for alone in parts])
+    assert np.array_equal(seen, each)
+    lacking = [list(sizes).index(n) for n in sizes if n not in feature_sizes(designs[0])]
+    assert lacking and not seen[:2, lacking].any()
+    for action in np.random.default_rng(0).uniform(-0.1, 0.1, (7, 4, 4)):
+        seen, rewards, done, infos = both.step(action)
+        found = [alone.step(action[2 * k : 2 * k + 2]) for k, alone in enumerate(parts)]
+        assert np.array_equal(seen, np.concatenate([one[0] for one in found]))
+        assert np.array_equal(rewards, np.concatenate([one[1] for one in found]))
+        assert np.array_equal(done, np.concatenate([one[2] for one in found]))
+        assert len(infos) == 4

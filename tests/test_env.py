@@ -27,6 +27,19 @@ from coax_env.simulation.log import log_readings
 LAMA = coax_env.load_vehicle("lama400d")
 DELAYED = LAMA.with_effect("servo_delay", time=0.027).with_effect("rotor_drag", coefficient=4e-4)
 
+NINE = (
+    LAMA.with_effect("command_delay", time=0.068)
+    .with_effect("hub_stiffness", upper=0.2, lower=0.1)
+    .with_effect("swash_phase", angle=0.2)
+    .with_effect("yaw_damping", coefficient=0.003)
+    .with_effect("motor_droop", upper=0.2, lower=0.15)
+    .with_effect("flap_blowback", gain=0.006)
+    .with_effect("swash_offset", lon=0.01, lat=-0.01)
+    .with_effect("marker_offset", y=0.18)
+    .with_effect("vibration", tilt=2.1e-3, heave=3.3e-4)
+)
+"""What the diagnosis of the real CoaX names."""
+
 
 def actions(seed: int, *shape: int, size: float = 1.0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-size, size, shape).astype(np.float32)
@@ -109,8 +122,10 @@ def test_the_same_seed_flies_the_same_flight():
         {},
         {"vehicle": DELAYED, "wind": 2.0, "gusts": (0.3, 0.01)},
         {"randomize": "posterior", "sensors": "state"},
+        {"vehicle": NINE, "sensors": "mocap", "task": "waypoints"},
+        {"vehicle": NINE, "sensors": "paper", "wind": 2.0, "turbulence": "light"},
     ],
-    ids=["plain", "delayed in wind and gusts", "randomized"],
+    ids=["plain", "delayed in wind and gusts", "randomized", "nine effects", "and turbulence"],
 )
 def test_a_row_flies_as_a_single_env_through_every_reset(arguments):
     n, seed = 3, 11
@@ -368,7 +383,7 @@ def test_a_drawn_vehicle_is_told_and_flown():
     env = gymnasium.make("CoaxHeli-v0", randomize="posterior").unwrapped
     masses = [env.reset(seed=s)[1]["vehicle"]["mass"] for s in (1, 2, 1)]
     assert masses[0] == masses[2] != masses[1]
-    assert env.fleet.params[0, 0] == masses[2]
+    assert env.fleet.params_of(0)[0] == masses[2]
 
 
 # --- logs -----------------------------------------------------------------------------------------

@@ -803,6 +803,14 @@ def test_noise_that_is_too_large_is_not_white():
     assert not whiteness([a_pass(e)], ("a",))["a"].white
 
 
+def test_a_short_part_is_as_wide_as_chance_makes_it():
+    """Sixty readings have a std above 1.25 once in 300 times: with 100 of them, every third flight."""
+    draws = np.random.default_rng(4).standard_normal((400, 162, 1))
+    assert max(float(e[101:].std()) for e in draws) > 1.25
+    assert all(whiteness([a_pass(e)], ("a",))["a"].white for e in draws)
+    assert not whiteness([a_pass(2.0 * draws[0])], ("a",))["a"].white
+
+
 def test_an_empty_channel_is_not_judged():
     e = np.random.default_rng(3).standard_normal((500, 2))
     e[:, 1] = np.nan

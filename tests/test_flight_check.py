@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coax_env.consistency.agreement import agreement
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.errors import InputError
 from coax_env.estimation.state_space import Noise
@@ -17,9 +18,9 @@ from coax_env.inspection.flight_check import (
     FlightCheck,
     _next_step,
     check_flight,
+    contradictions,
 )
 from coax_env.inspection.readings import channel_checks, sensor_faults
-from coax_env.inspection.units_and_signs import unit_and_sign_faults
 from coax_env.logs.columns import draft_card, guesses
 from coax_env.logs.flight import Flight, read_flight, write_flight
 from coax_env.model.sensors import log_suite
@@ -52,7 +53,8 @@ def changed(flight: Flight, **factors: float) -> Flight:
 
 
 def suspicions(flight: Flight) -> str:
-    return "; ".join([*unit_and_sign_faults(flight, LAMA), *sensor_faults(channel_checks(flight))])
+    found = contradictions(flight, agreement(flight, LAMA))
+    return "; ".join([*found, *sensor_faults(channel_checks(flight))])
 
 
 # --- what is there --------------------------------------------------------------------------------
@@ -77,14 +79,14 @@ PLANTED: dict[str, tuple[dict[str, float], tuple[str, ...]]] = {
     "rotors in rad/s": ({"rpm": math.pi / 30}, ("rpm_upper_cmd", '"rad/s"')),
     "rotors in rev/s": ({"rpm": 1 / 60}, ("rpm_lower_cmd", '"rev/s"')),
     "rotors stand": ({"rpm": 0.0}, ("rpm_upper_cmd is 0",)),
-    "z up": ({"az": -1.0, "ay": -1.0}, ("z points up",)),
+    "z up": ({"az": -1.0, "ay": -1.0}, ("ay = { sign = -1 }", "az = { sign = -1 }")),
     "acceleration in g": ({"az": 1 / 9.80665}, ("az is -1", '"g"')),
-    "no gravity": ({"az": 3e-3}, ("gravity has been taken out",)),
+    "no gravity": ({"az": 3e-3}, ("Gravity has been taken out",)),
     "angles in degrees": ({"phi": 57.3, "theta": 57.3}, ("phi reaches", '"deg"')),
     "gyros in degrees": ({"p": 57.3, "q": 57.3, "r": 57.3}, ("q reaches", '"deg/s"')),
-    "yaw gyro turned": ({"r": -1.0}, ("psi and r disagree", "scale = -1")),
-    "height downward": ({"h": -1.0}, ("h is -", "scale = -1")),
-    "climb as velocity down": ({"vd": -1.0}, ("h and vd disagree", "scale = -1")),
+    "yaw gyro turned": ({"r": -1.0}, ("psi-r", "r = { sign = -1 }")),
+    "height downward": ({"h": -1.0}, ("h is -", "h = { sign = -1 }")),
+    "climb as velocity down": ({"vd": -1.0}, ("h-vd", "vd = { sign = -1 }")),
 }
 
 

@@ -18,11 +18,11 @@ FLOORS = (
     "kernel",
     "model",
     "env logs",
-    "simulation",
+    "simulation consistency",
     "estimation",
     "design",
     "identification diagnosis",
-    "inspection",
+    "comparison inspection",
     "report",
 )
 """Rooms of coax_env from the ground up: a room may import from the floors below it, and from itself.

@@ -97,7 +97,8 @@ def test_the_trace_grows_with_the_flight_and_is_forgotten_with_it():
 
 
 def test_the_view_is_of_the_state_the_wind_and_the_target():
-    env = CoaxEnv(LAMA, render_mode="rgb_array", wind=(1.0, 2.0))
+    vehicle = LAMA.with_effect("airframe_drag", area_x=0.01)  # so that the wind acts
+    env = CoaxEnv(vehicle, render_mode="rgb_array", wind=(1.0, 2.0))
     _, info = env.reset(seed=3)
     view = env._screen._traces.view(0)
     assert np.array_equal(view.state, info["state"]) and np.allclose(view.air, [1.0, 2.0, 0.0])

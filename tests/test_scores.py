@@ -16,6 +16,7 @@ import pytest
 from coax_env import load_vehicle
 from coax_env.diagnosis import confounding, remarks
 from coax_env.diagnosis.confounding import channels_of
+from coax_env.diagnosis.findings import mixtures_as_one
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import damping_gain, inflation, is_large, loss, score, scores, swap
 from coax_env.estimation.helicopter import HeliModel
@@ -265,6 +266,26 @@ def test_a_lags_delay_stands_for_it_within_a_tie_of_the_refit(refits, inflation,
     slope[names.index("servo_delay.time")] = -50.0 / std[names.index("servo_delay.time")]
     found = confounding._of_one(SERVO, fit, replace(q, g=slope), "servo_lag", inflation, lost)
     assert set(found) == {"servo_delay"}
+
+
+def test_a_servo_that_lags_and_is_late_is_one_cause():
+    """By the name of the stronger; the other one's number is told, and the name is in doubt."""
+
+    def entry(effect: str, evidence: float, *alike: str) -> dict[str, Any]:
+        return {
+            "effect": effect, "evidence": evidence, "parameters": {f"{effect}.time": {"value": 0.02}},
+            "confusable_with": list(alike), "channels": ["q"], "trust": "sure", "doubts": [],
+        }  # fmt: skip
+
+    lag, delay, wind = entry("servo_lag", 40.0), entry("servo_delay", 60.0), entry("wind", 50.0)
+    found = mixtures_as_one([lag, wind, delay])
+    assert [c["effect"] for c in found] == ["servo_delay", "wind"]
+    assert found[0]["confusable_with"] == ["servo_lag"] and found[0]["trust"] == "doubtful"
+    assert set(found[0]["parameters"]) == {"servo_delay.time"}
+    assert found[0]["mixture"] == lag["parameters"]
+    assert found[1] == wind  # what is no mixture is as it was
+    alone = mixtures_as_one([entry("servo_lag", 40.0, "servo_delay")])
+    assert "mixture" not in alone[0] and alone[0]["trust"] == "sure"
 
 
 # --- what is said beside the findings ---------------------------------------------------------------

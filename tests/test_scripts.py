@@ -4,6 +4,7 @@ A process of its own costs seconds of imports, so most calls run the script's fi
 each kind of refusal is also seen once from outside.
 """
 
+import importlib
 import json
 import os
 import runpy
@@ -205,10 +206,20 @@ REQUESTS: dict[str, tuple[list[str], tuple[str, ...]]] = {
         ("RUN:T", "end"),
     ),
     "no such edit to check": (["check_edits.py", "flight", "--edit", "sun=1"], ("sun", "phase")),
+    "nothing to compare with": (["compare.py", "flight"], ("flight", 'part = "A"')),
+    "a logbook of nowhere": (["logbook.py", "nowhere"], ("nowhere",)),
+    "no pairs": (["study_changes.py", "--same", "0", "--changed", "0"], ("pair",)),
     "no such maneuver": (["simulate.py", "--maneuver", "looping"], ("looping",)),
     "no such sensors": (["simulate.py", "--sensors", "radar"], ("radar",)),
     "no such controller": (["evaluate.py", "--controller", "none.json"], ("none.json",)),
     "no episodes": (["evaluate.py", "--episodes", "0"], ("episode",)),
+    "no such weight": (["design_lqr.py", "--weights", "charm=1"], ("charm", "height")),
+    "a weight in words": (["design_lqr.py", "--weights", "height=much"], ("height", "much")),
+    "no weight for the effort": (["design_lqr.py", "--weights", "effort=0"], ("effort",)),
+    "no such file of limits": (["design_lqr.py", "--limits", "l.toml"], ("l.toml",)),
+    "speeds that fall": (["design_lqr.py", "--speeds", "0", "2", "1"], ("speeds",)),
+    "nothing to export as C": (["export.py", "lqi"], ("lqi", "lqg")),
+    "no flight to compare": (["export.py", "pid", "--seconds", "0"], ("--seconds",)),
     "no such option": (["design_lqr.py", "--fast"], ("--fast",)),
 }
 
@@ -265,6 +276,25 @@ def test_simulate_then_replay_then_identify(tmp_path):
     assert done.returncode == 0, done.stderr
     assert {p.name for p in (tmp_path / "steps").iterdir()} == {"vehicle.toml", "report.html"}
     assert "Table VIII examined" in (tmp_path / "steps" / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_without_plotly_the_results_are_there_and_it_says_what_to_install(
+    tmp_path, monkeypatch, capsys
+):
+    import replay
+
+    page = importlib.import_module("coax_env.report.page")  # the room has a function of that name
+    page._packed_plotly.cache_clear()  # of tests before
+    for module in ("plotly", "plotly.offline"):
+        monkeypatch.setitem(sys.modules, module, None)  # importing it is an ImportError
+    out = tmp_path / "out"
+    monkeypatch.setattr(sys, "argv", ["replay", "windy", "--out", str(out)])
+    replay.main()
+    assert json.loads((out / "replay.json").read_text())["runs"]
+    assert not (out / "report.html").exists()
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert "no report: this needs plotly" in last and "pip install 'coaxheli[report]'" in last
 
 
 @pytest.mark.slow
@@ -341,6 +371,27 @@ def test_our_program_flies_in_every_mode(mode):
     assert found["value"] > 0.0 and found["count"] == (5 if mode in ("many", "kernel") else 1)
 
 
+def test_vehicles_take_turns_and_the_first_turn_does_not_count(monkeypatch):
+    from speed import fly_vehicles
+
+    assert not next(iter(fly_vehicles.worlds().values()))  # the bare one: others are held to it
+    assert fly_vehicles.flying(3, {})() == 3 * fly_vehicles.STEPS
+    clock, taken = [0.0], []
+    monkeypatch.setattr(fly_vehicles.time, "perf_counter", lambda: clock[0])
+
+    def turn(name: str, seconds: list[float]) -> Callable[[], int]:
+        def fly() -> int:
+            taken.append(name)
+            clock[0] += seconds.pop(0)
+            return 8
+
+        return fly
+
+    turns = {"bare": turn("bare", [1.0, 4.0, 2.0]), "laden": turn("laden", [1.0, 8.0, 16.0])}
+    assert fly_vehicles.best_of(turns, 2) == {"bare": 4.0, "laden": 1.0}
+    assert taken == ["bare", "laden"] * 3
+
+
 def test_every_peer_has_its_program_and_its_pins():
     from speed import peers
 
@@ -377,6 +428,7 @@ def test_the_benchmarks_table():
             for row in benchmark.ROWS
         },
         "kernel": found(1000.0), "cold_start_s": 12.0, "effects_off_ratio": 1.02,
+        "vehicles": {"bare": 400.0, "four effects": 300.0}, "training": {},
         "diagnoses": [{"hidden": ["a", "b"], "named": ["a"], "seconds": 11.0, "flown_s": 220.0}],
     }  # fmt: skip
     lines = benchmark.table(result)
@@ -386,7 +438,8 @@ def test_the_benchmarks_table():
     assert sum("late|3 s|1.5 x quicker" in line for line in text) == 1
     assert sum("lame|-|" in line and "no wheel" in line for line in text) == 2
     assert any("0.60 of it in the env" in line for line in text)
-    assert text[-2].startswith("effects off, against cut out|coax|+2.0 %")
+    assert text[-4].startswith("effects off, against cut out|coax|+2.0 %")
+    assert text[-2] == "env-steps, four effects|coax|300 /s|||||0.75 of bare"
     assert text[-1] == "diagnosis, 2 hidden, 1 named|coax|11 s|||||20 x the time flown"
 
 

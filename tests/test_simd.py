@@ -2,6 +2,8 @@
 
 import ast
 import math
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numba
@@ -14,14 +16,32 @@ from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.kernel import simd
 from coax_env.kernel.random_streams import normals_of
 from coax_env.kernel.simd import SIMD_WIDTH, simd_view, simd_view_uint64
+from coax_env.model import effects
 from coax_env.model import inputs as U
 from coax_env.model import state as S
-from coax_env.model.dynamics import WORK_SIZE, full_state, hover_trim, measure, step
+from coax_env.model.dynamics import (
+    WORK_SIZE,
+    full_state,
+    hover_trim,
+    measure,
+    step,
+    step_and_measure_with,
+)
 from coax_env.model.dynamics import measure_bare as measure_any
 from coax_env.model.dynamics import step_bare as step_any
 from coax_env.model.layout import N_CHANNELS, N_FULL, N_INPUTS
 
 LAMA = coax_env.load_vehicle("lama400d")
+TERMS = (
+    "unlisted_Z.abs_w_w", "unlisted_Z.height", "unlisted_L.u_q", "unlisted_M.sin_3psi",
+    "unlisted_M.cos_theta", "unlisted_M.omega_u_l", "unlisted_N.omega_u", "unlisted_N.delta_lat",
+    "unlisted_N.omega_l_rate", "unlisted_N.lon_direction",
+)  # fmt: skip
+"""A generic term of each kind."""
+EVERY = tuple(
+    name for effect in effects.CATALOGUE.values() for name in effect.names()
+) + TERMS  # fmt: skip
+step_every, measure_every = step_and_measure_with(EVERY, "every")
 
 
 @numba.njit
@@ -32,6 +52,25 @@ def _step_registers(x, u, p, work, out):
 @numba.njit
 def _measure_registers(x, u, p, work, out):
     measure_any(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
+
+
+@numba.njit(error_model="numpy")
+def _step_every(x, u, p, work, out):
+    step_every(simd_view(x), simd_view(u), 0.01, simd_view(p), simd_view(work), simd_view(out))
+
+
+@numba.njit(error_model="numpy")
+def _measure_every(x, u, p, work, out):
+    measure_every(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
+
+
+@numba.njit
+def _seldom_needed(x, power, tangent, sine, angle):
+    for i in range(len(x)):
+        simd_view(power)[i] = (1.0 + abs(simd_view(x)[i])) ** simd_view(x)[i]
+        simd_view(tangent)[i] = math.tanh(simd_view(x)[i])
+        simd_view(sine)[i] = math.asin(math.tanh(simd_view(x)[i]))
+        simd_view(angle)[i] = math.atan2(simd_view(x)[i], math.copysign(2.0, -simd_view(x)[i]))
 
 
 @numba.njit
@@ -111,6 +150,15 @@ def test_exponential_and_logarithm_are_right_to_the_last_bits():
         assert np.isnan(applied(_logarithm, np.full(SIMD_WIDTH, wrong))).all()
 
 
+def test_powers_and_what_is_done_lane_by_lane():
+    x = np.random.default_rng(6).uniform(-6.0, 6.0, 4000 * SIMD_WIDTH)
+    power, tangent, sine, angle = applied(_seldom_needed, x, 4)
+    assert np.abs(power / (1.0 + np.abs(x)) ** x - 1.0).max() < 1e-14
+    assert np.abs(tangent - np.tanh(x)).max() < 4e-16
+    assert np.abs(sine - np.arcsin(tangent)).max() < 4e-16
+    assert np.abs(angle - np.arctan2(x, np.copysign(2.0, -x))).max() < 1e-15
+
+
 def test_angles_within_and_beyond_an_eighth_of_a_turn_do_not_hurt_each_other():
     x = np.random.default_rng(4).uniform(-0.7, 0.7, 800 * SIMD_WIDTH)
     small = applied(_sine_and_cosine, x, 2)
@@ -173,6 +221,39 @@ def test_each_lane_flies_and_measures_as_one_helicopter(seed):
         assert readings[:, j] == pytest.approx(measured, rel=1e-11, abs=1e-11)
 
 
+def with_every_effect(rng: np.random.Generator, lane: int) -> np.ndarray:
+    """A parameter vector: every effect on, or about half of them, or a few."""
+    vector = LAMA.draw(rng).vector
+    for effect in effects.GROUPS.values():
+        for name, parameter in zip(effect.names(), effect.parameters, strict=True):
+            if name in EVERY and not parameter.held and rng.random() < (1.0, 0.5, 0.1)[lane % 3]:
+                vector[effects.parameter_index(name)] = parameter.at(rng.uniform(0.3, 1.0))
+    effects.set_switches(vector)
+    return vector
+
+
+def test_each_lane_flies_and_measures_with_its_own_effects():
+    """All effects of the catalogue, and generic terms of each kind, on in some lanes only."""
+    for seed in range(10):
+        x, u, _ = drawn(seed)
+        rng = np.random.default_rng(100 + seed)
+        u[U.TIME], u[U.BATTERY] = rng.uniform(0.0, 20.0, (2, SIMD_WIDTH))
+        u[U.BATTERY] = rng.normal(0.0, 0.5, SIMD_WIDTH)
+        x[S.SWASH_LON, :2] = u[U.DELTA_LON, :2]  # in a deadband: stands still
+        p = np.array([with_every_effect(rng, lane) for lane in range(SIMD_WIDTH)]).T.copy()
+        work = np.zeros((WORK_SIZE, SIMD_WIDTH))
+        flown, readings = np.empty_like(x), np.empty((N_CHANNELS, SIMD_WIDTH))
+        _step_every(x, u, p, work, flown)
+        _measure_every(x, u, p, work, readings)
+        for j in range(SIMD_WIDTH):
+            one = [np.ascontiguousarray(a[:, j]) for a in (x, u, p)]
+            expected, measured = np.empty(N_FULL), np.empty(N_CHANNELS)
+            step(one[0], one[1], 0.01, one[2], np.zeros(WORK_SIZE), expected)
+            measure(*one, np.zeros(WORK_SIZE), measured)
+            assert flown[:, j] == pytest.approx(expected, rel=1e-11, abs=1e-11)
+            assert readings[:, j] == pytest.approx(measured, rel=1e-10, abs=1e-10)
+
+
 def test_what_is_not_a_number_stays_in_its_lane():
     x, u, p = drawn(0)
     work, clean, spoilt = np.zeros((WORK_SIZE, SIMD_WIDTH)), np.empty_like(x), np.empty_like(x)
@@ -209,6 +290,37 @@ def test_rows_go_into_registers_and_back_to_where_they_were(columns, kind):
 # --- the fleet ------------------------------------------------------------------------------------
 
 
+FOUR = (
+    LAMA.with_effect("motor_lag", upper=0.07, lower=0.05)
+    .with_effect("wind", north=-1.0, east=1.2)
+    .with_effect("rotor_drag", coefficient=3.5e-4)
+    .with_effect("gyro_bias", x=0.004, y=-0.012, z=0.002)
+)
+"""What is hidden in the bundled flight."""
+NINE = (
+    LAMA.with_effect("command_delay", time=0.068)
+    .with_effect("hub_stiffness", upper=0.2, lower=0.1)
+    .with_effect("swash_phase", angle=0.2)
+    .with_effect("yaw_damping", coefficient=0.003)
+    .with_effect("motor_droop", upper=0.2, lower=0.15)
+    .with_effect("flap_blowback", gain=0.006)
+    .with_effect("swash_offset", lon=0.01, lat=-0.01)
+    .with_effect("marker_offset", y=0.18)
+    .with_effect("vibration", tilt=2.1e-3, heave=3.3e-4)
+)
+"""What the diagnosis of the real CoaX names."""
+LATE = FOUR.with_sensor("h", delay=0.033, dropout=0.2, bias_std=0.05).with_actuators(
+    swash_travel=0.15, rotor_acceleration=2000.0
+)
+
+
+def spread_out(vehicle, *names: str):
+    """A vehicle of whose numbers some are a fifth uncertain."""
+    return vehicle.with_parameters(
+        {name: replace(vehicle[name], std=0.2 * abs(vehicle[name].value)) for name in names}
+    )
+
+
 def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str, np.ndarray]:
     """A flight of a batch through ends and resets: what came, (steps, count, ...)."""
     monkeypatch.setattr(fleet, "SIMD_FROM", 2 if side_by_side else 10**9)
@@ -237,19 +349,92 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
         (2, {"sensors": "mocap", "task": "position"}),
         (SIMD_WIDTH + 1, {"randomize": "posterior", "gusts": (0.3, 0.01)}),
         (13, {"sensors": "mocap", "task": "waypoints", "target": [(0, 0, 1.5, 0), (0, 0, 1.6, 0)]}),
+        (11, {"vehicle": FOUR, "gusts": (0.3, 0.01)}),
+        (11, {"vehicle": FOUR, "sensors": "paper"}),
+        (11, {"vehicle": FOUR, "sensors": "state", "task": "waypoints"}),
+        (11, {"vehicle": FOUR, "sensors": "mocap", "task": "position"}),
+        pytest.param(
+            11,
+            {
+                "vehicle": spread_out(NINE, "command_delay.time", "motor_droop.upper")
+                .with_sensor("p", delay=0.015),
+                "randomize": "posterior", "wind": (1.0, -2.0), "turbulence": 5.0,
+                "gusts": (0.1, 0.01), "sensors": "mocap", "task": "waypoints",
+            },
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            19, {"randomize": [LAMA, FOUR, LATE, "skybotix_coax"]}, marks=pytest.mark.slow
+        ),
+        pytest.param(11, {"vehicle": NINE}, marks=pytest.mark.slow),
+        pytest.param(11, {"vehicle": NINE, "randomize": "posterior"}, marks=pytest.mark.slow),
+        pytest.param(
+            11,
+            {
+                "randomize": {
+                    "mass": (0.7, 0.9), "wind.north": (-2.0, 0.0),
+                    "rotor_drag.coefficient": (0.0, 4e-4), "servo_delay.time": (0.0, 0.05),
+                },
+                "wind": 1.0,
+            },
+            marks=pytest.mark.slow,
+        ),
     ],
-    ids=["one group", "and three more", "fewer than a group", "own vehicles", "waypoints"],
-)
+    ids=[
+        "one group", "and three more", "fewer than a group", "own vehicles", "waypoints",
+        "four effects", "four, paper", "four, state", "four, mocap",
+        "nine effects, each their own, in turbulence, late sensors", "a list",
+        "nine effects", "nine effects, own vehicles", "ranges in wind",
+    ],
+)  # fmt: skip
 def test_rows_in_a_simd_batch_fly_as_rows_one_by_one(monkeypatch, count, arguments):
     side_by_side = flown(monkeypatch, True, count, **arguments)
     one_by_one = flown(monkeypatch, False, count, **arguments)
     assert np.array_equal(side_by_side["ends"], one_by_one["ends"])
-    assert one_by_one["ends"][20, -1, 0] and not one_by_one["ends"][20, :-1].any()
+    assert one_by_one["ends"][20:40, -1, 0].any()  # what is not a number has arrived
     assert one_by_one["ends"].sum() >= 2 * count
     for what, error in (("numbers", 1e-9), ("readings", 1e-6)):
         ours, theirs = side_by_side[what], one_by_one[what]
         assert np.array_equal(np.isnan(ours), np.isnan(theirs))
         assert np.nanmax(np.abs(ours - theirs) / (1.0 + np.abs(theirs))) < error
+
+
+def test_a_batch_is_compiled_for_what_its_vehicles_have():
+    plain = CoaxVectorEnv(SIMD_WIDTH).fleet
+    assert not any(plain.makeup)
+    drawn = CoaxVectorEnv(SIMD_WIDTH, randomize="posterior").fleet
+    assert drawn.makeup == plain.makeup._replace(own=True)
+    light = CoaxVectorEnv(SIMD_WIDTH, FOUR.with_effect("unlisted_M", sin_psi=0.01)).fleet.makeup
+    groups = {name.partition(".")[0] for name in light.used}
+    assert groups == {"motor_lag", "wind", "rotor_drag", "gyro_bias", "unlisted_M"}
+    assert [n for n in light.used if n.startswith("unlisted")] == ["unlisted_M.sin_psi"]
+    assert not light.own and not light.delayed and not light.turbulent and not light.late
+    off = CoaxVectorEnv(SIMD_WIDTH, LAMA.with_effect("rotor_drag", coefficient=0.0)).fleet
+    assert not any(off.makeup)
+
+
+@numba.njit
+def _branching(x, f, p, e):
+    if x[S.R] > 0.0:
+        f[0] += p[e]
+
+
+@numba.njit
+def _selecting(x, f, p, e):
+    f[0] += simd.select(x[S.R] > 0.0, p[e], 0.0)
+
+
+def test_a_users_effect_with_a_branch_flies_one_by_one_and_says_so(monkeypatch):
+    damped = LAMA.with_effect("yaw_damping", coefficient=0.004)
+    for function, fits in ((_selecting, True), (_branching, False)):
+        entry = replace(effects.GROUPS["yaw_damping"], users=True, function=function)
+        monkeypatch.setitem(effects.GROUPS, "yaw_damping", entry)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            env = CoaxVectorEnv(SIMD_WIDTH, damped)
+        assert [("one by one" in str(w.message)) for w in said] == [True] * (not fits)
+    env.reset(seed=0)
+    assert np.isfinite(env.step(np.zeros((SIMD_WIDTH, 4)))[0]).all()
 
 
 # --- numba ----------------------------------------------------------------------------------------

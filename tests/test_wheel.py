@@ -176,8 +176,8 @@ def vehicles_flight_and_policy_have_come(coax: Callable[..., Done]) -> None:
 def what_is_missing_is_named_with_its_extra(coax: Callable[..., Done]) -> None:
     refused = coax(code=1, text="from coax_env.errors import require; require('pigame', 'render')")
     assert refused.stderr.splitlines()[-1] == (
-        "coax_env.errors.InputError: this needs pigame, which is not installed: pip install"
-        " 'coaxheli[render]', or what it consists of: pip install 'pygame>=2.6'"
+        "coax_env.errors.MissingPackage: this needs pigame, which is not installed: pip install"
+        " 'coaxheli[render]', or what it consists of: pip install 'moviepy>=1.0' 'pygame>=2.6'"
     )
 
 

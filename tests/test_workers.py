@@ -17,6 +17,7 @@ from controllers.evaluation import evaluate_spread
 BACKENDS = ("loky", pytest.param("ray", marks=pytest.mark.slow))  # a cluster takes a while to start
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 LAMA = coax_env.load_vehicle("lama400d")
+DRAGGED = LAMA.with_effect("rotor_drag", coefficient=4e-4)  # so that the wind acts
 
 
 @pytest.fixture(params=BACKENDS)
@@ -51,7 +52,7 @@ def test_no_workers_are_refused(jobs, name):
 def test_drawn_vehicles_are_judged_alike_by_two_workers(backend):
     controller = pid.design(LAMA)
     alone, both = (
-        evaluate_spread(controller, LAMA, 3, 2, 4.0, seed=5, jobs=jobs, backend=where, wind=1.0)
+        evaluate_spread(controller, DRAGGED, 3, 2, 4.0, seed=5, jobs=jobs, backend=where, wind=1.0)
         for jobs, where in ((1, "loky"), (2, backend))
     )
     assert both == alone

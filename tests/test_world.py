@@ -377,7 +377,9 @@ def test_turbulence_acts_through_drag_and_not_on_a_bare_vehicle():
     flown = {}
     for name, vehicle in (("bare", LAMA), ("dragged", DRAGGED)):
         for turbulence in (None, 6.0):
-            env = CoaxEnv(vehicle, turbulence=turbulence, sensors="state")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that it cannot act
+                env = CoaxEnv(vehicle, turbulence=turbulence, sensors="state")
             state = env.reset(seed=2, options={"state": TRIM[0]})[1]["state"]
             for _ in range(100):
                 state = env.step(np.zeros(4))[4]["state"]
@@ -457,7 +459,7 @@ def test_make_vec_takes_every_argument_and_its_own_time_limit():
         warnings.simplefilter("error")
         env = gymnasium.make_vec(
             "CoaxHeli-v0", num_envs=2, vectorization_mode="vector_entry_point",
-            autoreset_mode="SameStep", max_episode_steps=7,
+            vehicle=DRAGGED, autoreset_mode="SameStep", max_episode_steps=7,
             task="waypoints", sensors="state", turbulence="light", wind=1.0,
             randomize={"mass": (0.7, 0.9)},
         )  # fmt: skip
@@ -612,7 +614,8 @@ def test_ranges_draw_uniformly_and_fly():
         assert low <= drawn.min() and drawn.max() <= high
         assert drawn.mean() == pytest.approx(0.5 * (low + high), rel=0.02)
         assert drawn.std() == pytest.approx((high - low) / math.sqrt(12.0), rel=0.05)
-        assert np.array_equal(env.fleet.params[:, effects.parameter_index(name)], drawn)
+        flown = [env.fleet.params_of(i)[effects.parameter_index(name)] for i in range(3000)]
+        assert np.array_equal(flown, drawn)
     assert (info["vehicle"]["ground_effect.decay"] == 2.0).all()
     assert (info["vehicle"]["gravity"] == LAMA["gravity"].value).all()
     assert info["_vehicle"].all()
@@ -649,6 +652,13 @@ def test_a_drawn_vehicle_flies_as_if_it_had_been_given():
     for action in actions(1, 50, 4):
         ours, theirs = env.step(action), twin.step(action)
         assert np.array_equal(ours[4]["state"], theirs[4]["state"])
+
+
+def test_the_envs_wind_adds_to_a_drawn_one():
+    env = CoaxVectorEnv(9, randomize={"wind.north": (1.0, 2.0)}, wind=(0.5, -1.0))
+    drawn = env.reset(seed=0)[1]["vehicle"]["wind.north"]
+    assert np.array_equal(env.fleet.air[:, 0], drawn + 0.5)
+    assert (env.fleet.air[:, 1] == -1.0).all() and len(set(drawn)) == 9
 
 
 def test_the_spread_of_a_file_is_drawn_jointly():
@@ -723,6 +733,63 @@ def test_a_row_flies_as_a_single_env_in_any_world(world):
 def test_an_unlimited_bare_world_costs_no_memory():
     fleet = CoaxVectorEnv(64).fleet
     own = fleet.helicopters
-    assert own.past.size == 0 and own.command_ring.shape[1] == 1 and len(own.params) == 1
+    assert own.past.size == 0 and own.command_ring.shape[1] == 1 and own.own.size == 0
     assert sum(array.nbytes for array in (fleet.x, *own) if len(array) == 64) / 64 < 1000
     assert len(tasks.TASKS["hover"].terms) == hover.N_TERMS
+
+
+def test_a_drawn_vehicle_costs_what_is_drawn():
+    fleet = CoaxVectorEnv(64, randomize="posterior").fleet
+    assert fleet.own.shape[1] < 40  # of several hundred parameters
+    arrays = (fleet.x, fleet.drawn, *fleet.helicopters)
+    assert sum(array.nbytes for array in arrays if len(array) == 64) / 64 < 1500
+
+
+@pytest.mark.parametrize(
+    "hidden, arguments, warned",
+    [
+        ({}, {}, False),
+        ({}, {"wind": (8.0, 0.0)}, True),
+        ({}, {"wind": 3.0}, True),
+        ({}, {"turbulence": "severe"}, True),
+        ({"axial_damping": {"coefficient": 0.1}}, {"turbulence": "severe"}, False),
+        ({"axial_damping": {"coefficient": 0.1}}, {"wind": (8.0, 0.0)}, False),
+        ({"rotor_drag": {"coefficient": 1e-4}}, {"wind": (8.0, 0.0), "turbulence": "light"}, False),
+    ],
+)
+def test_wind_that_cannot_act_is_warned_of(hidden, arguments, warned):
+    """And rightly: where it warns, the flight is the one in still air."""
+    vehicle = LAMA
+    for name, values in hidden.items():
+        vehicle = vehicle.with_effect(name, **values)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        env = CoaxEnv(vehicle, **arguments)
+    assert any("cannot act on" in str(w.message) for w in said) == warned
+    still = CoaxEnv(vehicle)
+    flights = []
+    for one in (env, still):
+        one.reset(seed=3, options={"state": TRIM[0]})
+        flights.append([one.step(np.full(4, 0.05))[4]["state"][:16] for _ in range(30)])
+    same = np.allclose(flights[0], flights[1], atol=1e-12)
+    assert same == (warned or not arguments)
+
+
+def test_a_drawn_wind_has_its_speeds_and_comes_from_everywhere():
+    env = CoaxVectorEnv(400, DRAGGED, wind={"speed": (1.0, 3.0)})
+    env.reset(seed=0)
+    north, east, down = env.fleet.air.T
+    speed, angle = np.hypot(north, east), np.arctan2(east, north)
+    assert 1.0 <= speed.min() < 1.1 and 2.9 < speed.max() <= 3.0 and not down.any()
+    assert abs(np.mean(speed) - 2.0) < 0.1  # 3.5 std
+    assert np.abs(np.mean(np.exp(1j * angle))) < 0.17
+    fixed = CoaxVectorEnv(8, DRAGGED, wind=2.0)
+    same = CoaxVectorEnv(8, DRAGGED, wind={"speed": (2.0, 2.0)})
+    assert np.array_equal(fixed.reset(seed=1)[0], same.reset(seed=1)[0])
+    assert np.array_equal(fixed.fleet.air, same.fleet.air)
+
+
+@pytest.mark.parametrize("wind", [{"speed": (3, 1)}, {"speed": 2}, {"north": (0, 1)}, {}])
+def test_a_drawn_wind_that_is_none_gets_one_line(wind):
+    with pytest.raises(InputError, match="wind"):
+        CoaxVectorEnv(1, wind=wind)

@@ -93,7 +93,8 @@ def _of_one(
         if trial.objective - fit.objective < tie:
             found[other] = trial
     # a lag is far from a delay of nothing: the quadratic does not reach there, and both may be there
-    for twin in sorted(exclusive_with(effect) & set(problem.candidates) - set(found)):
+    absent = set(problem.candidates) - set(found) - set(fit.active)
+    for twin in sorted(exclusive_with(effect) & absent):
         _, move = swap(problem, quadratic, fit.active, effect, twin)
         trial = refit(twin, move, steps=TWIN_STEPS)
         mixed = score(problem, quadratic, fit.active, twin).evidence > chosen.evidence

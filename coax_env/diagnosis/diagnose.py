@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.design import next_maneuver
 from coax_env.diagnosis import confounding, findings, unlisted, vibration
 from coax_env.diagnosis.black_box import black_box
@@ -105,6 +106,7 @@ def diagnose(
     progress: Progress | None = None,
     ceiling: bool = False,
     settings: Settings = SETTINGS,
+    waive: Collection[str] = (),
 ) -> Diagnosis:
     """Find the causes of what a vehicle's simulation gets wrong on a flight.
 
@@ -116,15 +118,18 @@ def diagnose(
         progress: called with a line of text at every step.
         ceiling: also report what a black box removes of the error, which takes half as long again.
         settings: thresholds and limits; a calibrated false alarm rate is that of the default.
+        waive: checks of the log with itself (consistency/) that are passed over, beside the card's.
 
     Raises:
-        InputError: a run or effect that does not exist, or nothing left to fit.
+        InputError: a run or effect that does not exist, a log that contradicts itself, or nothing left
+            to fit.
     """
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
     flight.select(hold_out or ())
     check_hold_out(hold_out, flight.run_names)
     flight = flown_parts(flight, vehicle)
+    passed_over = refuse_disagreement(flight, vehicle, waive)
     lines, calm, calm_vehicle = (
         ((), flight, vehicle) if "vibration" in exclude else vibration.calmed(flight, vehicle)
     )
@@ -139,7 +144,7 @@ def diagnose(
 
     problem = Problem.of(model, used, candidates, settings, progress)
     first = searched(problem, noise)
-    bare, refitted = first.bare, first.refitted
+    problem, bare, refitted = first.problem, first.bare, first.refitted
     passes_before = problem.engine.filter(bare.values, bare.noise)
     problem, fit, quadratic, terms = unlisted.explain(problem, first.fit, first.quadratic)
     report("weighing the causes against their confounded alternatives")
@@ -195,6 +200,7 @@ def diagnose(
         strongest=fit.strongest,
         remarks=(
             *flight.notes,
+            *passed_over,
             *double_counting(flight, vehicle),
             *([vibration_removed(lines)] if lines else []),
             *remarks(problem, fit, quadratic, found),

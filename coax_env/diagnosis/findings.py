@@ -1,14 +1,14 @@
 """The entries of findings.json: causes, what is unexplained, the verdict."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from coax_env.diagnosis.confounding import Alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
-from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.trust import Trust, of_line
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.engine import RunPass
@@ -19,6 +19,7 @@ from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.model import effects
 from coax_env.model.layout import CHANNELS
+from coax_env.plain_words import plain
 
 
 def causes(
@@ -66,7 +67,31 @@ def causes(
         )
     if lines:
         entries.append(_vibration(lines))
-    return sorted(entries, key=lambda c: (c["trust"] != "sure", -c["evidence"]))
+    return sorted(mixtures_as_one(entries), key=lambda c: (c["trust"] != "sure", -c["evidence"]))
+
+
+def mixtures_as_one(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Causes of which one at most is named, such as a servo's lag and its delay, stated as one.
+
+    It goes by the name of the stronger; the other is among its alternatives, and its numbers, which the
+    model has too, are the entry's `mixture`. So the name is in doubt.
+    """
+    kept: list[dict[str, Any]] = []
+    for weaker in sorted(entries, key=lambda c: -c["evidence"]):
+        same = (c for c in kept if weaker["effect"] in exclusive_with(c["effect"]))
+        stronger = next(same, None)
+        if stronger is None:
+            kept.append(dict(weaker))
+            continue
+        alike = dict.fromkeys([*stronger["confusable_with"], weaker["effect"]])
+        stronger |= {
+            "confusable_with": [e for e in alike if e != stronger["effect"]],
+            "channels": list(dict.fromkeys([*stronger["channels"], *weaker["channels"]])),
+            "mixture": {**stronger.get("mixture", {}), **weaker["parameters"]},
+            "trust": "doubtful",
+            "doubts": [*stronger["doubts"], f"it is a mixture with {plain(weaker['effect'])}"],
+        }
+    return kept
 
 
 def stated_std(

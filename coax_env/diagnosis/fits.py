@@ -1,7 +1,7 @@
 """Fits of a problem: linearise, step, fit, noise levels. Each takes a fit and returns another one."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +10,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import NoiseScore, RunPass, objective
 from coax_env.estimation.helicopter_noise import LATENT_START, fitted_levels
 from coax_env.estimation.noise_levels import fit_noise, level_slopes
+from coax_env.estimation.parted_engine import PartedEngine, joint_noise, of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 
@@ -115,6 +116,8 @@ def noise_fitted(problem: Problem, fit: Fit, seconds: float | None = None) -> Fi
         problem, fit: where to begin; parameters stay.
         seconds: of flight that are enough; default the settings'.
     """
+    if isinstance(problem.engine, PartedEngine):
+        return by_parts(problem, fit, lambda p, own: noise_fitted(p, own, seconds))
     chosen = problem.settings
     noise = fit_noise(
         problem.engine, fit.values, fit.noise, fit.levels,
@@ -122,6 +125,29 @@ def noise_fitted(problem: Problem, fit: Fit, seconds: float | None = None) -> Fi
         seconds=chosen.noise_fit_seconds if seconds is None else seconds,
     )  # fmt: skip
     return replace(fit, noise=noise)
+
+
+def by_parts(problem: Problem, fit: Fit, work: Callable[[Problem, Fit], Fit]) -> Fit:
+    """What is done to the noise of each part of the flights alone, at the joint values.
+
+    Args:
+        problem, fit: whose engine is a `PartedEngine`.
+        work: gets a part's problem and fit, by plain names, and returns the fit with other noise.
+    """
+    assert isinstance(problem.engine, PartedEngine)
+    noise: dict[str, Noise] = {}
+    levels: list[str] = []
+    for part in problem.engine.parts:
+        own = replace(
+            fit,
+            values=part.values(fit.values),
+            noise=part.noise(fit.noise),
+            levels=part.levels(fit.levels),
+        )
+        done = work(replace(problem, engine=part.engine), own)
+        noise[part.name] = done.noise
+        levels += [of_part(name, part.name) for name in done.levels]
+    return replace(fit, noise=joint_noise(noise), levels=tuple(levels))
 
 
 def converged(problem: Problem, fit: Fit, held: Collection[str] = ()) -> Fit:
@@ -148,6 +174,9 @@ def with_latent_noise(problem: Problem, fit: Fit) -> Fit | None:
     A level at its floor has next to no slope in its logarithm, however much it wants to grow; its
     score over the scatter of that from block to block says so all the same.
     """
+    if isinstance(problem.engine, PartedEngine):
+        both = by_parts(problem, fit, lambda p, own: with_latent_noise(p, own) or own)
+        return both if both.levels != fit.levels else None
     engine, chosen = problem.engine, problem.settings
     latent = [name for name in LATENT_START if name not in fit.levels]
     if not latent:

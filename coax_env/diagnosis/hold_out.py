@@ -119,22 +119,22 @@ def fair_part(shares: np.ndarray, weights: np.ndarray, seconds: np.ndarray) -> l
         seconds: share of the flown time of each run, (runs,).
     """
 
-    def unfairness(chosen: Sequence[int]) -> float:
-        held = shares[list(chosen)].sum(0)
+    def unfairness(held: np.ndarray) -> np.ndarray:
         lost, unseen = np.maximum(held - MOST_LOST, 0.0), np.maximum(LEAST_SEEN - held, 0.0)
-        costs = (held - FAIR_SHARE) ** 2 + UNFAIR * unseen + UNDETERMINED * lost
-        return float(weights @ costs)
-
-    def allowed(chosen: Sequence[int]) -> bool:
-        return seconds[list(chosen)].sum() <= MOST_TIME
+        return np.asarray(
+            ((held - FAIR_SHARE) ** 2 + UNFAIR * unseen + UNDETERMINED * lost) @ weights
+        )
 
     chosen: list[int] = []
     while True:
         rest = [i for i in range(len(seconds)) if i not in chosen]
-        moves = [[*chosen, i] for i in rest]
-        moves += [[*(j for j in chosen if j != out), i] for out in chosen for i in rest]
-        moves = [m for m in moves if allowed(m)]
-        best = min(moves, key=unfairness, default=chosen)
-        if chosen and unfairness(best) >= unfairness(chosen) - LEAST_FAIRER:
+        best, least = chosen, np.inf
+        for out in (None, *chosen):  # one more, or one in the place of another
+            kept = [j for j in chosen if j != out]
+            costs = unfairness(shares[kept].sum(0) + shares[rest])
+            costs[seconds[kept].sum() + seconds[rest] > MOST_TIME] = np.inf
+            if rest and costs.min() < least:
+                best, least = [*kept, rest[int(np.argmin(costs))]], float(costs.min())
+        if chosen and least >= unfairness(shares[chosen].sum(0)) - LEAST_FAIRER:
             return sorted(chosen)
         chosen = best or [int(np.argmin(seconds))]

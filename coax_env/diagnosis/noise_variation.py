@@ -108,10 +108,14 @@ class _Trial:
         factor = self.problem.settings.noise_factor
         found: dict[str, list[str]] = {}
         twice = self._at(level, factor)
-        if not self._felt(twice):
+        unfelt = any(self.fit.noise.at_bound(name) for name in level.names)
+        if unfelt and not self._felt(self.engine.filter(twice.values, twice.noise)):
             return found
         for words, there in (("twice", twice), ("half", self._at(level, 1.0 / factor))):
-            for effect in self._fallen(there):
+            passes, fallen = self._fallen(there)
+            if there is twice and not self._felt(passes):
+                return found
+            for effect in fallen:
                 found.setdefault(effect, []).append(f"{words} {level.words}")
         return found
 
@@ -120,25 +124,25 @@ class _Trial:
         changed = {name: factor * noise.level(name) for name in level.names}
         return replace(self.fit, noise=noise.with_levels(changed))
 
-    def _felt(self, there: Fit) -> bool:
-        """Whether the innovations change with the level so that a score could."""
-        passes = self.engine.filter(there.values, there.noise)
+    def _felt(self, passes: Sequence[RunPass]) -> bool:
+        """Whether the innovations of another level are so much others that a score could be."""
         change = sum(
             float(np.nansum((new.innovations - old.innovations) ** 2))
             for new, old in zip(passes, self.passes, strict=True)
         )
         return not change < self.problem.settings.felt_change
 
-    def _fallen(self, there: Fit) -> list[str]:
+    def _fallen(self, there: Fit) -> tuple[list[RunPass], list[str]]:
+        """The passes with another level, and the causes that do not hold there."""
         problem, fit = self.problem, self.fit
         replaced = {b for e in fit.active for b in problem.file_values(e)}
         names = replaced.union(problem.free_names(fit.active))
         free = [f for f in problem.parameters if f.name in names]
         passes, lin = self.engine.linearise(there.values, there.noise, free)
         if not all(np.isfinite(run.log_likelihood) for run in passes):
-            return []  # the filter cannot fly with such noise
+            return passes, []  # the filter cannot fly with such noise
         varied = Quadratic.of(lin, free, there.values)
-        return [e for e in fit.active if not self._holds(varied, e)]
+        return passes, [e for e in fit.active if not self._holds(varied, e)]
 
     def _holds(self, varied: Quadratic, effect: str) -> bool:
         problem, fit = self.problem, self.fit

@@ -14,6 +14,7 @@ from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.estimation.engine import Engine, Progress
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import GUST_LEVELS
+from coax_env.estimation.rotor_jitter import REACTION
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.model import effects
 from coax_env.model import parameters as P
@@ -107,6 +108,12 @@ class Problem:
         """Without some of those."""
         return replace(self, added=tuple(f for f in self.added if f.name not in names))
 
+    def with_model(self, model: HeliModel) -> "Problem":
+        """Of another model of the same machine."""
+        return replace(
+            self, model=model, engine=Engine(model, self.engine.records, self.engine.threads)
+        )
+
     def with_records(self, records: Sequence[Record]) -> "Problem":
         """On other records."""
         return replace(self, engine=Engine(self.model, records, self.engine.threads))
@@ -129,7 +136,8 @@ class Problem:
 
     def free_of_vehicle(self, active: Collection[str]) -> list[FreeParameter]:
         """Those of them that a vehicle file can hold."""
-        return [f for f in self.free(active) if f.name not in P.COMMAND_GAINS]
+        of_filter = {*P.COMMAND_GAINS, REACTION.name}
+        return [f for f in self.free(active) if f.name not in of_filter]
 
     def acting_names(self, effect: str) -> list[str]:
         """An effect's parameters that act as soon as it does (no shapes)."""

@@ -7,23 +7,31 @@ next second worse. So where innovations stay coloured and readings are finer tha
 three times that, as long as the model's open-loop flight over the horizon comes nearer to the fitted
 runs (the likelihood raised to a power less than 1, for a model that is wrong: Miller and Dunson 2019,
 J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Identification, ch. 8).
+
+And where innovations that rotors' jitter would colour stay so, it is done again with that noise in the
+filter (estimation/rotor_jitter.py), if its levels are worth more than a tie: after a search, since a
+motor's lag colours them too and must be found as what it is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from coax_env.diagnosis.fits import fitted, noise_fitted, start
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
-from coax_env.estimation.helicopter_noise import LEAST_READING_STD
+from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
+from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.rotor_jitter import REACTION, JitteryModel, with_jitter
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.whiteness import is_white
+from coax_env.estimation.whiteness import is_white, whiteness
 
 COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
+SHOWN_BY = ("rpm_upper", "rpm_lower", "r")
+"""Channels that a rotor's jitter colours."""
 FINER = 2.0
 """Times finer than LEAST_READING_STD that a channel must be for a second search; ours."""
 
@@ -32,9 +40,11 @@ FINER = 2.0
 class Searched:
     """The model as given, with its own numbers refitted, and with causes; the quadratic at the last.
 
+    problem: what was searched.
     coarse: whether readings were taken to be no finer than LEAST_READING_STD.
     """
 
+    problem: Problem
     bare: Fit
     refitted: Fit
     fit: Fit
@@ -49,6 +59,12 @@ def searched(problem: Problem, noise: Noise) -> Searched:
         problem: what may be free. noise: levels to start from.
     """
     best = _searched(problem, noise)
+    found = _with_jitter(problem, best.fit)
+    if found is not None:
+        problem, levels = found
+        problem.report("searching again with rotor speeds that jitter")
+        noise = with_jitter(noise, problem.model).with_levels(levels)
+        best = _searched(problem, noise)
     coarser = _coarser(best.fit.noise)
     passes = problem.engine.filter(best.fit.values, best.fit.noise)
     if not coarser or is_white(passes, problem.model.channels):
@@ -69,7 +85,30 @@ def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
     problem.report("fitting the model's own parameters")
     refitted = noise_fitted(problem, fitted(problem, bare))
     problem.report("searching for causes")
-    return Searched(bare, refitted, *search(problem, refitted), coarse)
+    return Searched(problem, bare, refitted, *search(problem, refitted), coarse)
+
+
+def _with_jitter(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] | None:
+    """The problem with rotors that jitter and the levels of that, where they gain more than a tie."""
+    passes = problem.engine.filter(fit.values, fit.noise)
+    shown = whiteness(passes, problem.model.channels)
+    if all(shown[channel].white for channel in SHOWN_BY if channel in shown):
+        return None
+    chosen = problem.settings
+    wider = problem.with_model(JitteryModel.like(problem.model)).with_free([REACTION])
+    start = with_jitter(fit.noise, wider.model)
+    levels = (*fit.levels, JITTER_LEVEL, JITTER_MEMORY)
+    trial = replace(fit.at({REACTION.name: REACTION.value}), levels=levels)
+    noise = fit_noise(
+        wider.engine, trial.values, start, levels,
+        chosen.first_noise_evaluations, chosen.step_gain, chosen.noise_fit_seconds,
+    )  # fmt: skip
+    gained = wider.engine.log_likelihood(trial.values, noise)
+    gained -= sum(run.log_likelihood for run in passes)
+    problem.report(f"rotor speeds that jitter: {gained:.1f} nats")
+    if gained < chosen.tie:
+        return None
+    return wider, {name: noise.level(name) for name in (JITTER_LEVEL, JITTER_MEMORY)}
 
 
 def _coarser(noise: Noise) -> dict[str, float]:

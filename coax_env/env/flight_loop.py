@@ -1,7 +1,7 @@
 """The loops over a batch of helicopters, compiled: one control period, new flights, targets.
 
 Every loop takes a share of the rows, first..last-1, so that threads can have one each, and a mask. Rows
-know nothing of each other. For batches without effects there are faster loops, in fleet_simd.py.
+know nothing of each other. From fleet.SIMD_FROM helicopters on fleet_simd.py's loops are faster.
 """
 
 import math
@@ -9,7 +9,8 @@ import math
 import numpy as np
 
 from coax_env.env import hover, tasks
-from coax_env.env.hover import EAST, NORTH
+from coax_env.env.arrays import AIR_DOWN, AIR_EAST, AIR_NORTH
+from coax_env.env.hover import EAST, HEADING, NORTH
 from coax_env.env.period import (
     DT,
     FORCE,
@@ -26,17 +27,13 @@ from coax_env.env.period import (
 from coax_env.env.turbulence import ACROSS, ALONG, DOWN, draw_filters, turbulence_step
 from coax_env.kernel.compilation import compiled
 from coax_env.kernel.random_streams import two_normals, uniform
-from coax_env.model import effects
+from coax_env.kernel.simd import select
 from coax_env.model import inputs as U
-from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model.actuators import limit
 from coax_env.model.dynamics import WORK_SIZE
 from coax_env.model.layout import N_CHANNELS, N_COMMANDS
 from coax_env.model.sampling import BIAS, BIAS_STD, DELAY, delayed, measured_quantities
-
-WIND_NORTH = effects.parameter_index("wind.north")
-WIND_EAST = WIND_NORTH + 1
 
 
 @compiled()
@@ -54,15 +51,28 @@ def _sense(i, x, p, heli, world, readings, values, work, out):
 
 
 @compiled()
-def _move_air(x, p, stream, filters, steady, turbulence, air):
-    """Wind of the coming period into `p`: steady (2,), turbulence along and across it, and down."""
+def own_numbers(own, places, p):
+    """Put a helicopter's own parameters (k,) at their places (k,) in a parameter vector."""
+    for k in range(len(places)):
+        p[places[k]] = own[k]
+
+
+@compiled()
+def move_air(x, own, stream, filters, steady, turbulence, air):
+    """The air's velocity in the coming period: steady, with turbulence along and across it, and down.
+
+    Args:
+        x: full state, (29,). own: the helicopter's own parameters, (k,), whose first are the air's.
+        stream: key and counter, (2,) uint64. filters: states of the forming filters, (N_FILTERS,).
+        steady: north and east [m/s], (2,). turbulence: mean wind at 6 m [m/s]. air: scratch, (3,).
+    """
     turbulence_step(stream, filters, -x[S.Z], turbulence, DT, air)
     speed = math.sqrt(steady[NORTH] * steady[NORTH] + steady[EAST] * steady[EAST])
-    north = steady[NORTH] / speed if speed > 0.0 else 1.0
-    east = steady[EAST] / speed if speed > 0.0 else 0.0
-    p[WIND_NORTH] = steady[NORTH] + north * air[ALONG] - east * air[ACROSS]
-    p[WIND_EAST] = steady[EAST] + east * air[ALONG] + north * air[ACROSS]
-    p[P.AIR_DOWN] = air[DOWN]
+    north = select(speed > 0.0, steady[NORTH] / speed, 1.0)
+    east = select(speed > 0.0, steady[EAST] / speed, 0.0)
+    own[AIR_NORTH] = steady[NORTH] + north * air[ALONG] - east * air[ACROSS]
+    own[AIR_EAST] = steady[EAST] + east * air[ALONG] + north * air[ACROSS]
+    own[AIR_DOWN] = air[DOWN]
 
 
 @compiled(makes_arrays=True)
@@ -73,17 +83,16 @@ def disturb_rows(first, last, active, x, heli, world):
         first, last: the share of the rows. active: which of them fly, (n,) bool.
         x: full states, (n, 29), whose gusts change. heli, world: the batch's arrays, arrays.py.
     """
-    air = np.empty(3)
-    many = len(heli.params) > 1
+    air, p = np.empty(3), world.params.copy()
     gust = world.gust
     for i in range(first, last):
         if active[i]:
-            p = heli.params[i if many else 0]
             if gust[FORCE] > 0.0 or gust[MOMENT] > 0.0:
+                own_numbers(heli.own[i], world.own, p)
                 add_gusts(x[i], p, gust, heli.streams[i])
             if world.turbulence > 0.0:
-                _move_air(
-                    x[i], p, heli.streams[i], heli.filters[i], heli.steady_wind[i],
+                move_air(
+                    x[i], heli.own[i], heli.streams[i], heli.filters[i], heli.steady_wind[i],
                     world.turbulence, air,
                 )  # fmt: skip
 
@@ -99,7 +108,7 @@ def fly_rows(first, last, active, actions, x, heli, world, mission, outcome):
     """
     work = np.empty(WORK_SIZE)
     readings, values = np.empty(N_CHANNELS), np.empty(world.sensors.shape[1])
-    many = len(heli.params) > 1
+    p = world.params.copy() if len(world.own) > 0 else world.params
     rewards, terms, over = outcome.rewards, outcome.terms, outcome.over
     for i in range(first, last):
         for k in range(len(mission.weights)):
@@ -109,7 +118,7 @@ def fly_rows(first, last, active, actions, x, heli, world, mission, outcome):
             rewards[i] = 0.0
             over[i] = False
             continue
-        p = heli.params[i if many else 0]
+        own_numbers(heli.own[i], world.own, p)
         u, ring, row = heli.u[i], heli.command_ring[i], heli.rows[i]
         command(actions[i], world.trim, world.scale, u)
         give_command(u, heli.last_commands[i], world.limits[heli.kinds[i]], ring, row, DT)
@@ -144,6 +153,21 @@ def pay_waypoints(first, last, active, x, heli, mission, outcome):
 
 
 @compiled()
+def move_targets(first, last, active, heli, mission):
+    """The targets of the active rows first..last-1 where the path has got to by now.
+
+    Args:
+        first, last: the share of the rows. active: which of them fly, (n,) bool.
+        heli, mission: the batch's arrays, arrays.py.
+    """
+    rows = len(mission.path)
+    for i in range(first, last):
+        if active[i]:
+            row = tasks.row_of_path(heli.rows[i], rows, mission.again)
+            copy_row(mission.path[row, :4], heli.targets[i])
+
+
+@compiled()
 def observe_targets(first, last, which, heli, mission, observations):
     """The way to the target by the readings held, observed, for the rows first..last-1 of a mask.
 
@@ -151,13 +175,19 @@ def observe_targets(first, last, which, heli, mission, observations):
         first, last: the share of the rows. which: those of them to observe, (n,) bool.
         heli, mission: the batch's arrays, arrays.py. observations: (n, n_observed), in place.
     """
-    begin = heli.held.shape[1] - tasks.N_WAY
+    rows = len(mission.path)
+    begin = heli.held.shape[1] - tasks.N_WAY - (tasks.N_MOTION if rows > 0 else 0)
+    end = begin + tasks.N_WAY
     for i in range(first, last):
         if which[i]:
             held = heli.held[i]
             tasks.way_to_target(
-                held, mission.places, mission.height_sign, heli.targets[i], held[begin:]
+                held, mission.places, mission.height_sign, heli.targets[i], held[begin:end]
             )
+            if rows > 0:
+                row = tasks.row_of_path(heli.rows[i], rows, mission.again)
+                psi = held[mission.places[HEADING]]
+                tasks.motion_of_target(mission.path[row], psi, held[end:])
             for k in range(begin, len(held)):
                 observations[i, k] = held[k]
 
@@ -173,7 +203,7 @@ def restart_rows(first, last, which, keep_state, x, heli, world, mission, observ
     """
     work = np.empty(WORK_SIZE)
     readings, values = np.empty(N_CHANNELS), np.empty(world.sensors.shape[1])
-    many = len(heli.params) > 1
+    p = world.params.copy() if len(world.own) > 0 else world.params
     trim = world.trim
     for i in range(first, last):
         if not which[i]:
@@ -181,15 +211,18 @@ def restart_rows(first, last, which, keep_state, x, heli, world, mission, observ
         stream = heli.streams[i]
         if world.wind_speed > 0.0:
             angle = uniform(stream, -math.pi, math.pi)
-            heli.params[i, WIND_NORTH] += world.wind_speed * math.cos(angle)
-            heli.params[i, WIND_EAST] += world.wind_speed * math.sin(angle)
-        p = heli.params[i if many else 0]
+            speed = world.wind_speed
+            if world.wind_slowest < speed:
+                speed = uniform(stream, world.wind_slowest, speed)
+            heli.own[i, AIR_NORTH] += speed * math.cos(angle)
+            heli.own[i, AIR_EAST] += speed * math.sin(angle)
+        own_numbers(heli.own[i], world.own, p)
         _draw_bias(stream, world.sensors[heli.kinds[i]], heli.bias[i])
         if not keep_state:
             hover.random_start(stream, trim, x[i])
         if world.turbulence > 0.0:
             steady = heli.steady_wind[i]
-            steady[NORTH], steady[EAST] = p[WIND_NORTH], p[WIND_EAST]
+            steady[NORTH], steady[EAST] = heli.own[i, AIR_NORTH], heli.own[i, AIR_EAST]
             draw_filters(stream, heli.filters[i])
         progress = heli.progress[i]
         progress[tasks.WITHIN] = progress[tasks.REACHED] = 0

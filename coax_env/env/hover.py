@@ -8,8 +8,10 @@ at the goal, and with a slope far from it, so that a policy can be learnt from n
 """
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled
@@ -159,37 +161,58 @@ def is_over(x):
     return negated(inside)  # a comparison with NaN is false
 
 
-def squared_errors(states: np.ndarray, targets: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def in_world(states: np.ndarray) -> np.ndarray:
+    """Velocities north, east and down [m/s], shape (..., 3), of states (..., >=16)."""
+    turn = Rotation.from_euler("ZYX", states[..., [S.PSI, S.THETA, S.PHI]].reshape(-1, 3))
+    return turn.apply(states[..., VELOCITY].reshape(-1, 3)).reshape(*states.shape[:-1], 3)
+
+
+def squared_errors(
+    states: np.ndarray, targets: np.ndarray | None = None, rates: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     """Squares of the errors that LIMITS names, but for the effort, of every state; SI.
 
     Args:
         states: full or paper states, shape (..., >=16).
         targets: x y z psi, shape (..., 4); None: hover's.
+        rates: of the targets, shape (..., 4), where they move: the speed is then relative to theirs.
 
     Returns:
         height, position (horizontal), speed, heading, rates: each of shape (...).
     """
     goal = np.array([0.0, 0.0, -HEIGHT, 0.0]) if targets is None else targets
+    speed = (states[..., VELOCITY] ** 2).sum(-1)
+    if rates is not None:
+        speed = ((in_world(states) - rates[..., :3]) ** 2).sum(-1)
     heading = (states[..., S.PSI] - goal[..., HEADING] + math.pi) % (2.0 * math.pi) - math.pi
     return {
         "height": (states[..., S.Z] - goal[..., DOWN]) ** 2,
         "position": ((states[..., PLACE] - goal[..., HORIZONTAL]) ** 2).sum(-1),
-        "speed": (states[..., VELOCITY] ** 2).sum(-1),
+        "speed": speed,
         "heading": heading**2,
         "rates": (states[..., RATE] ** 2).sum(-1),
     }
 
 
-def cost(states: np.ndarray, actions: np.ndarray, targets: np.ndarray | None = None) -> np.ndarray:
+def cost(
+    states: np.ndarray,
+    actions: np.ndarray,
+    targets: np.ndarray | None = None,
+    limits: Mapping[str, float] | None = None,
+    rates: np.ndarray | None = None,
+) -> np.ndarray:
     """Quadratic cost of every step: COST_WEIGHTS times the squared errors in units of LIMITS.
 
     Args:
         states: full or paper states, shape (..., >=16). actions: shape (..., 4).
         targets: x y z psi, shape (..., 4); None: hover's.
+        limits: other errors that count 1, where not LIMITS.
+        rates: of the targets, shape (..., 4), where they move.
 
     Returns:
         shape (...).
     """
-    errors = squared_errors(states, targets) | {"effort": (np.asarray(actions) ** 2).sum(-1)}
+    errors = squared_errors(states, targets, rates) | {"effort": (np.asarray(actions) ** 2).sum(-1)}
     squares = np.stack([errors[name] for name in LIMITS], axis=-1)
-    return squares @ (_COST_WEIGHTS / _LIMITS**2)
+    scale = _LIMITS if limits is None else np.array(list((LIMITS | dict(limits)).values()))
+    return squares @ (_COST_WEIGHTS / scale**2)

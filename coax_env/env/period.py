@@ -100,9 +100,9 @@ def give_command(u, last, limits, ring, row, dt):
 @compiled()
 def _split(delay, slots, dt):
     """A delay [s] as whole rows, and the seconds of a row for which the command before holds."""
-    whole = min(int(delay / dt + 1e-9), slots - 2)
+    whole = min(math.floor(delay / dt + 1e-9), slots - 2.0)
     rest = min(max(delay - whole * dt, 0.0), dt)
-    return whole, rest if rest > SHORTEST_PART else 0.0
+    return whole, select(rest > SHORTEST_PART, rest, 0.0)
 
 
 @compiled()
@@ -131,11 +131,23 @@ def apply_delays(u, p, ring, row, dt):
 def _take(ring, row, late, since, first, u):
     """Two commands from the `first` on, as in force `since` seconds after a row began, into `u`."""
     whole, rest = late
-    slot = (row - whole - (1 if since < rest else 0)) % len(ring)
+    slot = (row - int(whole) - (1 if since < rest else 0)) % len(ring)
     u[first], u[first + 1] = ring[slot, first], ring[slot, first + 1]
 
 
 # --- flight -------------------------------------------------------------------------------------------
+
+
+@compiled()
+def _slots(ring):
+    """How many commands a ring holds."""
+    return len(ring)
+
+
+@compiled()
+def _fly_part(x, u, length, p, work):
+    """Fly so many seconds in place."""
+    step(x, u, length, p, work, x)
 
 
 @compiled()
@@ -150,22 +162,23 @@ def fly_period(x, u, p, ring, row, dt, work):
         work: scratch, (dynamics.WORK_SIZE,).
     """
     rotors, swash = _delays(p)
-    slots = len(ring)
-    if swash <= 0.0 or slots == 1:
-        step(x, u, dt, p, work, x)
+    slots = _slots(ring)
+    if slots == 1 or not any_lane(swash > 0.0):
+        _fly_part(x, u, dt, p, work)
         return
     late_rotors, late_swash = _split(rotors, slots, dt), _split(swash, slots, dt)
     first = min(late_rotors[1], late_swash[1])
     second = max(late_rotors[1], late_swash[1])
-    since, begin = 0.0, u[U.TIME]
+    since, begin = 0.0 * first, u[U.TIME]
     for k in range(3):
         until = first if k == 0 else (second if k == 1 else dt)
-        if until - since > SHORTEST_PART:
+        flies = until - since > SHORTEST_PART
+        if any_lane(flies):
             _take(ring, row, late_rotors, since, U.OMEGA_U, u)
             _take(ring, row, late_swash, since, U.DELTA_LON, u)
             u[U.TIME] = begin + since
-            step(x, u, until - since, p, work, x)
-            since = until
+            _fly_part(x, u, until - since, p, work)
+            since = select(flies, until, since)
 
 
 @compiled()
@@ -216,6 +229,16 @@ def true_readings(x, u, p, azimuth, work, readings):
         x, u, p, work: as in `fly_period`. azimuth: of the upper rotor [rad].
     """
     measure(x, u, p, work, readings)
+    shake(readings, azimuth, p)
+
+
+@compiled()
+def shake(readings, azimuth, p):
+    """Add the vibration, if there is one, to readings (18,), in place.
+
+    Args:
+        readings: (18,), in place. azimuth: of the upper rotor [rad]. p: parameter vector.
+    """
     v = _VIBRATION
     if p[v] + p[v + 1] + p[v + 2] + p[v + 3] != 0.0:  # none is negative
         add_vibration(readings, azimuth, p[v], p[v + 1], p[v + 2], p[v + 3])

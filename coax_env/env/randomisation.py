@@ -18,6 +18,8 @@ from coax_env.model import effects, parameters
 from coax_env.model.vehicle import POSITIVE, Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 
+Wind = float | Sequence[float] | Mapping[str, Sequence[float]] | None
+"""None; (north, east) [m/s]; a speed from anywhere; or {"speed": (low, high)}, that is drawn too."""
 Randomize = str | Mapping[str, Sequence[float]] | Sequence[str | Path | Vehicle] | None
 """None; ``"posterior"``; parameter -> (low, high); or a list of vehicles."""
 
@@ -28,6 +30,8 @@ class Draws:
     Attributes:
         names: of the numbers drawn, full names as ``ground_effect.gain``; none without chance.
         vehicles: those whose sensors and actuators fly; a draw is of one of them.
+        places: in a parameter vector, of what flights may differ in, (k,) int64, in order.
+        effects: full names of the parameters of every effect that may be on in some flight.
     """
 
     def __init__(self, vehicle: Vehicle, randomize: Randomize = None) -> None:
@@ -50,6 +54,7 @@ class Draws:
         self._spread = vehicle.spread() if self._posterior else None
         self._columns = np.array([effects.parameter_index(n) for n in self.names], dtype=np.int64)
         self._vectors = np.array([v.vector for v in self.vehicles])
+        self._place(self._varying())
 
     @property
     def random(self) -> bool:
@@ -90,14 +95,53 @@ class Draws:
         _pick(streams, len(self.vehicles), kinds)
         return self._vectors[kinds][:, self._columns], kinds
 
-    def vectors(self, values: np.ndarray, kinds: np.ndarray) -> np.ndarray:
-        """Parameter vectors of what was drawn, shape (m, n_parameters)."""
-        vectors = self._vectors[kinds]
-        vectors[:, self._columns] = values
-        for reference, own in parameters.GUST_REFERENCE.items():
-            vectors[:, reference] = vectors[:, own]
-        effects.set_switches(vectors)
-        return vectors
+    def _varying(self) -> np.ndarray:
+        """Which of `names` may differ between flights, bool."""
+        if self._spread is not None:
+            return self._spread.std > 0.0
+        if len(self._ranges):
+            return self._ranges[:, 0] < self._ranges[:, 1]
+        return np.ptp(self._vectors[:, self._columns], axis=0) > 0.0
+
+    def _place(self, varying: np.ndarray) -> None:
+        """Where in a parameter vector stands what `names` of this mask decide."""
+        drawn = self._columns[varying]
+        known = set(drawn.tolist())
+        references = [r for r, own in parameters.GUST_REFERENCE.items() if own in known]
+        switches = np.arange(effects.SWITCHES.start, effects.SWITCHES.stop)
+        by_effects = drawn[drawn >= switches[-1] + 1]
+        kinds = np.ptp(self._vectors, axis=0) > 0.0  # between the vehicles of a list
+        thrown = switches if len(by_effects) else switches[kinds[effects.SWITCHES]]
+        self.places = np.unique([*drawn, *references, *thrown, *np.flatnonzero(kinds)]).astype(
+            np.int64
+        )
+        self.effects = effects.acting(self._vectors, known)
+        self._own = self._vectors[:, self.places]
+        self._values, self._drawn = np.flatnonzero(varying), np.searchsorted(self.places, drawn)
+        self._references = np.searchsorted(self.places, references)
+        self._referred = np.searchsorted(
+            self.places, [parameters.GUST_REFERENCE[r] for r in references]
+        )
+        self._by_effects, self._at_effects = by_effects, np.searchsorted(self.places, by_effects)
+        self._at_switches = np.searchsorted(self.places, switches) if len(by_effects) else None
+        same = self._vectors.copy()
+        same[:, by_effects] = effects.off_vector()[by_effects]
+        effects.set_switches(same)
+        self._always = same[:, effects.SWITCHES] > 0.0
+
+    def numbers(self, values: np.ndarray, kinds: np.ndarray) -> np.ndarray:
+        """What was drawn, as the parameters at `places`, shape (m, k).
+
+        Args:
+            values, kinds: as `draw` returns them.
+        """
+        own = self._own[kinds]
+        own[:, self._drawn] = values[:, self._values]
+        own[:, self._references] = own[:, self._referred]
+        if self._at_switches is not None:
+            thrown = effects.switched_on(own[:, self._at_effects], self._by_effects)
+            own[:, self._at_switches] = thrown | self._always[kinds]
+        return own
 
     def most(self, name: str) -> float:
         """The largest value a parameter can have (its upper limit where the spread has no end)."""

@@ -60,7 +60,7 @@ class Traces:
         state = np.nan_to_num(fleet.x[row], posinf=0.0, neginf=0.0)
         return View(
             state=state,
-            params=fleet.params[row if len(fleet.params) > 1 else 0],
+            params=fleet.params_of(row),
             air=fleet.air[row],
             azimuth=float(fleet.azimuth[row]),
             seconds=float(fleet.rows[row] * DT),

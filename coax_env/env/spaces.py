@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from gymnasium.spaces import Box
 
-from coax_env.env import tasks
 from coax_env.env.actions import ROTOR_RANGE, SWASH_RANGE
 from coax_env.env.fleet import Fleet
 
@@ -49,11 +48,10 @@ ACTIONS = (
 
 def observed(fleet: Fleet) -> tuple[Entry, ...]:
     """Every number of the observation: readings, ``new_INSTRUMENT`` flags, the way to the target."""
-    way = tasks.WAY if fleet.task.shows_target else ()
     named = [
         *((s.name, s.unit, s.noise, s.rate) for s in fleet.sensors),
         *((f"new_{flag}", "1", None, None) for flag in fleet.flags),
-        *((name, unit, None, None) for name, unit, _ in way),
+        *((name, unit, None, None) for name, unit, _ in fleet.task.shown),
     ]
     bounds = zip(fleet.low.tolist(), fleet.high.tolist(), strict=True)
     return tuple(

@@ -1,4 +1,4 @@
-"""What a flight of the env is for: hover, hold a position, or follow waypoints.
+"""What a flight of the env is for: hover, hold a position, follow waypoints or a path in time.
 
 A task is one entry of TASKS: its reward's weights and scales, where its targets are drawn, and whether
 it moves on from one target to the next. All tasks start, end and are rewarded by hover.py about the
@@ -10,12 +10,12 @@ Success is SUCCESS's, about the target: see `judge`, and `succeeded` for one rec
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from coax_env.env import hover
+from coax_env.env import hover, paths
 from coax_env.env.hover import DOWN, EAST, HEADING, HORIZONTAL, NORTH
 from coax_env.errors import InputError
 from coax_env.kernel.angles import wrap_angle
@@ -49,7 +49,8 @@ class Task:
 
     ``lowest`` and ``highest``: the box targets are drawn from, (north, east, height, heading).
     ``shows_target``: whether the way to the target is observed; ``moves_on``: whether one target
-    follows the other.
+    follows the other; ``follows_path``: whether the target moves in time (paths.py), whose velocity and
+    acceleration are observed too. ``success``: limits of the errors, see `judge`.
     """
 
     summary: str
@@ -59,6 +60,15 @@ class Task:
     highest: tuple[float, float, float, float]
     shows_target: bool = True
     moves_on: bool = False
+    follows_path: bool = False
+    success: Mapping[str, float] = field(default_factory=lambda: SUCCESS)
+
+    @property
+    def shown(self) -> tuple[tuple[str, str, float], ...]:
+        """Name, unit and bound of what is observed of the target."""
+        if not self.shows_target:
+            return ()
+        return WAY + MOTION if self.follows_path else WAY
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -92,6 +102,15 @@ TASKS: dict[str, Task] = {
         (-2.0, -2.0, 1.0, -math.pi), (2.0, 2.0, 2.5, math.pi),
         moves_on=True,
     ),
+    "trajectory": Task(
+        "follow a path in time",
+        {
+            "alive": 0.1, "height": 0.2, "position": 0.4, "speed": 0.0, "heading": 0.15,
+            "rates": 0.05, "effort": 0.1,
+        },
+        {**hover.REWARD_SCALES, "position": 0.25},
+        HOVER_TARGET, HOVER_TARGET, follows_path=True, success=SUCCESS | {"drift": 1.0},
+    ),
 }  # fmt: skip
 """The tasks by name. ``reached`` is paid once per waypoint: more than moving on costs at first."""
 
@@ -104,11 +123,19 @@ WAY = (
 Target minus *measured* position, turned by the measured heading; target minus measured heading.
 """
 N_WAY = len(WAY)
+MOTION = (
+    ("path_forward", "m/s", 15.0), ("path_right", "m/s", 15.0), ("path_up", "m/s", 15.0),
+    ("path_turn", "rad/s", 10.0), ("path_forward_acceleration", "m/s2", 60.0),
+    ("path_right_acceleration", "m/s2", 60.0), ("path_up_acceleration", "m/s2", 60.0),
+)  # fmt: skip
+"""Name, unit and bound of how a path's target moves, appended after WAY; in the heading's axes."""
+N_MOTION = len(MOTION)
 LOW, HIGH = range(2)
 """Rows of the box that targets are drawn from."""
 FORWARD, RIGHT, UP, TURN = range(N_WAY)
 """Places of the way to the target."""
 _BOUNDS = np.array([bound for *_, bound in WAY])
+_MOTION_BOUNDS = np.array([bound for *_, bound in MOTION])
 
 WITHIN, REACHED = range(2)
 """Columns of a helicopter's progress: rows spent at the target so far, and targets reached."""
@@ -129,6 +156,8 @@ def course(name: str, target: Any = None) -> np.ndarray:
             ``hover``, whose target is fixed.
     """
     own = task(name)
+    if own.follows_path:
+        return paths.path(target)[0][:1, :4]
     if name == "hover":
         if target is not None:
             raise InputError(
@@ -242,6 +271,29 @@ def way_to_target(held, places, height_sign, target, out):
         out[i] = min(max(out[i], -_BOUNDS[i]), _BOUNDS[i])
 
 
+@compiled()
+def row_of_path(row, rows, again):
+    """Where a path is after so many control periods: past its last row from `again` on."""
+    return row if row < rows else again + (row - again) % (rows - again)
+
+
+@compiled()
+def motion_of_target(point, psi, out):
+    """How a path moves, MOTION, in the axes of a heading.
+
+    Args:
+        point: a row of a path, (paths.N_PATH,). psi: measured heading [rad]. out: is put here, (7,).
+    """
+    cosine, sine = math.cos(psi), math.sin(psi)
+    for k, first in ((0, 4), (4, 8)):
+        out[k] = cosine * point[first] + sine * point[first + 1]
+        out[k + 1] = cosine * point[first + 1] - sine * point[first]
+        out[k + 2] = -point[first + 2]
+    out[3] = point[7]
+    for i in range(N_MOTION):
+        out[i] = min(max(out[i], -_MOTION_BOUNDS[i]), _MOTION_BOUNDS[i])
+
+
 def judge(
     name: str,
     flown: np.ndarray,
@@ -252,6 +304,7 @@ def judge(
     """Which flights were successes, (count,) bool.
 
     ``hover`` and ``position``: flown to the end, and from SETTLED on every error under SUCCESS's.
+    ``trajectory``: the same, about the moving target, nearer to it and with the speed relative to it.
     ``waypoints``: flown to the end, and `wanted` of them reached.
 
     Args:
@@ -263,7 +316,7 @@ def judge(
     """
     if task(name).moves_on:
         return np.asarray(flown & (reached >= wanted))
-    within = [errors[key] < limit for key, limit in SUCCESS.items()]
+    within = [errors[key] < limit for key, limit in task(name).success.items()]
     return np.logical_and.reduce([flown, *within])
 
 
@@ -274,11 +327,13 @@ def succeeded(
     steps: int,
     reached: int = 0,
     wanted: int = 1,
+    rates: np.ndarray | None = None,
 ) -> bool:
     """Whether one flight was a success by `judge`, from true states.
 
     Args:
         states: (n, >=16), one row after each step flown. targets: x y z psi in force, (n, 4).
+        rates: of the targets, ``info["target_rates"]`` (n, 4), where they move.
         steps: how many the flight should have had.
         reached: waypoints reached, ``info["reached"]``. wanted: how many it should have been.
     """
@@ -287,7 +342,8 @@ def succeeded(
     errors = dict.fromkeys(SUCCESS, np.array([np.inf]))
     if len(x):
         place = x[0, PLACE] if name == "hover" else goal[:, HORIZONTAL]
-        squares = hover.squared_errors(x, goal)
+        moving = None if rates is None else rates[FIRST_JUDGED - 1 :]
+        squares = hover.squared_errors(x, goal, moving)
         errors = {k: np.sqrt([squares[k].mean()]) for k in ("height", "speed", "heading")}
         errors["drift"] = np.linalg.norm(x[:, PLACE] - place, axis=1).max(keepdims=True)
     return bool(judge(name, flown, errors, reached, wanted)[0])

@@ -11,10 +11,11 @@ from coax_env.env import tasks
 from coax_env.env.actions import Nominal
 from coax_env.env.fleet import Fleet
 from coax_env.env.gym_env import CoaxEnv, start_states
-from coax_env.env.randomisation import Randomize
+from coax_env.env.randomisation import Randomize, Wind
 from coax_env.env.screen import Screen, checked_render_mode
 from coax_env.env.spaces import action_space, observation_space, observed
 from coax_env.errors import InputError
+from coax_env.model.sensors import BASE_RATE
 from coax_env.model.vehicle import Vehicle
 
 
@@ -42,7 +43,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         vehicle: str | Vehicle = "lama400d",
         nominal: Nominal = None,
         sensors: str = "onboard",
-        wind: float | Sequence[float] | None = None,
+        wind: Wind = None,
         gusts: tuple[float, float] | None = None,
         randomize: Randomize = None,
         render_mode: str | None = None,
@@ -52,6 +53,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         turbulence: float | str | None = None,
         task: str = "hover",
         target: Any = None,
+        control_rate: float = BASE_RATE,
     ) -> None:
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, found {num_envs}")
@@ -62,7 +64,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.max_episode_steps = max_episode_steps
         self.fleet = Fleet(
             num_envs, vehicle, nominal, sensors, wind, gusts, randomize, threads,
-            turbulence, task, target,
+            turbulence, task, target, control_rate,
         )  # fmt: skip
         entries = observed(self.fleet)
         self.single_observation_space = observation_space(entries)
@@ -121,11 +123,11 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         active = ~ended if waiting else self._every
         anew = ended if waiting and self.autoreset_mode == AutoresetMode.NEXT_STEP else None
         commands = np.array(actions, dtype=np.float64).reshape(self.num_envs, 4)
-        outcome = fleet.fly(commands, active, anew)
+        outcome = fleet.fly_held(commands, active, anew)
         terminated = outcome.over
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         if self.max_episode_steps is not None:
-            truncated = (fleet.rows >= self.max_episode_steps) & active
+            truncated = (fleet.rows >= self.max_episode_steps * fleet.periods) & active
         observations = outcome.observations
         info: dict[str, Any] = {}
         done = terminated | truncated
@@ -168,6 +170,8 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         info: dict[str, np.ndarray] = {"state": state}
         if fleet.task.shows_target:
             info["target"] = fleet.targets.copy()
+        if fleet.task.follows_path:
+            info["target_rates"] = fleet.target_rates
         if fleet.task.moves_on:
             info["reached"] = fleet.progress[:, tasks.REACHED].copy()
         return _masked(info, which.copy())

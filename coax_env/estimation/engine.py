@@ -10,17 +10,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from coax_env.estimation import frozen_gains, kalman, noise_score
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
+from coax_env.estimation.sparse import aligned, padded
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
 
 GATE = 8.0  # std of an innovation beyond which a reading counts as an outlier; ours
-REFRESH = 4  # rows between new Jacobians: at 100 Hz they change little in 40 ms
+REFRESH = 4  # rows between new Jacobians, at least
+REFRESH_SECONDS = 0.04  # [s] in which they change little: more rows of a log faster than 100 Hz
 BLOCK = 2.0  # [s] of the blocks whose scores are taken as independent
+BLOCKS_AT_ONCE = 5  # whose signatures are held at a time: 7 MB at 100 Hz with every parameter
 DIVERGED = 1e6  # whitened innovations [std] that only a diverging mean has
 Progress = Callable[[str], None]
 
@@ -30,9 +34,9 @@ class RunPass:
     """What a filter pass leaves of one run.
 
     innovations: (n, m) whitened, NaN where there is no reading. states: (n, nx) filtered.
-    gains: (readings, nx), per_sigma: (readings,), H: (n / REFRESH, m, nx), see kalman.py, empty unless
-    kept. start_covariances: (s, nx, nx) of the filtered state at `start_rows`. deweighted: how many
-    readings were beyond the gate.
+    gains: (readings, nx), per_sigma: (readings,), H: (n / rows between new ones, m, nx), see kalman.py,
+    empty unless kept. start_covariances: (s, nx, nx) of the filtered state at `start_rows`.
+    deweighted: how many readings were beyond the gate.
     """
 
     record: Record
@@ -151,6 +155,7 @@ class Engine:
         self.threads = threads or int(os.environ.get("COAX_THREADS", "2"))
         self.starts = [model.start(r) for r in self.records]
         self.intervals = [np.append(np.diff(r.t), 0.0) for r in self.records]
+        self._refresh = [_rows_between_jacobians(dt) for dt in self.intervals]
         self._readings = [int((~np.isnan(r.z)).sum()) for r in self.records]
         self._buffers: list[_Buffers] = []  # that no thread works with
 
@@ -234,7 +239,7 @@ class Engine:
         count, rows, buffers = (0, 0, _Buffers()) if keep is None else (self._readings[i], n, keep)
         K = buffers.array("K", (count, nx), np.float32)
         per_sigma = buffers.array("per_sigma", (count,))
-        H = buffers.array("H", (math.ceil(rows / REFRESH), m, nx), np.float32)
+        H = buffers.array("H", (math.ceil(rows / self._refresh[i]), m, nx), np.float32)
         rows, buffers = (0, _Buffers()) if jacobians is None else (n, jacobians)
         F = buffers.array("F", (rows, nx, nx), np.float32)
         F_of = buffers.array("F_of", (rows,), np.int64)
@@ -250,7 +255,7 @@ class Engine:
         path = kalman.Path(F, F_of, predicted, decaying, rows_of_P, beyond)
         log_likelihood, deweighted = kalman.filter_pass(
             self.compiled, kalman.RunData(self.intervals[i], u, record.z),
-            kalman.Variances(x0, P0, R, q, decay), p, GATE, REFRESH,
+            kalman.Variances(x0, P0, R, q, decay), p, GATE, self._refresh[i],
             kalman.Trace(states, e, gains, path), kalman.Covariances(P, slots),
         )  # fmt: skip
         if not np.isfinite(log_likelihood):
@@ -289,20 +294,27 @@ class Engine:
         def one(i: int) -> tuple[Any, ...]:
             with self._borrowed_buffers() as buffers:
                 run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
-                J = buffers.array("J", (int(np.isfinite(run.innovations).sum()), len(free)))
+                information = np.zeros((len(free), len(free)))
                 by_channel = np.zeros((len(free), run.innovations.shape[1]))
+                edges, before = _block_edges(run)
+                blocks = np.zeros((edges.size - 1, len(free)))
                 if np.isfinite(run.log_likelihood):
-                    self._signatures(i, run, at, p, moves, J, by_channel)
-                    self._probed_signatures(i, run, moves, J, by_channel)
-                else:
-                    J[:] = 0.0
-                information = J.T @ J
+                    work = self._signatures(i, run, at, p, moves, by_channel)
+                    probed = self._probed_signatures(i, run, moves, by_channel)
+                    e = run.innovations[np.isfinite(run.innovations)]
+                    for first in range(0, edges.size - 1, BLOCKS_AT_ONCE):
+                        own = edges[first : first + BLOCKS_AT_ONCE + 1]
+                        since, until = before[own[0]], before[own[-1]]
+                        J = buffers.array("J", (int(until - since), len(free)))
+                        J[:, moves.probed] = probed[since:until]
+                        work(frozen_gains.Portion(int(own[0]), int(own[-1]), int(since)), J)
+                        information += J.T @ J
+                        for b, (a, z) in enumerate(pairwise(before[own] - since), first):
+                            blocks[b] = e[since + a : since + z] @ J[a:z]
                 wild = ~np.isfinite(np.diag(information))
-                if wild.any():
-                    J[:, wild] = 0.0
-                    information[wild] = information[:, wild] = 0.0
-                    by_channel[wild] = 0.0
-                blocks = _block_scores(run, J)
+                information[wild] = information[:, wild] = 0.0
+                by_channel[wild] = 0.0
+                blocks[:, wild] = 0.0
             return run, information, blocks.sum(0), by_channel, blocks
 
         passes, *parts, blocks = zip(*self._each(one), strict=True)
@@ -332,16 +344,18 @@ class Engine:
         at: PassJacobians,
         p: np.ndarray,
         moves: _Moves,
-        J: np.ndarray,
         by_channel: np.ndarray,
-    ) -> None:
-        """Derivatives of a run's whitened innovations where a small step does, into columns of J.
+    ) -> Callable[[frozen_gains.Portion, np.ndarray], None]:
+        """Derivatives of a run's whitened innovations where a small step does.
 
-        And their squares, summed by channel, into rows of `by_channel`.
+        Returns:
+            what puts those of a portion of the run, one after the other, into columns of J, and adds
+            their squares, by channel, to rows of `by_channel`.
         """
         columns = np.flatnonzero(~moves.probed)
         if not columns.size:
-            return
+            return lambda portion, J: None
+        columns = columns[np.argsort(~moves.reading_only[columns], kind="stable")]
         vectors = [moves.vectors[k] for k in columns]
         sets, which = [run.inputs], np.zeros(columns.size, np.int64)
         for k, vector in enumerate(vectors):
@@ -353,23 +367,40 @@ class Engine:
             np.array(vectors), moves.steps[columns], moves.reading_only[columns],
             np.array(sets), which, columns,
         )  # fmt: skip
-        frozen_gains.signature_pass(
-            self.compiled, self.intervals[i], _trace(run, at), p, moved, REFRESH, J, by_channel
-        )
+        s = aligned(self.compiled.exact.size, padded(columns.size + 1))
+        trace = _trace(run, at)
+
+        def of_portion(portion: frozen_gains.Portion, J: np.ndarray) -> None:
+            frozen_gains.signature_pass(
+                self.compiled,
+                self.intervals[i],
+                trace,
+                p,
+                moved,
+                self._refresh[i],
+                portion,
+                s,
+                J,
+                by_channel,
+            )
+
+        return of_portion
 
     def _probed_signatures(
-        self, i: int, run: RunPass, moves: _Moves, J: np.ndarray, by_channel: np.ndarray
-    ) -> None:
-        """The same where a finite step is needed, by a mean pass each."""
+        self, i: int, run: RunPass, moves: _Moves, by_channel: np.ndarray
+    ) -> np.ndarray:
+        """The same where a finite step is needed, by a mean pass each: (readings, probed)."""
         there = np.isfinite(run.innovations)
+        columns = np.flatnonzero(moves.probed)
+        found = np.zeros((int(there.sum()), columns.size))
         probed = np.zeros(there.shape)
-        for k in np.flatnonzero(moves.probed):
-            J[:, k] = 0.0
+        for column, k in enumerate(columns):
             if self._frozen(i, run, moves.vectors[k], probed):
                 change = np.where(there, probed - run.innovations, 0.0)
                 if np.abs(change).max(initial=0.0) < DIVERGED:
-                    J[:, k] = change[there] / moves.steps[k]
+                    found[:, column] = change[there] / moves.steps[k]
                     by_channel[k] = np.square(change / moves.steps[k]).sum(0)
+        return found
 
     def descend(
         self,
@@ -431,7 +462,7 @@ class Engine:
         u, gains = self.model.inputs(run.record, p), kalman.Gains(run.gains, run.per_sigma, run.H)
         return frozen_gains.mean_pass(
             self.compiled, kalman.RunData(self.intervals[i], u, run.record.z), self.starts[i][0], p,
-            gains, REFRESH, out,
+            gains, self._refresh[i], out,
         )  # fmt: skip
 
     def fit(
@@ -511,8 +542,8 @@ class Engine:
                 run, at = self._filter_run(i, p, noise, buffers, buffers, decaying=decaying)
                 if np.isfinite(run.log_likelihood):
                     noise_score.score_pass(
-                        self.intervals[i], _trace(run, at), places, q, decay, GATE, REFRESH, block,
-                        slopes,
+                        self.intervals[i], _trace(run, at), places, q, decay, GATE,
+                        self._refresh[i], block, slopes,
                     )  # fmt: skip
             return run.log_likelihood, slopes
 
@@ -542,12 +573,15 @@ def objective(
     return penalty(free, values) - float(sum(p.log_likelihood for p in passes))
 
 
-def _block_scores(run: RunPass, J: np.ndarray) -> np.ndarray:
-    """Signatures (readings, k) times innovations, summed over blocks of BLOCK seconds, (blocks, k)."""
-    there = np.isfinite(run.innovations)
-    e = run.innovations[there]
-    row = np.nonzero(there)[0]
+def _rows_between_jacobians(dt: np.ndarray) -> int:
+    """Rows of a run, with these seconds between them, that new Jacobians serve."""
+    usual = float(np.median(dt[:-1])) if dt.size > 1 else 0.0
+    return max(REFRESH, round(REFRESH_SECONDS / usual)) if usual > 0.0 else REFRESH
+
+
+def _block_edges(run: RunPass) -> tuple[np.ndarray, np.ndarray]:
+    """First rows of blocks of BLOCK seconds, and the end (blocks + 1,); readings before each row."""
     t = run.record.t
     edges = np.searchsorted(t, np.arange(t[0] + BLOCK, t[-1], BLOCK))
-    parts = np.split(np.arange(e.size), np.searchsorted(row, edges))
-    return np.array([e[part] @ J[part] for part in parts])
+    readings = np.isfinite(run.innovations).sum(1)
+    return np.array([0, *edges, t.size]), np.append(0, np.cumsum(readings))

@@ -1,6 +1,7 @@
 """What of a flight was flown: runs cut where nothing is known, or something else moves the machine.
 
-- A gap: the last command is held for so long, and no longer; a new part begins behind it.
+- A gap: the last command is held for so long, and no longer; a new part begins behind it. So it does
+  where a command jumped in a gap of some rows: nobody knows when.
 - Commands that freeze, where they otherwise change all the time: the machine obeys others, or none.
 - Rotors that carry less than half the weight: it stands on the ground, or is carried.
 
@@ -10,6 +11,7 @@ identification, replay, check) asks for the parts here, since only a vehicle say
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +19,7 @@ import numpy as np
 from coax_env.logs.flight import Flight, Run
 from coax_env.logs.held_signal import integral_of_held
 from coax_env.logs.packets import stretches
-from coax_env.logs.repairs import hold_last
+from coax_env.logs.repairs import GAP, hold_last
 from coax_env.model.layout import RPM_PER_RAD_S
 from coax_env.model.vehicle import Vehicle
 
@@ -28,6 +30,14 @@ A swash command that is 0.05 rad off turns a machine of this size by half a radi
 radio links that are shorter cost less by a held command than by a filter that starts anew; ours.
 """
 BELIEVED_STEPS = 5.0
+MISSING = 1.8
+"""Usual steps from which on a row is missing; ours."""
+JUMP = 3.0
+"""Times the rms of what a command does in the time of a gap, over all runs, from which on it jumped.
+
+Held, it is wrong by the jump for a part of the gap: such steps of 0.1 rad were worth 106 nats to
+whatever made the machine answer sooner, on a clean synthetic flight by telemetry. Ours.
+"""
 SHORTEST_PART = 2.0
 """A part that is shorter [s] is left out: the filter needs the first second to settle; ours."""
 
@@ -54,18 +64,19 @@ def flown_parts(flight: Flight, vehicle: Vehicle) -> Flight:
         vehicle: whose rotors carry its weight.
     """
     grounded = _grounded_rows(flight, vehicle)
+    jumps = jumps_in_gaps([run.t for run in flight.runs], [run.command for run in flight.runs])
     counts: Counter[str] = Counter(flight.counts)
     notes: list[str] = []
     taken = set(flight.run_names)
     parts: list[Run] = []
-    for run, on_ground in zip(flight.runs, grounded, strict=True):
+    for run, on_ground, jumped in zip(flight.runs, grounded, jumps, strict=True):
         frozen = frozen_rows(run)
         for what, mask in (("commands frozen", frozen), ("rotors too slow to fly", on_ground)):
             for first, stop in stretches(mask):
                 last = run.t[min(stop, run.t.size - 1)]
                 notes.append(f"{run.name}: {run.t[first]:.1f} to {last:.1f} s left out: {what}")
                 counts[f"stretches left out: {what}"] += 1
-        parts += _parts(run, frozen | on_ground, taken, counts, notes)
+        parts += _parts(run, frozen | on_ground, jumped, taken, counts, notes)
     if not parts:
         too_short = (
             f"no run has {SHORTEST_PART:g} s of flight without a gap: all are used as they are"
@@ -77,14 +88,23 @@ def flown_parts(flight: Flight, vehicle: Vehicle) -> Flight:
 
 
 def _parts(
-    run: Run, left_out: np.ndarray, taken: set[str], counts: Counter[str], notes: list[str]
+    run: Run,
+    left_out: np.ndarray,
+    jumped: np.ndarray,
+    taken: set[str],
+    counts: Counter[str],
+    notes: list[str],
 ) -> list[Run]:
     """What is left of a run, cut at its gaps too; `taken`: names of runs that there are."""
     step = np.diff(run.t)
-    gap = np.concatenate([[False], step > longest_believed(run.t)])
+    long = np.concatenate([[False], step > longest_believed(run.t)])
+    gap = long | jumped
     for row in np.flatnonzero(gap):
         if not left_out[row - 1 : row + 1].any():
-            notes.append(f"{run.name}: cut at a gap of {step[row - 1]:.2f} s, {run.t[row]:.1f} s")
+            why = "" if long[row] else ", in which a command jumped"
+            notes.append(
+                f"{run.name}: cut at a gap of {step[row - 1]:.2f} s, {run.t[row]:.1f} s{why}"
+            )
             counts["gaps at which a run is cut"] += 1
     if not (gap.any() or left_out.any()):
         return [run]
@@ -130,6 +150,28 @@ def _part(run: Run, rows: np.ndarray, name: str) -> Run:
 def longest_believed(t: np.ndarray) -> float:
     """Time [s] for which a run's last command is believed; t: (n,) its rows."""
     return max(LONGEST_BELIEVED, BELIEVED_STEPS * float(np.median(np.diff(t))))
+
+
+def jumps_in_gaps(times: Sequence[np.ndarray], commands: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Rows (n,) of each run before which rows are missing for GAP or longer and a command jumped.
+
+    Args:
+        times: (n,) of each run [s]. commands: (n, 4) of each.
+    """
+    usual = float(np.median(np.concatenate([np.diff(t) for t in times])))
+    found = [np.zeros(t.size, bool) for t in times]
+    moved: dict[int, np.ndarray] = {}  # rms of each command's change, by rows
+    for t, command, jumped in zip(times, commands, found, strict=True):
+        step = np.diff(t)
+        for row in np.flatnonzero(step > max(GAP, MISSING * usual)):
+            rows = round(step[row] / usual)
+            if rows not in moved:
+                changes = [np.zeros((0, 4)), *(c[rows:] - c[:-rows] for c in commands)]
+                squares = np.square(np.concatenate(changes)).sum(axis=0)
+                moved[rows] = np.sqrt(squares / max(sum(map(len, changes)), 1))
+            change = np.abs(command[row + 1] - command[row])
+            jumped[row + 1] = bool(np.any(change > JUMP * moved[rows]))
+    return found
 
 
 # --- commands that freeze ------------------------------------------------------------------------

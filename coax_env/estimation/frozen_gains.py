@@ -21,10 +21,13 @@ from coax_env.estimation.kalman import (
     MODEL,
     RUN_DATA,
     TRACE,
+    in_every_lane,
+    lanes_of,
 )
-from coax_env.estimation.sparse import REORDER, padded, unpack, with_places
+from coax_env.estimation.sparse import REORDER, aligned, padded, unpack, with_places
 from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled
+from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
 
 
 @compiled(boolean(MODEL, RUN_DATA, _A, _A, GAINS, int64, _M), makes_arrays=True, **REORDER)
@@ -44,7 +47,7 @@ def mean_pass(model, run, x0, p, gains, refresh, e):
     x_next = np.zeros(nx)
     work = np.zeros(model.work_size)
     h = np.zeros(m)
-    H = with_places(np.zeros((m, nx)), nx)
+    H = with_places(np.zeros((m, padded(nx))), nx)
     reading = 0
     for k in range(n):
         if k % refresh == 0:
@@ -78,8 +81,8 @@ class Moves(NamedTuple):
     """The parameters whose signatures are wanted, k of them, each moved by itself.
 
     p: (k, np) parameters with one moved. steps: (k,) by how much. reading_only: (k,) those that add
-    nothing to the state. u: (sets, n, nu) inputs, the first those of no move; u_of: (k,) which of
-    them a move has. columns: (k,) where in J and by_channel a parameter stands.
+    nothing to the state, best first. u: (sets, n, nu) inputs, the first those of no move; u_of: (k,)
+    which of them a move has. columns: (k,) where in J and by_channel a parameter stands.
     """
 
     p: np.ndarray
@@ -88,6 +91,14 @@ class Moves(NamedTuple):
     u: np.ndarray
     u_of: np.ndarray
     columns: np.ndarray
+
+
+class Portion(NamedTuple):
+    """Rows `first` to `last` - 1 of a run; `reading`: how many readings there are before them."""
+
+    first: int
+    last: int
+    reading: int
 
 
 class _Signatures(NamedTuple):
@@ -105,9 +116,77 @@ class _Signatures(NamedTuple):
     h_base: Any  # readings (m,) of no move
     h_here: Any
     work: Any  # the model's scratch
+    lanes: Any  # kalman.Lanes
+    groups: (
+        Any  # parameters of SIMD_WIDTH moves in a row (groups, np, SIMD_WIDTH); of none, none moved
+    )
+    per_step: Any  # (width,) 1 / steps, 0 beyond the last
+    still: int  # groups at first that never move the state
 
 
 MOVES = types.NamedTuple([_M, _A, boolean[::1], float64[:, :, ::1], _N, _N], Moves)
+PORTION = types.NamedUniTuple(int64, 3, Portion)
+
+
+@compiled(**REORDER)
+def _effects_in_lanes(row, model, dt, trace, moves, w):
+    """`_effects_of_moves`, SIMD_WIDTH at once; after the last parameter comes none moved."""
+    count, blocks = moves.steps.size, np.uint64(w.per_step.size // SIMD_WIDTH)
+    state, u, lanes = trace.states[row], moves.u[0, row], w.lanes
+    out, dv, added = simd_blocks(lanes.out), simd_blocks(w.dv), simd_blocks(w.b)
+    per_step = simd_blocks(w.per_step)
+    m, nx = np.uint64(w.dv.shape[0]), np.uint64(state.size)
+    in_every_lane(u, lanes.u)
+    for drifts in range(2):
+        in_every_lane(state if drifts else trace.path.predicted[row], lanes.x)
+        for g in range(w.still if drifts else 0, w.groups.shape[0]):
+            first = g * SIMD_WIDTH
+            last = min(first + SIMD_WIDTH, count)
+            same = True
+            for k in range(first, last):
+                same &= moves.u_of[k] == 0
+            if not same:
+                for k in range(first, last):
+                    for i in range(u.size):
+                        lanes.u[i, k - first] = moves.u[moves.u_of[k], row, i]
+            at = np.uint64(g)
+            if drifts:
+                model.drift_of_lanes(lanes.x, lanes.u, dt, w.groups[g], lanes.work, lanes.out)
+                for i in range(nx):
+                    added[i * blocks + at] = out[i]
+            else:
+                model.measure_of_lanes(lanes.x, lanes.u, w.groups[g], lanes.work, lanes.out)
+                for i in range(m):
+                    dv[i * blocks + at] = out[i]
+            if not same:
+                in_every_lane(u, lanes.u)
+    for i in range(m):
+        base = w.dv[i, count]
+        for b in range(blocks):
+            dv[i * blocks + b] = (base - dv[i * blocks + b]) * per_step[b]
+    for i in range(nx):
+        base = w.b[i, count]
+        for b in range(np.uint64(w.still), blocks):
+            added[i * blocks + b] = (added[i * blocks + b] - base) * per_step[b]
+
+
+@compiled(makes_arrays=True)
+def _groups_of(moves, p):
+    """Parameters of the moves and of none, (groups, np, SIMD_WIDTH), and the groups `still`."""
+    count = moves.steps.size
+    groups = np.zeros((count // SIMD_WIDTH + 1, p.size, SIMD_WIDTH))
+    still = 0
+    for g in range(groups.shape[0]):
+        moving = False
+        for lane in range(SIMD_WIDTH):
+            k = g * SIMD_WIDTH + lane
+            one = moves.p[k] if k < count else p
+            moving |= k >= count or not moves.reading_only[k]
+            for i in range(p.size):
+                groups[g, i, lane] = one[i]
+        if not moving and still == g:
+            still = g + 1
+    return groups, still
 
 
 @compiled(**REORDER)
@@ -132,40 +211,44 @@ def _effects_of_moves(row, model, dt, trace, p, moves, w):
 @compiled(**REORDER)
 def _take_in(i, H, K, w):
     """Reading `i`: dv = dv - H s, s = s + K dv."""
-    width = w.s.shape[1]
-    for c in range(H.counts[i]):
-        j = H.places[i, c]
-        weight = H.values[i, j]
-        for k in range(width):
-            w.dv[i, k] -= weight * w.s[j, k]
-    for j in range(K.size):
-        gain = float64(K[j])
-        for k in range(width):
-            w.s[j, k] += gain * w.dv[i, k]
+    blocks = np.uint64(w.s.shape[1] // SIMD_WIDTH)
+    s, dv = simd_blocks(w.s), simd_blocks(w.dv)
+    at = np.uint64(i) * blocks
+    for b in range(blocks):
+        change = dv[at + b]
+        for c in range(H.counts[i]):
+            j = np.uint64(H.places[i, c])
+            change -= H.values[i, j] * s[j * blocks + b]
+        dv[at + b] = change
+        for a in range(np.uint64(K.size)):
+            s[a * blocks + b] += float64(K[a]) * change
 
 
 @compiled(**REORDER)
 def _propagate(exact, F, w):
     """s = F (s + b/2) + b/2; of a state that the drift takes exactly F s + b."""
-    nx, width = w.s.shape
-    for j in range(nx):
-        for k in range(width):
-            w.half[j, k] = w.s[j, k] + 0.5 * w.b[j, k]
-            w.before[j, k] = w.s[j, k]
+    nx, blocks = np.uint64(w.s.shape[0]), np.uint64(w.s.shape[1] // SIMD_WIDTH)
+    s, added = simd_blocks(w.s), simd_blocks(w.b)
+    half, before = simd_blocks(w.half), simd_blocks(w.before)
+    for a in range(nx * blocks):
+        half[a] = s[a] + 0.5 * added[a]
+        before[a] = s[a]
     for i in range(nx):
-        source = w.before if exact[i] else w.half
+        source = before if exact[i] else half
         own = 1.0 if exact[i] else 0.5
-        for k in range(width):
-            w.s[i, k] = own * w.b[i, k]
-        for c in range(F.counts[i]):
-            j = F.places[i, c]
-            weight = F.values[i, j]
-            for k in range(width):
-                w.s[i, k] += weight * source[j, k]
+        for b in range(blocks):
+            total = own * added[i * blocks + b]
+            for c in range(F.counts[i]):
+                j = np.uint64(F.places[i, c])
+                total += F.values[i, j] * source[j * blocks + b]
+            s[i * blocks + b] = total
 
 
-@compiled(types.void(MODEL, _A, TRACE, _A, MOVES, int64, _M, _M), makes_arrays=True, **REORDER)
-def signature_pass(model, dt, trace, p, moves, refresh, J, by_channel):
+@compiled(
+    types.void(MODEL, _A, TRACE, _A, MOVES, int64, PORTION, _M, _M, _M),
+    makes_arrays=True, **REORDER,
+)  # fmt: skip
+def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channel):
     """Derivatives of the whitened innovations in many parameters at once, gains frozen.
 
     What `mean_pass` gives with a parameter moved a little, to first order: with s the state's
@@ -183,27 +266,38 @@ def signature_pass(model, dt, trace, p, moves, refresh, J, by_channel):
         model: a CompiledModel. dt: (n,) seconds from each row to the next.
         trace: of the filter pass, with gains and path; refresh: as there.
         p: (np,) the parameters of the filter pass. moves: Moves.
-        J: derivatives, out, one row for each reading that there is, in the order of the innovations.
-        by_channel: (k or more, m) their squares summed, out.
+        portion: Portion of the run. s: (nx, padded(k + 1)) the state's derivatives at its first row, on
+            return at the one after its last; zeros where the run begins.
+        J: derivatives, out, one row for each reading of the portion, in the order of the innovations.
+        by_channel: (k or more, m) their squares, added.
     """
     n, m = trace.e.shape
     nx, k_all = model.exact.size, moves.steps.size
-    width = padded(k_all)
+    width = padded(k_all + 1)
+    groups, still = _groups_of(moves, p)
+    scratch = model.work_size if model.has_lanes else 0
     w = _Signatures(
-        s=np.zeros((nx, width)), b=np.zeros((nx, width)), half=np.zeros((nx, width)),
-        before=np.zeros((nx, width)), dv=np.zeros((m, width)),
+        s=s, b=aligned(nx, width), half=aligned(nx, width),
+        before=aligned(nx, width), dv=aligned(m, width),
         base=np.zeros(nx + m), here=np.zeros(nx + m), h_base=np.zeros(m), h_here=np.zeros(m),
         work=np.zeros(model.work_size),
+        lanes=lanes_of(nx, moves.u.shape[2], p, scratch, m),
+        groups=groups, per_step=aligned(1, width)[0], still=still,
     )  # fmt: skip
+    for k in range(k_all):
+        w.per_step[k] = 1.0 / moves.steps[k]
     power = np.zeros((m, width))
-    F = with_places(np.zeros((nx, nx)), nx)
-    H = with_places(np.zeros((m, nx)), nx)
+    F = with_places(np.zeros((nx, padded(nx))), nx)
+    H = with_places(np.zeros((m, padded(nx))), nx)
     F_slot = -1
-    reading = 0
-    for row in range(n):
-        if row % refresh == 0:
+    reading = portion.reading
+    for row in range(portion.first, portion.last):
+        if row % refresh == 0 or row == portion.first:
             unpack(trace.gains.H, row // refresh, H)
-        _effects_of_moves(row, model, dt[row], trace, p, moves, w)
+        if model.has_lanes:
+            _effects_in_lanes(row, model, dt[row], trace, moves, w)
+        else:
+            _effects_of_moves(row, model, dt[row], trace, p, moves, w)
         for i in range(m):
             if math.isnan(trace.e[row, i]):
                 continue
@@ -212,7 +306,7 @@ def signature_pass(model, dt, trace, p, moves, refresh, J, by_channel):
                 w.dv[i, k] *= trace.gains.per_sigma[reading]
                 power[i, k] += w.dv[i, k] * w.dv[i, k]
             for k in range(k_all):
-                J[reading, moves.columns[k]] = w.dv[i, k]
+                J[reading - portion.reading, moves.columns[k]] = w.dv[i, k]
             reading += 1
         if row == n - 1:
             break
@@ -222,4 +316,4 @@ def signature_pass(model, dt, trace, p, moves, refresh, J, by_channel):
         _propagate(model.exact, F, w)
     for k in range(k_all):
         for i in range(m):
-            by_channel[moves.columns[k], i] = power[i, k]
+            by_channel[moves.columns[k], i] += power[i, k]

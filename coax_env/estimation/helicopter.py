@@ -6,14 +6,19 @@ step is split to second order).
 """
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
+import numba
 import numpy as np
 from numba import float64, types
 
 from coax_env.estimation import helicopter_noise
+from coax_env.estimation.kalman import LANES_MEASURE, LANES_STEP
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
+from coax_env.kernel.simd import simd_view
+from coax_env.kernel.variants import under_names
 from coax_env.logs.flight import Run
 from coax_env.logs.held_signal import integral_of_held
 from coax_env.model import dynamics, effects, usual_sizes
@@ -101,6 +106,39 @@ def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) 
     _take_in_innovations(u, p, out)
 
 
+_drift_of_registers: Any = None  # what stands for them is compiled when it is first needed
+_measure_of_registers: Any = None
+
+
+def _drift_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`_drift_and_readings` of SIMD_WIDTH states, inputs and vehicles, a column each."""
+    u_, p_, out_ = simd_view(u), simd_view(p), simd_view(out)
+    _drift_of_registers(simd_view(x), u_, dt, p_, simd_view(work), out_)
+    _take_in_innovations(u_, p_, out_)
+
+
+def _measure_of_lanes(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
+    """`_measure` of as many."""
+    _measure_of_registers(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
+
+
+@cache
+def _side_by_side() -> Any:
+    """Pointers to the two; None where a user's effect does not compile for registers."""
+    drift, measure = dynamics.drift_and_measure_of_registers()
+    names = {"_drift_of_registers": drift, "_measure_of_registers": measure}
+    try:
+        return tuple(
+            pointer(kind)(under_names(function, names, "all_effects"))
+            for kind, function in (
+                (LANES_STEP.signature, _drift_of_lanes),
+                (LANES_MEASURE.signature, _measure_of_lanes),
+            )
+        )
+    except numba.core.errors.NumbaError:
+        return None
+
+
 def _small_changes() -> np.ndarray:
     """Size of a small change of each state, for differences (29,)."""
     size = np.empty(N_FULL)
@@ -123,6 +161,11 @@ class HeliModel:
     work_size = dynamics.WORK_SIZE
     noise_places = helicopter_noise.NOISE_PLACES
     state_scale = _small_changes()
+
+    @property
+    def side_by_side(self) -> Any:
+        """`drift_and_readings` and `measure` of SIMD_WIDTH at once, or None."""
+        return _side_by_side()
 
     def __init__(self, vehicle: Vehicle, held: Mapping[str, float] | None = None) -> None:
         """Of a vehicle; ``held``: values that effects which it does not have would take as stated."""

@@ -6,6 +6,8 @@ No level is a constant that evidence could depend on: all are fitted by maximum 
 - ``force_xy`` ..: std of gusts, states with an exponential memory, ``memory_force_xy`` ..
 - ``white_force_xy`` ..: force and moment without a memory
 - ``rotor_speed``: of the rotors' speeds, whose change the body feels where the model has that reaction
+- ``rotor_jitter``: std of speeds with a memory of their own, ``memory_rotor_jitter``, where flights
+  show them (rotor_jitter.py)
 - ``trim_force_z``, ``trim_moment_z``: random walks of thrust and torque
 
 and each channel's name for the std of its readings.
@@ -52,6 +54,8 @@ then undo the damping in every prediction.
 """
 ROTOR_LEVEL = "rotor_speed"
 """Intensity of the rotor speeds' noise [rad/s per s^1/2]."""
+JITTER_LEVEL, JITTER_MEMORY = "rotor_jitter", "memory_rotor_jitter"
+"""Std [rad/s] and correlation time [s] of what rotor_jitter.py adds to the rotor speeds."""
 TRIM_LEVELS = ("trim_force_z", "trim_moment_z")
 """Intensity of the random walks of thrust and torque [N/s^1/2, N m/s^1/2] (effect `trim_drift`)."""
 TRIM_AXES = ("force_z", "moment_z")
@@ -64,6 +68,8 @@ LEVEL_UNITS = {
     **{f"white_{axes}": "N s^1/2" for axes in _FORCE},
     **{f"white_{axes}": "N m s^1/2" for axes in _MOMENT},
     ROTOR_LEVEL: "rad/s^3/2",
+    JITTER_LEVEL: "rad/s",
+    JITTER_MEMORY: "s",
     "trim_force_z": "N/s^1/2",
     "trim_moment_z": "N m/s^1/2",
 }
@@ -179,7 +185,8 @@ SHAKEN = {
 
 def fitted_levels(noise: Noise) -> tuple[str, ...]:
     """Levels that are always fitted; white noise and trims are asked for first (noise_levels.py)."""
-    return (*GUST_LEVELS, *MEMORIES, ROTOR_LEVEL, *noise.reading)
+    jitter = [name for name in (JITTER_LEVEL, JITTER_MEMORY) if name in noise.process]
+    return (*GUST_LEVELS, *MEMORIES, ROTOR_LEVEL, *jitter, *noise.reading)
 
 
 def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:

@@ -29,19 +29,23 @@ from numba.extending import typeof_impl
 from coax_env.estimation.sparse import (
     REORDER,
     SPARSE,
+    aligned,
     find_non_zeros,
     multiply,
     padded,
     with_places,
 )
 from coax_env.kernel.angles import wrap_angle
-from coax_env.kernel.compilation import compiled
+from coax_env.kernel.compilation import compiled, pointer
+from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
 
 _A = float64[::1]
 _M = float64[:, ::1]
 _N = int64[::1]
 STEP = types.FunctionType(types.void(_A, _A, float64, _A, _A, _A))
 MEASURE = types.FunctionType(types.void(_A, _A, _A, _A, _A))
+LANES_STEP = types.FunctionType(types.void(_M, _M, float64, _M, _M, _M))
+LANES_MEASURE = types.FunctionType(types.void(_M, _M, _M, _M, _M))
 MOST_DECAY = 0.5
 """Share of a state that may decay in a row for the series of the exponential to be used."""
 SAME_STEP = 1e-6
@@ -52,8 +56,21 @@ _LOG_2PI = math.log(2.0 * math.pi)
 # --- what the passes are given and what they leave --------------------------------------------------
 
 
+@pointer(LANES_STEP.signature)
+def _no_drift(x, u, dt, p, work, out):
+    """What stands for `drift_of_lanes` where a model has none."""
+
+
+@pointer(LANES_MEASURE.signature)
+def _no_readings(x, u, p, work, out):
+    """What stands for `measure_of_lanes`."""
+
+
 class CompiledModel(NamedTuple):
-    """What compiled code needs of a model; see state_space.Model for each."""
+    """What compiled code needs of a model; see state_space.Model for each.
+
+    has_lanes: whether it has `side_by_side`, the two `_of_lanes`.
+    """
 
     step: Any
     measure: Any
@@ -63,10 +80,14 @@ class CompiledModel(NamedTuple):
     scale: np.ndarray
     work_size: int
     noise_places: np.ndarray
+    has_lanes: bool
+    drift_of_lanes: Any
+    measure_of_lanes: Any
 
     @classmethod
     def of(cls, model: Any) -> "CompiledModel":
         """That of a state_space.Model."""
+        side_by_side = getattr(model, "side_by_side", None)
         return cls(
             model.step,
             model.measure,
@@ -76,6 +97,8 @@ class CompiledModel(NamedTuple):
             np.ascontiguousarray(model.state_scale, float),
             int(model.work_size),
             np.ascontiguousarray(model.noise_places, np.int64),
+            side_by_side is not None,
+            *(side_by_side or (_no_drift, _no_readings)),
         )
 
 
@@ -173,10 +196,44 @@ class _Filter(NamedTuple):
     probe: Any  # a mean with one state moved
     moved: Any  # drift and readings there
     work: Any  # the model's scratch
+    lanes: Any  # Lanes of moved states
+    per_change: Any  # (width,) 1 / how far a state is moved, 0 beyond the last
+
+
+class Lanes(NamedTuple):
+    """What the model takes and gives of SIMD_WIDTH states, inputs and vehicles, a column each."""
+
+    x: Any
+    u: Any
+    p: Any
+    work: Any
+    out: Any
+
+
+@compiled(makes_arrays=True)
+def lanes_of(nx, nu, p, work_size, readings):
+    """Lanes for so many states, inputs and readings, each with the parameters `p`."""
+    lanes = Lanes(
+        aligned(nx, SIMD_WIDTH), aligned(nu, SIMD_WIDTH), aligned(p.size, SIMD_WIDTH),
+        aligned(work_size, SIMD_WIDTH), aligned(nx + readings, SIMD_WIDTH),
+    )  # fmt: skip
+    for i in range(p.size):
+        for lane in range(SIMD_WIDTH):
+            lanes.p[i, lane] = p[i]
+    return lanes
+
+
+@compiled()
+def in_every_lane(values, out):
+    """Numbers (n,) into (n, SIMD_WIDTH)."""
+    for i in range(values.size):
+        for lane in range(SIMD_WIDTH):
+            out[i, lane] = values[i]
 
 
 MODEL = types.NamedTuple(
-    [STEP, MEASURE, STEP, boolean[::1], boolean[::1], _A, int64, int64[:, ::1]], CompiledModel
+    [STEP, MEASURE, STEP, boolean[::1], boolean[::1], _A, int64, int64[:, ::1], boolean, LANES_STEP,
+     LANES_MEASURE], CompiledModel
 )  # fmt: skip
 RUN_DATA = types.NamedTuple([_A, _M, _M], RunData)
 VARIANCES = types.NamedTuple([_A, _M, _A, _A, _A], Variances)
@@ -211,13 +268,37 @@ def differences(flow, x, u, dt, p, work, scale, base, probe, moved, out):
             probe[i] = x[i]
         probe[j] += scale[j]
         flow(probe, u, dt, p, work, moved)
+        per_change = 1.0 / scale[j]
         for i in range(base.size):
-            out[i, j] = (moved[i] - base[i]) / scale[j]
+            out[i, j] = (moved[i] - base[i]) * per_change
+
+
+@compiled(**REORDER)
+def _linearise_in_lanes(model, u, dt, w):
+    """`_linearise` with SIMD_WIDTH states moved at once; after the last comes one that is not."""
+    nx, blocks = w.x.size, np.uint64(w.per_change.size // SIMD_WIDTH)
+    out, table, per_change = simd_blocks(w.lanes.out), simd_blocks(w.AH), simd_blocks(w.per_change)
+    in_every_lane(u, w.lanes.u)
+    for b in range(nx // SIMD_WIDTH + 1):
+        first = b * SIMD_WIDTH
+        in_every_lane(w.x, w.lanes.x)
+        for j in range(first, min(first + SIMD_WIDTH, nx)):
+            w.lanes.x[j, j - first] += model.scale[j]
+        model.drift_of_lanes(w.lanes.x, w.lanes.u, dt, w.lanes.p, w.lanes.work, w.lanes.out)
+        for i in range(np.uint64(w.base.size)):
+            table[i * blocks + np.uint64(b)] = out[i]
+    for i in range(np.uint64(w.base.size)):
+        w.base[i] = base = w.AH[i, nx]
+        for b in range(blocks):
+            table[i * blocks + b] = (table[i * blocks + b] - base) * per_change[b]
 
 
 @compiled(**REORDER)
 def _linearise(model, u, dt, p, w):
     """Jacobians of the drift and of the readings at the mean, one under the other, into AH."""
+    if model.has_lanes and w.per_change.size > w.x.size:
+        _linearise_in_lanes(model, u, dt, w)
+        return
     model.drift_and_readings(w.x, u, dt, p, w.work, w.base)
     differences(
         model.drift_and_readings, w.x, u, dt, p, w.work, model.scale, w.base, w.probe, w.moved, w.AH
@@ -256,19 +337,17 @@ def exponential(exact, A, AA, F):
         return False
     find_non_zeros(A)
     multiply(A, A.values, AA)
-    width = F.values.shape[1]
-    for i in range(nx):
-        if exact[i]:
-            for j in range(width):
-                F.values[i, j] = A.values[i, j]
-        else:
-            for j in range(width):
-                F.values[i, j] = A.values[i, j] + 0.5 * AA[i, j]
-            for c in range(A.counts[i]):
-                a = A.places[i, c]
-                weight = A.values[i, a] / 6.0
-                for j in range(width):
-                    F.values[i, j] += weight * AA[a, j]
+    blocks = np.uint64(F.values.shape[1] // SIMD_WIDTH)
+    first, second, all_of_them = simd_blocks(A.values), simd_blocks(AA), simd_blocks(F.values)
+    for i in range(np.uint64(nx)):
+        for b in range(blocks):
+            total = first[i * blocks + b]
+            if not exact[i]:
+                total += 0.5 * second[i * blocks + b]
+                for c in range(A.counts[i]):
+                    a = np.uint64(A.places[i, c])
+                    total += A.values[i, a] / 6.0 * second[a * blocks + b]
+            all_of_them[i * blocks + b] = total
         F.values[i, i] += 1.0
     find_non_zeros(F)
     return True
@@ -325,6 +404,10 @@ def _gate(z, R, gate, log_likelihood, w):
     beyond = 0
     for i in range(z.size):
         if not math.isnan(z[i]):
+            w.noise[i] = R[i]
+            w.beyond[i] = 0.0
+            if w.v[i] * w.v[i] <= gate * gate * R[i]:
+                continue  # however well the state is known
             variance = R[i]
             for c in range(w.H.counts[i]):
                 a = w.H.places[i, c]
@@ -333,8 +416,6 @@ def _gate(z, R, gate, log_likelihood, w):
                     b = w.H.places[i, d]
                     total += w.P[a, b] * w.H.values[i, b]
                 variance += total * w.H.values[i, a]
-            w.noise[i] = R[i]
-            w.beyond[i] = 0.0
             if w.v[i] * w.v[i] > gate * gate * variance:
                 inflated = w.v[i] * w.v[i] / (gate * gate)
                 log_likelihood -= 0.5 * (gate * gate - 1.0) * math.log(inflated / variance)
@@ -347,26 +428,31 @@ def _gate(z, R, gate, log_likelihood, w):
 @compiled(forceinline=True, **REORDER)
 def _correct(i, w):
     """Take in reading `i` of a row: x = x + K v, P = P - K H P; returns v and s^2."""
-    nx, width = w.x.size, w.HP.size
-    for j in range(width):
-        w.HP[j] = 0.0
+    nx, blocks = np.uint64(w.x.size), np.uint64(w.HP.size // SIMD_WIDTH)
+    P, HP = simd_blocks(w.P), simd_blocks(w.HP)
     variance = w.noise[i]
     residual = w.v[i]
     for c in range(w.H.counts[i]):
         a = w.H.places[i, c]
-        weight = w.H.values[i, a]
-        residual -= weight * (w.x[a] - w.predicted[a])
-        for j in range(width):
-            w.HP[j] += weight * w.P[a, j]
+        residual -= w.H.values[i, a] * (w.x[a] - w.predicted[a])
+    for b in range(blocks):
+        total = 0.0
+        for c in range(w.H.counts[i]):
+            a = np.uint64(w.H.places[i, c])
+            total += w.H.values[i, a] * P[a * blocks + b]
+        HP[b] = total
     for c in range(w.H.counts[i]):
         a = w.H.places[i, c]
         variance += w.HP[a] * w.H.values[i, a]
     if variance > 0.0:
+        per_variance = 1.0 / variance
         for a in range(nx):
-            w.K[a] = weight = w.HP[a] / variance
+            w.K[a] = weight = w.HP[a] * per_variance
             w.x[a] += weight * residual
-            for j in range(width):
-                w.P[a, j] -= weight * w.HP[j]
+        for b in range(blocks):
+            left = HP[b]
+            for a in range(nx):
+                P[a * blocks + b] -= w.K[a] * left
     return residual, variance
 
 
@@ -537,19 +623,24 @@ def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
     """
     nx, m = assumed.x0.size, assumed.R.size
     width = padded(nx)
-    P = np.zeros((nx, width))
+    P = aligned(nx, width)
     P[:, :nx] = assumed.P0
-    AH = np.zeros((nx + m, width))
+    AH = aligned(nx + m, width)
+    scratch = model.work_size if model.has_lanes else 0
     w = _Filter(
         x=assumed.x0.copy(), P=P, predicted=np.zeros(nx), x_next=np.zeros(nx), h=np.zeros(m),
         v=np.zeros(m), noise=np.zeros(m), beyond=np.zeros(m), Q=np.zeros(assumed.q.size),
-        K=np.zeros(nx), HP=np.zeros(width),
-        H=with_places(np.zeros((m, nx)), nx), F=with_places(np.zeros((nx, width)), nx),
-        A=with_places(AH[:nx], nx), AA=np.zeros((nx, width)), AH=AH,
-        FP=np.zeros((nx, width)), PF=np.zeros((nx, width)),
+        K=np.zeros(nx), HP=aligned(1, width)[0],
+        H=with_places(aligned(m, width), nx), F=with_places(aligned(nx, width), nx),
+        A=with_places(AH[:nx], nx), AA=aligned(nx, width), AH=AH,
+        FP=aligned(nx, width), PF=aligned(nx, width),
         base=np.zeros(nx + m), probe=np.zeros(nx), moved=np.zeros(nx + m),
         work=np.zeros(model.work_size),
+        lanes=lanes_of(nx, run.u.shape[1], p, scratch, m),
+        per_change=aligned(1, width)[0],
     )  # fmt: skip
+    for j in range(nx):
+        w.per_change[j] = 1.0 / model.scale[j]
     return _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w)
 
 

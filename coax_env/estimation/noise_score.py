@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import float64, int64, types
 
-from coax_env.estimation.kalman import _A, _M, _N, TRACE, growth
+from coax_env.estimation.kalman import _A, _M, _N, SAME_STEP, TRACE, growth
 from coax_env.estimation.sparse import (
     REORDER,
+    aligned,
     find_non_zeros,
     multiply,
     padded,
@@ -16,6 +17,10 @@ from coax_env.estimation.sparse import (
     with_places,
 )
 from coax_env.kernel.compilation import compiled
+from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
+
+FEW = 4
+"""Non-zeros of a reading's Jacobian of which each is taken by itself; ours."""
 
 
 @compiled(**REORDER)
@@ -36,26 +41,38 @@ def _reading_back(b, e, per_sigma, gain, H, K, NK, r, N):
     nx, width = r.size, NK.size
     pull = e * per_sigma
     curve = per_sigma * per_sigma
-    for j in range(width):
-        NK[j] = 0.0
+    rows, product = simd_blocks(N), simd_blocks(NK)
+    blocks = np.uint64(width // SIMD_WIDTH)
     for i in range(nx):
         K[i] = gain[i]
         pull -= K[i] * r[i]
-        for j in range(width):
-            NK[j] += K[i] * N[i, j]
+    for block in range(blocks):
+        total = 0.0
+        for i in range(np.uint64(nx)):
+            total += K[i] * rows[i * blocks + block]
+        product[block] = total
     for j in range(width):
         curve += K[j] * NK[j]
     for c in range(H.counts[b]):
         j = H.places[b, c]
         NK[j] -= 0.5 * curve * H.values[b, j]
         r[j] += H.values[b, j] * pull
+    few = H.counts[b] < FEW
     for c in range(H.counts[b]):
         a = H.places[b, c]
         weight = H.values[b, a]
-        for j in range(width):
-            N[a, j] -= weight * NK[j]
-        for i in range(nx):
-            N[i, a] -= weight * NK[i]
+        for block in range(blocks):
+            rows[np.uint64(a) * blocks + block] -= weight * product[block]
+        if few:
+            for i in range(nx):
+                N[i, a] -= weight * NK[i]
+    if not few:
+        row = simd_blocks(H.values)
+        at = np.uint64(b) * blocks
+        for block in range(blocks):
+            left = row[at + block]
+            for i in range(np.uint64(nx)):
+                rows[i * blocks + block] -= NK[i] * left
     return 0.5 * pull * pull, 0.5 * curve
 
 
@@ -90,6 +107,9 @@ class _Backward(NamedTuple):
     B: Any  # F' N
     NF: Any
     F: Any  # Sparse, transposed
+    NFP: Any  # F' N times a row of the covariance
+    grown: Any  # what noise of unit intensity adds in a row, by entry
+    left: Any  # and dt exp(-2 decay dt)
 
 
 @compiled(**REORDER)
@@ -123,30 +143,41 @@ def _decay_slope(g, x, P, dt, w):
     smoothed = x
     for j in range(w.r.size):
         smoothed += P[j] * w.r[j]
+    rows, product = simd_blocks(w.B), simd_blocks(w.NFP)
+    blocks = np.uint64(w.NFP.size // SIMD_WIDTH)
+    for block in range(blocks):
+        known = 0.0
+        for j in range(np.uint64(w.r.size)):
+            known += float64(P[j]) * rows[j * blocks + block]
+        product[block] = known
     total = 0.0
     for c in range(w.F.counts[g]):
         i = w.F.places[g, c]
-        NFP = 0.0
-        for j in range(w.r.size):
-            NFP += w.B[j, i] * P[j]
         share = -dt if i == g else -0.5 * dt
-        total += share * w.F.values[g, i] * (w.r_next[i] * smoothed - NFP)
+        total += share * w.F.values[g, i] * (w.r_next[i] * smoothed - w.NFP[i])
     return total
 
 
 @compiled(**REORDER)
-def _noise_slopes(places, q, decay, dt, w, in_noise, in_decay, expected):
+def _grow(decay, dt, w):
+    """What a row of `dt` seconds adds, into `grown` and `left`."""
+    for e in range(decay.size):
+        w.grown[e] = growth(dt, decay[e])
+        w.left[e] = dt * math.exp(-2.0 * decay[e] * dt)
+
+
+@compiled(**REORDER)
+def _noise_slopes(places, q, decay, w, in_noise, in_decay, expected):
     """Slopes through what a row's process noise adds to the covariance."""
     for e in range(q.size):
         i, j = places[e, 0], places[e, 1]
         weight = 0.5 if i == j else 1.0
         slope = weight * (w.r[i] * w.r[j] - w.N[i, j])
-        grown = growth(dt, decay[e])
+        grown = w.grown[e]
         in_noise[e] += slope * grown
         expected[e] += weight * w.N[i, j] * grown
         if decay[e] > 0.0:
-            left = dt * math.exp(-2.0 * decay[e] * dt)
-            in_decay[e] += slope * q[e] * (left - grown) / decay[e]
+            in_decay[e] += slope * q[e] * (w.left[e] - grown) / decay[e]
 
 
 @compiled(
@@ -172,19 +203,24 @@ def score_pass(dt, trace, places, q, decay, gate, refresh, block, out):
     nx = out.in_start.size
     width = padded(nx)
     w = _Backward(
-        r=np.zeros(nx), N=np.zeros((nx, width)), r_next=np.zeros(nx), B=np.zeros((nx, width)),
-        NF=np.zeros((nx, width)), F=with_places(np.zeros((nx, nx)), nx),
+        r=np.zeros(nx), N=aligned(nx, width), r_next=np.zeros(nx), B=aligned(nx, width),
+        NF=aligned(nx, width), F=with_places(aligned(nx, width), nx),
+        NFP=aligned(1, width)[0], grown=np.zeros(q.size), left=np.zeros(q.size),
     )  # fmt: skip
-    NK = np.zeros(width)
+    dt_of_growth = -1.0
+    NK = aligned(1, width)[0]
     K = np.zeros(width)
-    H = with_places(np.zeros((m, nx)), nx)
+    H = with_places(aligned(m, width), nx)
     F_slot = H_slot = -1
     reading = gains.per_sigma.size
     beyond = 0.5 * (gate * gate - 1.0)
     for k in range(n - 1, -1, -1):
         if k < n - 1:
+            if abs(dt[k] - dt_of_growth) > SAME_STEP * dt[k]:
+                _grow(decay, dt[k], w)
+                dt_of_growth = dt[k]
             _noise_slopes(
-                places, q, decay, dt[k], w, out.in_noise[block[k]], out.in_decay[block[k]],
+                places, q, decay, w, out.in_noise[block[k]], out.in_decay[block[k]],
                 out.noise_expected,
             )  # fmt: skip
             if path.F_of[k] != F_slot:

@@ -7,13 +7,14 @@ the end itself, its last one within the final TAIL seconds is used, at its own t
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
 from coax_env.estimation import kalman
 from coax_env.estimation.engine import Engine, Progress, RunPass
@@ -24,7 +25,7 @@ from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import Noise
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model import state as S
-from coax_env.model.layout import CHANNEL_UNITS, CHANNELS, GUSTS, N_FULL
+from coax_env.model.layout import CHANNEL_UNITS, CHANNELS, GUSTS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 
@@ -260,8 +261,8 @@ def _spread(
     first = run.start_rows[s]
     base = np.full(len(CHANNELS), np.nan)
     moved = np.full(len(CHANNELS), np.nan)
-    sensitivity = np.zeros((len(CHANNELS), N_FULL))
     x0 = run.states[first].copy()
+    sensitivity = np.zeros((len(CHANNELS), x0.size))
     x0[GUSTS] = 0.0
 
     def fly(x: np.ndarray, out: np.ndarray) -> None:
@@ -297,6 +298,7 @@ def replay(
     vehicle: Vehicle | str | Path | None = None,
     horizon: float = 1.0,
     progress: Progress | None = None,
+    waive: Collection[str] = (),
 ) -> Replay:
     """What the simulation of this vehicle gets wrong on this flight, per run and channel.
 
@@ -305,10 +307,15 @@ def replay(
         vehicle: a Vehicle, name or path; default the card's.
         horizon: seconds flown open loop.
         progress: called with a line of text.
+        waive: checks of the log with itself (consistency/) that are passed over, beside the card's.
+
+    Raises:
+        InputError: a log that contradicts itself, or no run that is long enough.
     """
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
     flight = flown_parts(flight, vehicle)
+    refuse_disagreement(flight, vehicle, waive)
     longest = max(run.duration for run in flight.runs)
     if longest < WARM_UP + horizon:
         raise InputError(

@@ -19,7 +19,7 @@ LAGS = 20  # readings back to which correlations are taken
 SETTLING = 1.0  # [s] at the start of each run that are not counted
 P_VALUE = 1e-5  # of all lags' chi square: long flights show correlations that do not matter
 SHARE = 0.04  # of a channel's innovation variance that its own past predicts
-SPREAD = 1.25  # std of whitened innovations (1 where model and noise are right)
+SPREAD = 1.25  # std of whitened innovations (1 where model and noise are right), if no chance
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,8 @@ def _judge(parts: Sequence[tuple[str, np.ndarray]]) -> Whiteness:
         share = float(np.clip(predictor @ rho - LAGS / n, 0.0, 1.0))
         p = float(chi2.sf(q, LAGS)) * len(parts)
         spread = float(e.std())
-        white = not ((p < P_VALUE and share * min(spread, 1.0) ** 2 > SHARE) or spread > SPREAD)
+        wide = spread > SPREAD and chi2.sf(n * spread**2, n) * len(parts) < P_VALUE
+        white = not (wide or (p < P_VALUE and share * min(spread, 1.0) ** 2 > SHARE))
         judged = Whiteness(share, min(p, 1.0), spread, name, white)
         if worst is None or (worst.white, -worst.coloured_share) > (white, -share):
             worst = judged

@@ -13,6 +13,7 @@ from typing import Literal, overload
 
 import numpy as np
 
+from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine, Estimate
 from coax_env.estimation.fitted_vehicle import (
@@ -83,6 +84,7 @@ def identify(
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
     hold_out: Collection[str] = (),
+    waive: Collection[str] = (),
 ) -> Identification: ...
 
 
@@ -96,6 +98,7 @@ def identify(
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
     hold_out: Collection[str] = (),
+    waive: Collection[str] = (),
 ) -> TwoStep: ...
 
 
@@ -108,6 +111,7 @@ def identify(
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
     hold_out: Collection[str] = (),
+    waive: Collection[str] = (),
 ) -> Identification | TwoStep: ...
 
 
@@ -119,6 +123,7 @@ def identify(
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
     hold_out: Collection[str] = (),
+    waive: Collection[str] = (),
 ) -> Identification | TwoStep:
     """Fit a vehicle's numbers to a flight.
 
@@ -130,9 +135,12 @@ def identify(
         channels: to use; None: all that were measured.
         also: effects of the catalogue whose parameters are free too ("gyro_bias", say); for "ml".
         hold_out: runs that are not fitted; with some, they alone are flown again.
+        waive: checks of the log with itself (consistency/) that are passed over, beside the card's.
 
     Raises:
-        InputError: no such method, nothing to identify, or sensors missing that the method needs.
+        InputError: no such method, nothing to identify, a log that contradicts itself, or sensors
+        missing
+            that the method needs.
     """
     if method not in METHODS:
         raise InputError(f"no method {method!r}; there are {', '.join(METHODS)}")
@@ -141,8 +149,10 @@ def identify(
     if channels is not None:
         flight = with_channels(flight, channels)
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
-    flight, held = _split(flown_parts(flight, vehicle), hold_out)
-    known = (*flight.notes, *double_counting(flight, vehicle))
+    flight = flown_parts(flight, vehicle)
+    passed_over = refuse_disagreement(flight, vehicle, waive)
+    flight, held = _split(flight, hold_out)
+    known = (*flight.notes, *passed_over, *double_counting(flight, vehicle))
     if method == "paper":
         result = two_step(flight, vehicle, progress=report)
         return replace(result, remarks=(*known, *result.remarks))

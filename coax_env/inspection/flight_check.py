@@ -3,7 +3,7 @@
 Data flow::
 
     flight -> runs and channels: rates, gaps, frozen and saturated sensors (readings.py)
-           -> units and signs (units_and_signs.py)
+           -> whether the log agrees with itself (consistency/)
            -> effects that would show, own numbers it determines (learnable.py)
            -> the next step, as a command
 """
@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from coax_env.consistency.agreement import Agreement, agreement, change_words
 from coax_env.estimation.flown import flown_parts
 from coax_env.inspection.learnable import EffectCheck, OwnNumber, learnable
 from coax_env.inspection.readings import (
@@ -23,7 +24,6 @@ from coax_env.inspection.readings import (
     run_check,
     sensor_faults,
 )
-from coax_env.inspection.units_and_signs import unit_and_sign_faults
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
@@ -39,7 +39,9 @@ class FlightCheck:
     """Result of `check_flight`.
 
     missing: channels that no run has. repaired: what was done to the data while reading. suspicions: of
-    units, signs and sensors, in words. effects: of the catalogue, best shown first. undetermined:
+    units, signs and sensors, in words. waived: of them, those that the card passes over. unseen:
+    channels
+    whose sign no check could see. effects: of the catalogue, best shown first. undetermined:
     base parameters that these flights leave open, `directions` along what. not_believed: share of
     readings that the filter left out. next_step: in words, with a command.
     """
@@ -52,6 +54,8 @@ class FlightCheck:
     repaired: tuple[str, ...]
     unread: tuple[str, ...]
     suspicions: tuple[str, ...]
+    waived: tuple[str, ...]
+    unseen: tuple[str, ...]
     effects: tuple[EffectCheck, ...]
     own_numbers: tuple[OwnNumber, ...]
     undetermined: tuple[str, ...]
@@ -93,13 +97,14 @@ def check_flight(
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
     flight = flown_parts(flight, vehicle)
     channels = channel_checks(flight)
-    suspicions = [*unit_and_sign_faults(flight, vehicle), *sensor_faults(channels)]
+    found = agreement(flight, vehicle)
+    suspicions = [*contradictions(flight, found), *sensor_faults(channels)]
     if progress:
         progress("linearising along the records")
-    found = learnable(flight, vehicle)
-    if found.not_believed > NOT_BELIEVED and not suspicions:
+    learned = learnable(flight, vehicle)
+    if learned.not_believed > NOT_BELIEVED and not suspicions:
         suspicions.append(
-            f"{100 * found.not_believed:.0f} % of the readings are too far from what {label} would"
+            f"{100 * learned.not_believed:.0f} % of the readings are too far from what {label} would"
             " read to be believed: is it this vehicle, and are signs and units those of the contract?"
         )
     where = str(flight.path or "FLIGHT")
@@ -112,13 +117,27 @@ def check_flight(
         repaired=flight.notes,
         unread=flight.unread,
         suspicions=tuple(suspicions),
-        effects=found.effects,
-        own_numbers=found.own_numbers,
-        undetermined=found.undetermined,
-        directions=found.directions,
-        not_believed=found.not_believed,
-        next_step=_next_step(where, label, bool(suspicions), found.effects),
+        waived=tuple(f"{fault.check}: {fault.words}" for fault in found.waived),
+        unseen=found.unseen,
+        effects=learned.effects,
+        own_numbers=learned.own_numbers,
+        undetermined=learned.undetermined,
+        directions=learned.directions,
+        not_believed=learned.not_believed,
+        next_step=_next_step(where, label, bool(suspicions), learned.effects),
     )
+
+
+def contradictions(flight: Flight, found: Agreement) -> list[str]:
+    """What of a log contradicts itself, and what to change, in sentences."""
+    if not flight.channels:
+        unread = f" (not read: {', '.join(flight.unread)})" if flight.unread else ""
+        return [f"no sensor in it{unread}: name the columns of the sensors under [columns]"]
+    if not found.faults:
+        return []
+    said = [f"{fault.check}: {fault.words}" for fault in found.faults]
+    names = ",".join(fault.check for fault in found.faults)
+    return [*said, *change_words(found), f"If the log is right as it is: --waive {names}"]
 
 
 def _next_step(where: str, vehicle: str, suspect: bool, found: Sequence[EffectCheck]) -> str:

@@ -104,6 +104,22 @@ def view_rows(context: Any, builder: Any, source: types.Array, array: Any, row: 
     return impl_ret_borrowed(context, builder, row, rows)
 
 
+def view_flat(context: Any, builder: Any, source: types.Array, array: Any, row: types.Array,
+              element: ir.Type, size: int) -> Any:  # fmt: skip
+    """The memory of a contiguous array as a one-dimensional one of larger elements.
+
+    Args:
+        context, builder: numba's. source, array: the array's type and value.
+        row: type of the array that is returned. element: of one of its elements, of `size` bytes.
+    """
+    of = make_array(source)(context, builder, array)
+    per_element = context.get_constant(types.intp, size // 8)
+    count = builder.udiv(of.nitems, per_element)
+    data = builder.bitcast(of.data, element.as_pointer())
+    rows = _one_dimensional(context, builder, row, data, count, size, of.meminfo)
+    return impl_ret_borrowed(context, builder, row, rows)
+
+
 def stack_array(context: Any, builder: Any, row: types.Array, element: ir.Type, count: int,
                 size: int) -> Any:  # fmt: skip
     """A one-dimensional array on the stack, not set.

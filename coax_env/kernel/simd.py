@@ -15,19 +15,43 @@ Products and sums may be fused, so lanes agree with the scalar kernel to roundin
 """
 
 from coax_env.kernel.simd_math import sine_and_cosine, sines_and_cosines
-from coax_env.kernel.simd_operators import any_lane, bits_of, from_bits, negated, select
-from coax_env.kernel.simd_rows import gather, scatter, simd_scratch, simd_view, simd_view_uint64
+from coax_env.kernel.simd_operators import (
+    any_lane,
+    bits_of,
+    by_type,
+    from_bits,
+    is_register,
+    lane,
+    lanes,
+    negated,
+    select,
+)
+from coax_env.kernel.simd_rows import (
+    REGISTERS,
+    gather,
+    scatter,
+    simd_blocks,
+    simd_scratch,
+    simd_view,
+    simd_view_uint64,
+)
 from coax_env.kernel.simd_types import SIMD_WIDTH
 
 __all__ = [
+    "REGISTERS",
     "SIMD_WIDTH",
     "any_lane",
     "bits_of",
+    "by_type",
     "from_bits",
     "gather",
+    "is_register",
+    "lane",
+    "lanes",
     "negated",
     "scatter",
     "select",
+    "simd_blocks",
     "simd_scratch",
     "simd_view",
     "simd_view_uint64",

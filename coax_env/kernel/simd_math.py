@@ -1,12 +1,25 @@
-"""Sine, cosine, exponential and logarithm of SIMD registers, and of numbers where it is faster."""
+"""Sine, cosine, exponential, logarithm and powers of SIMD registers, and of numbers where it is faster;
+what is seldom needed lane by lane.
+"""
 
 import math
+import operator
 
 import numba
 import numpy as np
 
-from coax_env.kernel.simd_operators import INLINE, any_lane, bits_of, by_type, from_bits, select
-from coax_env.kernel.simd_types import SIMD_FLOAT64, SIMD_UINT64
+from coax_env.kernel.simd_operators import (
+    INLINE,
+    any_lane,
+    bits_of,
+    by_type,
+    from_bits,
+    is_register,
+    lane,
+    select,
+    with_lane,
+)
+from coax_env.kernel.simd_types import SIMD_FLOAT64, SIMD_UINT64, SIMD_WIDTH
 
 # --- angles ----------------------------------------------------------------------------------------
 
@@ -159,3 +172,45 @@ def _logarithm(x):
         return select(x > 0.0, (r + y) + exponent * 0.693359375, math.nan)
 
     return logarithm if x == SIMD_FLOAT64 else None
+
+
+@by_type(operator.pow)
+def _power(x, y):
+    """Powers of positive numbers, to a few 1e-16 times y ln x; NaN of what is not positive."""
+    return (lambda x, y: math.exp(y * math.log(x))) if is_register(x) else None
+
+
+# --- seldom needed: lane by lane --------------------------------------------------------------------
+
+
+@by_type(math.atan2)
+def _angle(y, x):
+    def angle(y, x):
+        out = 0.0 * x
+        for k in range(SIMD_WIDTH):
+            out = with_lane(out, k, math.atan2(lane(y, k), lane(x, k)))
+        return out
+
+    return angle if is_register(x) and is_register(y) else None
+
+
+@by_type(math.asin)
+def _arc_sine(x):
+    def arc_sine(x):
+        out = 0.0 * x
+        for k in range(SIMD_WIDTH):
+            out = with_lane(out, k, math.asin(lane(x, k)))
+        return out
+
+    return arc_sine if is_register(x) else None
+
+
+@by_type(math.tanh)
+def _hyperbolic_tangent(x):
+    def hyperbolic_tangent(x):
+        out = 0.0 * x
+        for k in range(SIMD_WIDTH):
+            out = with_lane(out, k, math.tanh(lane(x, k)))
+        return out
+
+    return hyperbolic_tangent if is_register(x) else None

@@ -17,6 +17,7 @@ from numba.extending import intrinsic, overload
 from coax_env.kernel.compilation import name_apart
 from coax_env.kernel.numba_internals import define_call, external_function
 from coax_env.kernel.simd_types import (
+    I32,
     SIMD_BOOLEAN,
     SIMD_FLOAT64,
     SIMD_UINT64,
@@ -72,6 +73,10 @@ def _any(builder: Any, flags: Any) -> Any:
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
+def _lanes(builder: Any, flags: Any) -> Any:
+    return builder.zext(builder.bitcast(flags, ir.IntType(SIMD_WIDTH)), ir.IntType(64))
+
+
 def _choose(sign: str) -> Callable:
     return lambda b, x, y: b.select(b.fcmp_ordered(sign, y, x), y, x)
 
@@ -99,6 +104,7 @@ _define(max, _TWO, SIMD_FLOAT64, _choose(">"))
 _define(min, _TWO, SIMD_FLOAT64, _choose("<"))
 _define(math.sqrt, _ONE, SIMD_FLOAT64, _llvm("sqrt"))
 _define(math.floor, _ONE, SIMD_FLOAT64, _llvm("floor"))
+_define(math.copysign, _TWO, SIMD_FLOAT64, _llvm("copysign"))
 _define(
     math.isfinite, _ONE, SIMD_BOOLEAN, lambda b, x: b.fcmp_ordered("<", _fabs(b, x), _INFINITE)
 )  # fmt: skip
@@ -138,6 +144,11 @@ def by_type(key: Any) -> Callable[[Callable], Callable]:
     return enter
 
 
+def is_register(kind: types.Type) -> bool:
+    """Whether a type is that of a register of doubles."""
+    return kind == SIMD_FLOAT64
+
+
 def select(flag: Any, yes: Any, no: Any) -> Any:
     """What stands for a branch: of one number, or of each lane by itself.
 
@@ -157,12 +168,17 @@ def any_lane(flag: Any) -> Any:
     return flag
 
 
+def lanes(flag: Any) -> Any:
+    """The lanes in which a flag is true, a bit each, as a number."""
+
+
 _define(
     select, (SIMD_BOOLEAN, SIMD_FLOAT64, SIMD_FLOAT64), SIMD_FLOAT64,
     lambda b, c, x, y: b.select(c, x, y),
 )  # fmt: skip
 _define(negated, (SIMD_BOOLEAN,), SIMD_BOOLEAN, lambda b, x: b.not_(x))
 _define(any_lane, (SIMD_BOOLEAN,), types.boolean, _any)
+_define(lanes, (SIMD_BOOLEAN,), types.int64, _lanes)
 
 
 @by_type(select)
@@ -182,6 +198,29 @@ def _any_lane_one(flag):
     if isinstance(flag, types.Boolean):
         return lambda flag: flag
     return None
+
+
+# --- lanes ---------------------------------------------------------------------------------------
+
+
+@intrinsic
+def lane(typingctx, register, k):
+    """The number in the k-th lane of a register."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.extract_element(args[0], builder.trunc(args[1], I32))
+
+    return types.float64(SIMD_FLOAT64, types.int64), emit
+
+
+@intrinsic
+def with_lane(typingctx, register, k, number):
+    """A register with another number in its k-th lane."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.insert_element(args[0], args[2], builder.trunc(args[1], I32))
+
+    return SIMD_FLOAT64(SIMD_FLOAT64, types.int64, types.float64), emit
 
 
 # --- bits ----------------------------------------------------------------------------------------

@@ -8,7 +8,13 @@ from numba import types
 from numba.extending import intrinsic
 
 from coax_env.kernel.compilation import compiled
-from coax_env.kernel.numba_internals import array_data, stack_array, unpack_tuple, view_rows
+from coax_env.kernel.numba_internals import (
+    array_data,
+    stack_array,
+    unpack_tuple,
+    view_flat,
+    view_rows,
+)
 from coax_env.kernel.simd_types import I32, SIMD_FLOAT64, SIMD_UINT64, SIMD_WIDTH, SimdType
 
 _REGISTER_BYTES = 8 * SIMD_WIDTH
@@ -16,6 +22,10 @@ _REGISTER_BYTES = 8 * SIMD_WIDTH
 
 def _row_of(kind: SimdType) -> types.Array:
     return types.Array(kind, 1, "C", aligned=False)
+
+
+REGISTERS = _row_of(SIMD_FLOAT64)
+"""numba's type of an array of registers."""
 
 
 def _view(kind: SimdType, source: types.Array) -> tuple[Any, Callable]:
@@ -39,6 +49,20 @@ def simd_view(typingctx, array):
 def simd_view_uint64(typingctx, array):
     """A contiguous array (n, SIMD_WIDTH) of 64-bit numbers as n registers, the same memory."""
     return _view(SIMD_UINT64, array)
+
+
+@intrinsic
+def simd_blocks(typingctx, array):
+    """A contiguous array of doubles as registers of SIMD_WIDTH neighbours, the same memory.
+
+    What is left of a last register is not in it: rows are best a multiple of SIMD_WIDTH long.
+    """
+    row, vector = _row_of(SIMD_FLOAT64), SIMD_FLOAT64.vector
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return view_flat(context, builder, array, args[0], row, vector, _REGISTER_BYTES)
+
+    return row(array), emit
 
 
 @intrinsic

@@ -1,8 +1,8 @@
-"""PX4 (ULog) and ArduPilot (DataFlash) logs as flights: columns, units and time stamps of flight.py.
+"""Logs of signals with clocks of their own - PX4's, ArduPilot's, ROS bags, MCAP - as flights.
 
 Data flow::
 
-    log -> signals, "topic.field" -> (t, values)         ulog.py, dataflash.py
+    log -> signals, "topic.field" -> (t, values)         ulog.py, dataflash.py, ros.py
         -> channels: the autopilot's own and what the caller takes from it       signals.py
         -> one row per IMU reading, thinned to at most ROWS a second -> Flight
 """
@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from coax_env.errors import InputError
-from coax_env.logs import dataflash, ulog
+from coax_env.logs import dataflash, ros, ulog
 from coax_env.logs.flight import Flight, Run
 from coax_env.logs.repairs import LONGEST_RUN, SHORTEST_RUN, hold_last
 from coax_env.logs.signals import COMMANDS, Signal, Taken, channels_of
+from coax_env.logs.units import BATTERY
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
 ROWS = 100.0
@@ -29,8 +30,14 @@ READERS: dict[str, tuple[Reader, dict[str, tuple[str, ...]]]] = {
     ".ulg": (ulog.px4_signals, ulog.CHANNEL_SIGNALS),
     ".bin": (dataflash.ardupilot_signals, dataflash.CHANNEL_SIGNALS),
     ".log": (dataflash.ardupilot_signals, dataflash.CHANNEL_SIGNALS),
+    ".bag": (ros.ros_signals, ros.CHANNEL_SIGNALS),
+    ".db3": (ros.ros_signals, ros.CHANNEL_SIGNALS),
+    ".mcap": (ros.ros_signals, ros.CHANNEL_SIGNALS),
+    "": (ros.ros_signals, ros.CHANNEL_SIGNALS),
 }
-"""How a log's name ends -> what reads it, and which of its signals are a flight's channels."""
+"""How a log's name ends -> what reads it, and which of its signals are a flight's channels.
+
+A folder is a ROS 2 bag, whatever its name."""
 
 
 def import_log(
@@ -39,10 +46,12 @@ def import_log(
     take: Mapping[str, Taken] | None = None,
     cuts: Sequence[tuple[float, float]] = (),
 ) -> Flight:
-    """A flight from an autopilot's log.
+    """A flight from a log of signals.
 
     Args:
-        path: ``.ulg`` (PX4), or ``.bin`` or ``.log`` (ArduPilot).
+        path: ``.ulg`` (PX4), ``.bin`` or ``.log`` (ArduPilot), ``.bag``, ``.db3`` or the folder of
+        a bag
+            (ROS), or ``.mcap``.
         vehicle: shipped name or file.
         take: channel -> where it comes from, for what the autopilot cannot know or is to be read
             otherwise.
@@ -52,13 +61,8 @@ def import_log(
         InputError: no such log, no rotor speeds in it, or a signal or channel that does not exist.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"no log at {path}")
-    if path.suffix.lower() not in READERS:
-        raise InputError(f"{path}: a log ends in {', '.join(READERS)}, found {path.suffix!r}")
-    read, table = READERS[path.suffix.lower()]
-    with _silence():
-        signals = read(path)
+    signals = signals_of(path)
+    _, table = _reader(path)
     channels = channels_of(signals, table, take or {}, path)
     begin = min(t[0] for t, _ in channels.values())
     channels = {name: (t - begin, values) for name, (t, values) in channels.items()}
@@ -69,6 +73,31 @@ def import_log(
     for k, (start, stop) in enumerate(cuts or [(0.0, end)], 1):
         runs.append(_run(f"run_{k}" if cuts else path.stem, channels, start, min(stop, end), path))
     return Flight(vehicle, tuple(runs))
+
+
+def signals_of(path: Path) -> dict[str, Signal]:
+    """Every signal of a log, ``topic.field``.
+
+    Raises:
+        InputError: no such log.
+    """
+    read, _ = _reader(path)
+    with _silence():
+        return read(path)
+
+
+def _reader(path: Path) -> tuple[Reader, dict[str, tuple[str, ...]]]:
+    if not path.exists():
+        raise InputError(f"no log at {path}")
+    if path.is_dir():
+        if not (path / "metadata.yaml").exists():
+            raise InputError(f"{path}: a folder, and no ROS 2 bag: no metadata.yaml in it")
+        return READERS[""]
+    ending = path.suffix.lower()
+    if not ending or ending not in READERS:
+        known = ", ".join(filter(None, READERS))
+        raise InputError(f"{path}: a log ends in {known}, found {path.suffix!r}")
+    return READERS[ending]
 
 
 def _run(name: str, channels: Mapping[str, Signal], start: float, stop: float, path: Path) -> Run:
@@ -100,7 +129,11 @@ def _run(name: str, channels: Mapping[str, Signal], start: float, stop: float, p
             raise InputError(f"{path}: no number among the values of {name_of} in run {name!r}")
         command[:, k] = hold_last(values)
     command[:, :2] /= RPM_PER_RAD_S
-    return Run(name, t - t[0], command, measured, "imported", f"from {path.name}")
+    battery = _held(channels[BATTERY], t) if BATTERY in channels else None
+    if battery is not None and not np.isfinite(battery).all():
+        battery = hold_last(battery) if np.isfinite(battery).any() else None
+    note = f"from {path.name}"
+    return Run(name, t - t[0], command, measured, "imported", note, battery=battery)
 
 
 def _held(signal: Signal, t: np.ndarray) -> np.ndarray:

@@ -6,12 +6,13 @@ log keeps what is right.
 
 import csv
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from coax_env.errors import InputError
 from coax_env.files import read_bytes, write_text
+from coax_env.logs.card_columns import quoted
 from coax_env.logs.units import LOG_UNITS, factor_to_canonical
 
 DELIMITERS = ",;\t"
@@ -60,8 +61,7 @@ class Guess:
 
     def line(self) -> str:
         """As an entry of a card's [columns]."""
-        name = self.name.replace("\\", "\\\\").replace('"', '\\"')
-        return f'{self.channel} = {{ name = "{name}", unit = "{self.unit}" }}'
+        return f'{self.channel} = {{ name = {quoted(self.name)}, unit = "{self.unit}" }}'
 
 
 def guesses(header: Iterable[str]) -> dict[str, Guess]:
@@ -134,7 +134,8 @@ def header_of(text: str) -> tuple[list[str], str]:
 
 
 def draft_card(folder: str | Path, vehicle: str) -> tuple[Path, list[Guess]]:
-    """A first card.toml for a folder of CSVs: a run per file, and a guess where names are foreign.
+    """A first card.toml for a folder of CSVs: a run per file, and every column, guessed or
+    commented out.
 
     Returns:
         the card, and the guesses in it, which somebody must look at.
@@ -149,18 +150,52 @@ def draft_card(folder: str | Path, vehicle: str) -> tuple[Path, list[Guess]]:
     files = sorted(p for p in folder.glob("*") if p.suffix.lower() in (".csv", ".tsv", ".txt"))
     if not files:
         raise InputError(f"no CSV in {folder}: put one in for every run, then draft its card")
-    headers = [header_of(read_bytes(f).decode("utf-8-sig", "replace"))[0] for f in files]
-    names = list(dict.fromkeys(name for header in headers for name in header if name))
-    drawn = [g for g in guesses(names).values() if (g.name, g.unit) != (g.channel, _own(g))]
-    lines = ["[vehicle]", f'name = "{vehicle}"', ""]
-    if drawn:
-        lines += ["[columns]  # guessed from the names: look at every line, above all at the units"]
-        lines += [g.line() for g in drawn] + [""]
-    for file in files:
-        stem = file.stem.replace("\\", "_").replace('"', "_")
-        lines += ["[[run]]", f'name = "{stem}"', f'file = "{file.name}"', 'maneuver = ""', ""]
-    write_text(card, "\n".join(lines))
-    return card, drawn
+    headers = {f.name: header_of(read_bytes(f).decode("utf-8-sig", "replace"))[0] for f in files}
+    text, guessed = draft_text(vehicle, headers)
+    write_text(card, text)
+    return card, guessed
+
+
+def draft_text(vehicle: str, headers: Mapping[str, Sequence[str]]) -> tuple[str, list[Guess]]:
+    """A first card: a run per file, and every column found, guessed or commented out.
+
+    Args:
+        vehicle: shipped name or file.
+        headers: file -> its columns.
+
+    Returns:
+        the card's text, and the guesses in it where a column is not as the channel.
+    """
+    names = list(dict.fromkeys(name for header in headers.values() for name in header if name))
+    found = guesses(names)
+    drawn = [g for g in found.values() if (g.name, g.unit) != (g.channel, _own(g))]
+    taken = {g.name for g in found.values()}
+    missing = [c for c in LOG_UNITS if c not in found]
+    lines = ["[vehicle]", f"name = {quoted(vehicle)}", ""]
+    lines += [
+        "[columns]  # guessed from the names: look at every line, at the units and signs above all"
+    ]
+    for channel, guess in found.items():
+        own = guess not in drawn
+        lines.append(f"# {channel}: as it is, in {_own(guess)}" if own else guess.line())
+    lines += [
+        f"# CHANNEL = {{ name = {quoted(n)} }}  # not recognised" for n in names if n not in taken
+    ]
+    lines += [f'# {c} = {{ name = "..." }}  # not found, in {LOG_UNITS[c]}' for c in missing]
+    lines += [
+        "# a key each, where needed: unit, sign = -1, offset, scale, calibration = [[raw, value], ...]",
+        "",
+    ]
+    for file in headers:
+        stem = Path(file).stem
+        lines += [
+            "[[run]]",
+            f"name = {quoted(stem)}",
+            f"file = {quoted(file)}",
+            'maneuver = ""',
+            "",
+        ]
+    return "\n".join(lines), drawn
 
 
 def _own(guess: Guess) -> str:

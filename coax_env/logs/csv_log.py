@@ -12,9 +12,10 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.files import read_text
-from coax_env.logs.card import Column
+from coax_env.logs.card_columns import Column, Quaternion
 from coax_env.logs.columns import advice, header_of
-from coax_env.logs.units import LOG_UNITS
+from coax_env.logs.frames import attitude
+from coax_env.logs.units import LOG_UNITS, PLACE_UNITS
 
 BEYOND_ALL = 1e20
 """No reading in any unit is larger; what is, is a bit error and dropped."""
@@ -25,11 +26,12 @@ class CsvLog:
     """A CSV, read.
 
     Attributes:
-        data: channel or command, ``t`` among them -> (n,) in its canonical unit (units.py).
+        data: channel or command, ``t`` among them -> (n,) in its canonical unit (units.py); also lat
+            and lon [deg] where the card names them.
         lines: the line of the file that each row ends on, n of them.
         header: names of all columns.
         time_column: the name of the one with the time.
-        renamed: channels that were found under the name that the card gives.
+        renamed: channels that were found under the name that the card gives; "quaternion" too.
         unknown: columns that are no channel.
         beyond: readings dropped because no reading is so large.
     """
@@ -54,19 +56,22 @@ class _Cells:
     lines: list[int]
 
 
-def read_csv(path: Path, columns: Mapping[str, Column]) -> CsvLog:
+def read_csv(
+    path: Path, columns: Mapping[str, Column], quaternion: Quaternion | None = None
+) -> CsvLog:
     """Read one run's CSV.
 
     Args:
         path: the file; comma, semicolon or tab between cells, names in the first row.
         columns: channel -> its column, where that has another name or unit than the channel.
+        quaternion: the attitude's columns, where it is one.
 
     Raises:
         InputError: one line naming the file, and the line or column at fault.
     """
     cells = _split(path, read_text(path))
     index = {name: k for k, name in enumerate(cells.header) if name}
-    asked = {c: columns.get(c, Column(c, 1.0)) for c in LOG_UNITS}
+    asked = _asked(columns, quaternion)
     found = {channel: column for channel, column in asked.items() if column.name in index}
     if "t" not in found:
         raise InputError(f"{path}: no time column {asked['t'].name!r}; {advice(index, ['t'])}")
@@ -80,18 +85,41 @@ def read_csv(path: Path, columns: Mapping[str, Column]) -> CsvLog:
             raise InputError(f"{path}, line {cells.lines[row]}: {values[row]:.3g} is no time")
         values[far] = np.nan
         beyond += int(np.count_nonzero(far))
-        data[channel] = column.factor * values
+        data[channel] = column.read(values)
     taken = {column.name for column in found.values()}
+    renamed = found.keys() & columns.keys()
+    if quaternion is not None and index.keys() >= set(quaternion.names):
+        q = np.stack([_numbers(cells, index[name], name) for name in quaternion.names], axis=1)
+        data |= dict(zip(("phi", "theta", "psi"), attitude(q, quaternion.frames), strict=True))
+        taken |= set(quaternion.names)
+        renamed = renamed | {"quaternion"}
     return CsvLog(
         path=path,
         data=data,
         lines=cells.lines,
         header=cells.header,
         time_column=found["t"].name,
-        renamed=frozenset(found.keys() & columns.keys()),
+        renamed=frozenset(renamed),
         unknown=[name for name in index if name not in taken],
         beyond=beyond,
     )
+
+
+def _asked(columns: Mapping[str, Column], quaternion: Quaternion | None) -> dict[str, Column]:
+    """Channel -> the column to look for: the card's, else its namesake where no other channel has
+    that."""
+    claimed = {column.name for column in columns.values()}
+    asked = dict(columns)
+    if quaternion is not None:
+        claimed |= {*quaternion.names, "phi", "theta", "psi"}
+    for place, channel in (("lat", "pn"), ("lon", "pe")):
+        if place in columns:
+            claimed.add(channel)
+    for channel in LOG_UNITS:
+        if channel not in asked and channel not in claimed:
+            asked[channel] = Column.own(channel)
+    asked.setdefault("t", Column.own("t"))
+    return {c: asked[c] for c in (*LOG_UNITS, *PLACE_UNITS) if c in asked}
 
 
 def _split(path: Path, text: str) -> _Cells:

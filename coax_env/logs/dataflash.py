@@ -16,6 +16,7 @@ CHANNEL_SIGNALS: dict[str, tuple[str, ...]] = {
     "h": ("RFND.Dist", "RFND.Dist1"),
     "vn": ("XKF1.VN", "NKF1.VN"), "ve": ("XKF1.VE", "NKF1.VE"), "vd": ("XKF1.VD", "NKF1.VD"),
     "pn": ("XKF1.PN", "NKF1.PN"), "pe": ("XKF1.PE", "NKF1.PE"),
+    "battery_v": ("BAT.Volt", "CURR.Volt"),
     "rpm_upper": ("RPM.rpm1", "ESC.RPM"), "rpm_lower": ("RPM.rpm2", "ESC.RPM[1]"),
 }  # fmt: skip
 """Channel -> signals of a log that hold it, the best first; SI and FRD, but ATT in degrees."""

@@ -1,8 +1,35 @@
 """A flight: a folder with a test card (``card.toml``) and one CSV log per run, read and written.
 
+A CSV has a row of names, then a row per time stamp; comma, semicolon or tab between cells, an
+empty cell where
+there is no new reading (an empty command holds the last one). Only ``t``, both rotor speeds -
+commanded or measured - and both swash commands are needed; of the rest any subset:
+
+    ============================ ======= =============================================================
+    column                       unit    what it is
+    ============================ ======= =============================================================
+    t                            s       time, from any beginning, never backwards
+    rpm_upper_cmd, rpm_lower_cmd rev/min commanded rotor speeds
+    rpm_upper, rpm_lower         rev/min measured rotor speeds
+    delta_lon                    rad     swash tilt: > 0 tilts the thrust back, nose up
+    delta_lat                    rad     swash tilt: > 0 tilts the thrust to the right, right side down
+    battery_v                    V       battery voltage
+    p, q, r                      rad/s   gyros: body x forward, y right, z down
+    ax, ay, az                   m/s2    accelerometers, specific force: az = -g in hover
+    phi, theta, psi              rad     roll to the right, nose up, heading from north over east
+    h                            m       height of the centre of gravity above ground, up
+    vn, ve, vd                   m/s     velocity north, east, down
+    pn, pe                       m       position north, east
+    v                            m/s     speed, unsigned
+    ============================ ======= =============================================================
+
+The card says the vehicle, the runs, and how the columns differ from that; README.md beside this
+file has one with every key.
+
 Bad input raises :class:`InputError`, one line naming file, line or channel. What a real log brings
-along - outliers, gaps, dropouts, repeated time stamps, impossible commands - is repaired (repairs.py),
-counted and reported in :attr:`Flight.notes`.
+along - outliers, gaps, dropouts, repeated time stamps, impossible commands, held and interpolated
+samples - is
+repaired (repairs.py), counted and reported in :attr:`Flight.notes`.
 """
 
 import hashlib
@@ -19,10 +46,15 @@ import tomlkit
 from coax_env.errors import InputError
 from coax_env.files import read_bytes, staged_folder, write_text
 from coax_env.logs.card import CARD, Card, read_card
-from coax_env.logs.csv_log import read_csv
+from coax_env.logs.card_columns import Column, Quaternion
+from coax_env.logs.csv_log import CsvLog, read_csv
+from coax_env.logs.frames import place
 from coax_env.logs.repairs import repaired
 from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
+
+FLIGHTS = Path(__file__).parent / "flights"
+"""Where shipped flights lie, each a folder."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +70,7 @@ class Run:
         part_of: the card's run of which it is a part (estimation/flown.py); empty where it is whole.
         began: time at which that one began [s]; None: with the first row.
         battery: (n,) voltage, the last sample held [V]; None where none was logged.
+        part: "A" or "B", of a flight whose parts are to be compared; else empty.
     """
 
     name: str
@@ -49,6 +82,7 @@ class Run:
     part_of: str = ""
     began: float | None = None
     battery: np.ndarray | None = None
+    part: str = ""
 
     @property
     def whole(self) -> str:
@@ -78,6 +112,9 @@ class Flight:
         counts: the same as numbers, e.g. ``{"outliers in h": 12}``.
         hashes: file name -> SHA-256, to recognise data that was used before.
         unread: columns of the files that are no channel and were ignored.
+        columns: channel -> the column that the card names for it.
+        quaternion: the attitude's columns, where it was logged as one.
+        waived: checks of the log with itself (consistency/) that the card passes over.
     """
 
     vehicle: str
@@ -89,6 +126,9 @@ class Flight:
     counts: Mapping[str, int] = field(default_factory=dict)
     hashes: Mapping[str, str] = field(default_factory=dict)
     unread: tuple[str, ...] = ()
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    quaternion: Quaternion | None = None
+    waived: tuple[str, ...] = ()
 
     @property
     def run_names(self) -> tuple[str, ...]:
@@ -117,24 +157,28 @@ class Flight:
 
 
 def read_flight(path: str | Path) -> Flight:
-    """Read a flight folder.
+    """Read a flight folder, or a shipped one by its name (``"windy"``).
 
     Raises:
         InputError: one line naming the file and line, channel or field at fault.
     """
     folder = Path(path)
+    if len(folder.parts) == 1 and not folder.exists() and (FLIGHTS / folder).is_dir():
+        folder = FLIGHTS / folder
     if folder.name == CARD:
         folder = folder.parent
     _check_folder(folder)
     card = read_card(folder / CARD)
     hashes = {CARD: _hash(folder / CARD)}
-    counts: Counter[str] = Counter(card.counts)
+    counts: Counter[str] = Counter()
     renamed: set[str] = set()
     unread: dict[str, None] = {}  # in the order of the files
     runs = []
+    origin: tuple[float, float] | None = None
     for entry in card.runs:
         file = folder / entry.file
-        log = read_csv(file, card.columns)
+        log = read_csv(file, card.columns, card.quaternion)
+        log, origin = _with_position(log, origin)
         hashes[entry.file] = _hash(file)
         renamed |= log.renamed
         unread |= dict.fromkeys(log.unknown)
@@ -148,6 +192,7 @@ def read_flight(path: str | Path) -> Flight:
                 entry.maneuver,
                 entry.note,
                 battery=data.battery,
+                part=entry.part,
             )
         )
     _check_columns(folder, card, renamed, unread)
@@ -161,15 +206,37 @@ def read_flight(path: str | Path) -> Flight:
         counts=dict(counts),
         hashes=hashes,
         unread=tuple(unread),
+        columns=card.columns,
+        quaternion=card.quaternion,
+        waived=card.waived,
     )
+
+
+def _with_position(
+    log: CsvLog, origin: tuple[float, float] | None
+) -> tuple[CsvLog, tuple[float, float] | None]:
+    """With pn and pe in place of lat and lon; the origin is the flight's first place."""
+    if not {"lat", "lon"} <= log.data.keys():
+        return log, origin
+    data = dict(log.data)
+    lat, lon = (np.radians(data.pop(name)) for name in ("lat", "lon"))
+    known = np.isfinite(lat) & np.isfinite(lon)
+    if origin is None and known.any():
+        first = int(np.argmax(known))
+        origin = (float(lat[first]), float(lon[first]))
+    data["pn"], data["pe"] = place(lat, lon, origin or (0.0, 0.0))
+    return replace(log, data=data), origin
 
 
 def _check_columns(folder: Path, card: Card, renamed: Iterable[str], unread: Iterable[str]) -> None:
     """Refuse a card that names columns which no run has."""
-    for channel, column in card.columns.items():
+    asked = {channel: repr(column.name) for channel, column in card.columns.items()}
+    if card.quaternion is not None:
+        asked["quaternion"] = ", ".join(map(repr, card.quaternion.names))
+    for channel, name in asked.items():
         if channel not in renamed:
             raise InputError(
-                f"{folder / CARD}: channel {channel}: no run has a column {column.name!r}; not read:"
+                f"{folder / CARD}: channel {channel}: no run has a column {name}; not read:"
                 f" {', '.join(unread) or 'none'}"
             )
 
@@ -213,7 +280,8 @@ def write_flight(flight: Flight, path: str | Path) -> Path:
     with staged_folder(path) as stage:
         for run, file in zip(flight.runs, _file_names(flight.run_names), strict=True):
             entry = {"name": run.name, "file": file, "maneuver": run.maneuver}
-            entries.append(tomlkit.item(entry | ({"note": run.note} if run.note else {})))
+            said = {"note": run.note, "part": run.part}
+            entries.append(tomlkit.item(entry | {key: text for key, text in said.items() if text}))
             write_text(stage / file, _csv_text(run))
         card["run"] = entries
         write_text(stage / CARD, tomlkit.dumps(card))

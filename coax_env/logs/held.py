@@ -7,6 +7,8 @@ that moves by a step at a time. So what counts is the pattern over the whole run
 
 import numpy as np
 
+from coax_env.logs.packets import stretches
+
 FEWEST = 10  # changes of value in a run, from which a pattern can be seen; ours
 LEAST_HELD = 0.95
 """Share of the values that a held channel shows more than once; ours."""
@@ -40,7 +42,7 @@ def repeats(values: np.ndarray, hold: bool | None = None) -> np.ndarray:
     inner = np.diff(starts)[1:]  # times that each value shows, without the first and the last one
     if inner.size < FEWEST:
         return found
-    if _is_held(inner, np.abs(np.diff(y[starts]))):
+    if _is_held(inner, np.abs(np.diff(y[starts]))) or _beyond_chance(y):
         found[present[again]] = True
     elif np.mean(inner > 1) <= MOST_REPEATED:
         for first, times in zip(starts[1:-1], inner, strict=True):
@@ -53,3 +55,75 @@ def _is_held(times: np.ndarray, steps: np.ndarray) -> bool:
     """Whether nearly every value shows more than once, and the next one is not just a step away."""
     leaps = np.mean(steps > COARSE_STEP * steps.min())
     return bool(np.mean(times > 1) >= LEAST_HELD and leaps >= LEAST_LEAPS)
+
+
+MOST_BY_CHANCE = 5.0
+"""Times as many repeats as there would be by chance, from which on they are held samples; ours."""
+NEARLY_ALL_LEAP = 0.9
+"""Share of the changes that are more than a step away where this is asked; ours."""
+
+
+def _beyond_chance(y: np.ndarray) -> bool:
+    """Whether repeats are far more than a sensor of this resolution makes: 80 Hz held on rows at
+    100 Hz.
+
+    By chance a sensor's next reading is the same as often as it is a given one of the two next to it.
+    """
+    step = np.abs(np.diff(y))
+    moved = step[step > 0.0]
+    if moved.size < FEWEST:
+        return False
+    beside = int(np.count_nonzero(moved <= COARSE_STEP * moved.min()))
+    same = step.size - moved.size
+    many = same > MOST_BY_CHANCE * (0.5 * beside + FEWEST) and same > MOST_REPEATED * step.size
+    return many and beside <= (1.0 - NEARLY_ALL_LEAP) * moved.size
+
+
+# --- straight lines between readings --------------------------------------------------------------
+
+LEAST_STRAIGHT = 0.3
+"""Share of the rows that lie on the line between their neighbours, from which on a channel was
+interpolated..."""
+LEAST_KINK = 3.0
+"""...if the others are off it by so many roundings; ours."""
+MOST_DIGITS = 9  # behind the point, in which a rounding is looked for
+
+
+def interpolated(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Where a channel's cells lie on a straight line between readings, and are none, (n,) bool.
+
+    Resampling that puts no row at a reading, or a curve in place of the line, is not found.
+
+    Args:
+        t: (n,) time [s]. values: (n,) readings, angles without jumps of a turn, NaN where there is
+        none.
+    """
+    found = np.zeros(values.size, bool)
+    present = np.flatnonzero(~np.isnan(values))
+    if present.size < 3 * FEWEST:
+        return found
+    at, y = t[present], values[present]
+    share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
+    off = np.abs(y[1:-1] - (1.0 - share) * y[:-2] - share * y[2:])
+    rounding = max(_rounding(y), 1e-9 * float(np.abs(y).max()))
+    # three numbers are rounded, each by half a unit at most
+    straight = (off <= 1.01 * rounding) & (y[2:] != y[:-2])
+    kinks = off[off > 1.01 * rounding]
+    if kinks.size < FEWEST or np.median(kinks) <= LEAST_KINK * rounding:
+        return found
+    if np.mean(straight) >= LEAST_STRAIGHT:
+        found[present[1:-1][straight]] = True
+    elif np.mean(straight) <= MOST_REPEATED:  # a line over a gap
+        for first, behind in stretches(straight):
+            if behind - first >= FROZEN:
+                found[present[1 + first : 1 + behind]] = True
+    return found
+
+
+def _rounding(y: np.ndarray) -> float:
+    """Unit of the last decimal that any number has; 0 where there are too many."""
+    for digits in range(MOST_DIGITS + 1):
+        scaled = y * 10.0**digits
+        if np.abs(scaled - np.round(scaled)).max() < 1e-6 * max(1.0, np.abs(scaled).max() * 1e-6):
+            return float(10.0**-digits)
+    return 0.0

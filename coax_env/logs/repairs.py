@@ -12,11 +12,11 @@ import numpy as np
 from coax_env.errors import InputError
 from coax_env.logs.columns import advice, time_advice
 from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
-from coax_env.logs.held import repeats
+from coax_env.logs.held import interpolated, repeats
 from coax_env.logs.outliers import find_leaps, find_outliers
 from coax_env.logs.packets import broken_packets
 from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS
-from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
+from coax_env.model.layout import ANGLES, CHANNELS, RPM_PER_RAD_S
 
 SHORTEST_RUN = 2.0
 """A run must last this long [s]."""
@@ -199,7 +199,7 @@ def _without_broken_packets(
 def _without_repeats(
     data: Mapping[str, np.ndarray], holds: Mapping[str, bool], counts: Counter[str]
 ) -> Mapping[str, np.ndarray]:
-    """With holes where a sensor's last reading was written again."""
+    """With holes where a sensor's last reading was written again, or a line was drawn to the next."""
     found = dict(data)
     for channel in CHANNELS:
         if channel in data:
@@ -207,6 +207,21 @@ def _without_repeats(
             if again.any():
                 counts[f"held samples of {channel}, no new readings"] += int(again.sum())
                 found[channel] = np.where(again, np.nan, data[channel])
+            if holds.get(channel) is False:
+                continue
+            values = found[channel]
+            unwrapped = _unwrapped(values) if channel in ANGLES else values
+            between = interpolated(data["t"], unwrapped)
+            if between.any():
+                counts[f"interpolated samples of {channel}, no readings"] += int(between.sum())
+                found[channel] = np.where(between, np.nan, values)
+    return found
+
+
+def _unwrapped(angles: np.ndarray) -> np.ndarray:
+    given = ~np.isnan(angles)
+    found = angles.copy()
+    found[given] = np.unwrap(angles[given])
     return found
 
 

@@ -6,20 +6,22 @@ motor controllers report are found without.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from coax_env.errors import InputError
-from coax_env.logs.units import ROTOR_COMMANDS, SWASH_COMMANDS
+from coax_env.logs.columns import Guess, guesses
+from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS
 from coax_env.model.layout import CHANNELS
 
 Signal = tuple[np.ndarray, np.ndarray]
 """Times [s] and values, both (n,)."""
 
 COMMANDS = (*ROTOR_COMMANDS, *SWASH_COMMANDS)
+MOST_NAMED = 12
 DEGREE = np.pi / 180.0
 
 _NUMBER = r"\d*\.?\d+(?:[eE][-+]?\d+)?"
@@ -78,20 +80,40 @@ def channels_of(
         found[channel] = (t, taken.scale * values + taken.offset)
     for which in ("upper", "lower"):
         if f"rpm_{which}" not in found and f"rpm_{which}_cmd" not in found:
-            outputs = sorted(s for s in signals if "output[" in s or s.startswith("RCOU.C"))
+            outputs = sorted(s for s in signals if _may_be_output(s))
             raise InputError(
                 f"{path}: no speed of the {which} rotor; take it from a signal, for instance "
-                f"rpm_{which}_cmd={(outputs or ['topic.field'])[0]}*2.1-1800"
+                f"--take rpm_{which}_cmd={(outputs or ['topic.field'])[0]}*2.1-1800; signals are"
+                f" {', '.join(sorted(outputs or signals)[:MOST_NAMED])}"
             )
     if not any(c in found for c in ("p", "ax", "phi")):
         raise InputError(f"{path}: neither gyros nor accelerometers nor attitude in it")
     return found
 
 
+def untaken(signals: Mapping[str, Signal], taken: Collection[str]) -> list[Guess]:
+    """Signals that a missing channel may be in, by the name of their field; nothing is read by a
+    guess."""
+    last: dict[str, list[str]] = {}
+    for name in signals:
+        last.setdefault(name.rpartition(".")[2], []).append(name)
+    found = guesses(field for field, names in last.items() if len(names) == 1)
+    return [
+        Guess(channel, last[guess.name][0], guess.unit)
+        for channel, guess in found.items()
+        if channel not in taken and channel != "t"
+    ]
+
+
+def _may_be_output(signal: str) -> bool:
+    words = ("output[", "motor", "servo", "actuator", "rpm", "rotor", "esc")
+    return signal.startswith("RCOU.C") or any(word in signal.lower() for word in words)
+
+
 def _check_taken(channel: str, taken: Taken, signals: Mapping[str, Signal], path: Path) -> None:
     """Refuse a channel that no flight has, or a signal that this log has not."""
-    if channel not in (*CHANNELS, *COMMANDS):
-        known = ", ".join([*COMMANDS, *CHANNELS])
+    if channel not in (*CHANNELS, *COMMANDS, BATTERY):
+        known = ", ".join([*COMMANDS, *CHANNELS, BATTERY])
         raise InputError(f"no channel {channel!r} to take; there are {known}")
     if taken.signal not in signals:
         topic = taken.signal.split(".")[0]

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from coax_env.errors import InputError, require
+from coax_env.logs.frames import attitude
 from coax_env.logs.signals import Signal
 
 MOST_READ = 20
@@ -27,6 +28,7 @@ CHANNEL_SIGNALS: dict[str, tuple[str, ...]] = {
     "vd": ("vehicle_local_position.vz",),
     "pn": ("vehicle_local_position.x",),
     "pe": ("vehicle_local_position.y",),
+    "battery_v": ("battery_status.voltage_v",),
     "rpm_upper": ("esc_status.esc[0].esc_rpm",),
     "rpm_lower": ("esc_status.esc[1].esc_rpm",),
 }
@@ -70,25 +72,11 @@ def px4_signals(path: Path) -> dict[str, Signal]:
             if np.issubdtype(np.asarray(values).dtype, np.number) and field != "timestamp":
                 signals[f"{topic.name}.{field}"] = (t[order], np.asarray(values, float)[order])
         if topic.name == "vehicle_attitude" and all(f"q[{k}]" in topic.data for k in range(4)):
-            q = [np.asarray(topic.data[f"q[{k}]"], float)[order] for k in range(4)]
-            for name, angle in zip(("phi", "theta", "psi"), euler_angles(*q), strict=True):
+            q = np.stack([np.asarray(topic.data[f"q[{k}]"], float)[order] for k in range(4)], 1)
+            angles = attitude(q, "body to NED")
+            for name, angle in zip(("phi", "theta", "psi"), angles, strict=True):
                 signals[f"vehicle_attitude.{name}"] = (t[order], angle)
     if "vehicle_local_position.z" in signals:  # above where the log began
         t, down = signals["vehicle_local_position.z"]
         signals["vehicle_local_position.height"] = (t, -down)
     return {name: signal for name, signal in signals.items() if len(signal[0]) > 1}
-
-
-def euler_angles(
-    w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Roll, pitch, heading (3-2-1) [rad] of the quaternion body to earth, NED.
-
-    Args:
-        w: scalar part, (n,).
-        x: first component of the vector part, (n,); y and z likewise.
-    """
-    phi = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    theta = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-    psi = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return phi, theta, psi

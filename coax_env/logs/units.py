@@ -26,6 +26,9 @@ LOG_UNITS: dict[str, str] = {
 }
 """Canonical unit of every column a flight can have."""
 
+PLACE_UNITS: dict[str, str] = {"lat": "deg", "lon": "deg"}
+"""Latitude and longitude: columns that a card may name in place of pn and pe, and their unit."""
+
 _RPM = 30.0 / pi
 _LENGTH = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "in": 0.0254}
 
@@ -49,6 +52,7 @@ _FACTORS: dict[str, dict[str, float]] = {
         "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY,
     },
     "m": _LENGTH,
+    "deg": {"deg": 1.0, "degree": 1.0, "degrees": 1.0, "°": 1.0, "rad": 180.0 / pi, "1e-7deg": 1e-7},
     "V": {"v": 1.0, "mv": 1e-3, "volt": 1.0, "volts": 1.0},
     "m/s": {
         **{f"{unit}/s": factor for unit, factor in _LENGTH.items()},
@@ -65,7 +69,7 @@ def factor_to_canonical(channel: str, unit: str) -> float:
     Raises:
         InputError: the unit is unknown, or measures something else than this channel.
     """
-    canonical = LOG_UNITS[channel]
+    canonical = LOG_UNITS.get(channel) or PLACE_UNITS[channel]
     known = _FACTORS[canonical]
     plain = unit.strip().lower().replace(" ", "").replace("²", "2").replace("^", "")
     plain = plain.replace("sec", "s").replace("**", "").replace("s-2", "s2")
@@ -76,16 +80,6 @@ def factor_to_canonical(channel: str, unit: str) -> float:
     return known[plain]
 
 
-def unit_that_makes(channel: str, factor: float, within: tuple[float, float]) -> str:
-    """A unit of a channel, other than its own, by which numbers are off by about a factor; "" if none.
-
-    Args:
-        channel: whose unit; its own is ``LOG_UNITS[channel]``.
-        factor: what the numbers should be multiplied by.
-        within: ratios that are about 1, from and to.
-    """
-    canonical = LOG_UNITS[channel]
-    for unit, own in _FACTORS[canonical].items():
-        if own != 1.0 and within[0] < factor / own < within[1]:
-            return unit
-    return ""
+def units_of(channel: str) -> dict[str, float]:
+    """Units that a channel may come in, and the factor of each to its own."""
+    return dict(_FACTORS[LOG_UNITS[channel]])

@@ -16,7 +16,7 @@ exactly over the step. A reading at a row is taken just after the row's command 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,15 @@ import numpy as np
 from coax_env.errors import InputError
 from coax_env.kernel.compilation import compiled
 from coax_env.kernel.lazy import lazily_compiled
-from coax_env.kernel.simd import sine_and_cosine, sines_and_cosines
-from coax_env.kernel.variants import WITH_EFFECTS, Variants, bare_and_with_effects, with_effects
+from coax_env.kernel.simd import (
+    any_lane,
+    by_type,
+    is_register,
+    select,
+    sine_and_cosine,
+    sines_and_cosines,
+)
+from coax_env.kernel.variants import WITH_EFFECTS, bare_and_with_effects, inlined, with_effects
 from coax_env.model import channels as Z
 from coax_env.model import effects
 from coax_env.model import inputs as U
@@ -81,6 +88,18 @@ WORK_SIZE = _TOTAL + N_STATES
 """Doubles of scratch that `step` and `measure` need."""
 
 
+@compiled(forceinline=True)
+def _acts(p, stage):
+    """Whether a stage has an effect that is on."""
+    return p[stage] != 0.0
+
+
+@compiled(forceinline=True)
+def _has_inflow(p):
+    """Whether the inflow moves."""
+    return any_lane(p[_INFLOW_TIME] > 0.0)
+
+
 @bare_and_with_effects()
 def _properties(x, u, p, f):
     """Vehicle file's numbers into the workspace, once a step. (15)-(20)."""
@@ -111,19 +130,21 @@ def _properties(x, u, p, f):
         f[F.SPEED_SHARE_U] = f[F.SPEED_SHARE_L] = f[F.SPEED_SCALE] = 1.0
         f[F.SPEED_REST_U] = f[F.SPEED_REST_L] = 0.0
         f[F.SERVO_PLAY] = f[F.SERVO_DEADBAND] = f[F.SERVO_RATE] = 0.0
-        f[F.INFLOW_TIME] = p[_INFLOW_TIME]
-        if p[_INFLOW_TIME] > 0.0:
+        f[F.INFLOW_TIME] = 0.0
+        if _has_inflow(p):
+            f[F.INFLOW_TIME] = p[_INFLOW_TIME]
             f[F.HOVER_U], f[F.HOVER_L] = hover_speeds(p)
-        if p[effects.PROPERTY] != 0.0:
+        if _acts(p, effects.PROPERTY):
             _property_effects(x, f, p)
 
 
 @compiled()
 def _follow(start, command, time, lag):
     """Exact first-order response to a held command; without a lag it is its own limit."""
-    if lag <= SHORTEST_LAG:
-        return command
-    return command + (start - command) * math.exp(-time / lag)
+    slow = lag > SHORTEST_LAG
+    if any_lane(slow):
+        return select(slow, command + (start - command) * math.exp(-time / lag), command)
+    return command
 
 
 @compiled()
@@ -144,33 +165,32 @@ def _servo(start, command, time, f):
     """
     half, dead, rate = 0.5 * f[F.SERVO_PLAY], f[F.SERVO_DEADBAND], f[F.SERVO_RATE]
     lag = f[F.SERVO_LAG]
-    if abs(start - command) <= dead:
-        return start
-    end = command if half == 0.0 else min(max(start, command - half), command + half)
-    if rate > 0.0:
+    end = select(half == 0.0, command, min(max(start, command - half), command + half))
+    reached = _follow(start, end, time, lag)
+    limited = rate > 0.0
+    if any_lane(limited):
         way = start - end
         knee = min(abs(way), rate * lag)  # what is left when the lag is the slower
         running = (abs(way) - knee) / rate
-        if time <= running:
-            reached = start - math.copysign(rate * time, way)
-        else:
-            reached = _follow(end + math.copysign(knee, way), end, time - running, lag)
-    else:
-        reached = _follow(start, end, time, lag)
-    if dead > 0.0 and (rate > 0.0 or lag > SHORTEST_LAG) and abs(reached - command) < dead:
-        return command + math.copysign(dead, start - command)
+        at_rate = start - math.copysign(rate * time, way)
+        slowing = _follow(end + math.copysign(knee, way), end, time - running, lag)
+        reached = select(limited, select(time <= running, at_rate, slowing), reached)
+    away = start - command
+    if any_lane(dead > 0.0):
+        slow = limited | (lag > SHORTEST_LAG)
+        stops = (dead > 0.0) & slow & (abs(reached - command) < dead)
+        reached = select(stops, command + math.copysign(dead, away), reached)
+        reached = select(abs(away) <= dead, start, reached)
     return reached
 
 
 @compiled()
 def _lag_of_lag(time, lag, inflow_time):
     """What is left, through a lag of `inflow_time`, of one that decays with another `lag`."""
-    if lag <= SHORTEST_LAG:
-        return 0.0
-    if abs(lag - inflow_time) < 1e-6 * inflow_time:
-        return time / inflow_time * math.exp(-time / inflow_time)
-    left = math.exp(-time / lag) - math.exp(-time / inflow_time)
-    return lag / (lag - inflow_time) * left
+    alike = abs(lag - inflow_time) < 1e-6 * inflow_time
+    fading = math.exp(-time / inflow_time)
+    left = lag / select(alike, 1.0, lag - inflow_time) * (math.exp(-time / lag) - fading)
+    return select(lag > SHORTEST_LAG, select(alike, time / inflow_time * fading, left), 0.0)
 
 
 @compiled()
@@ -195,8 +215,9 @@ def _actuate(x, u, time, f, out):
     Only effects part an actuator from its command.
     """
     if WITH_EFFECTS:
-        if f[F.INFLOW_TIME] > 0.0:
-            out[S.INFLOW] = _inflow(x, u, time, f)
+        moves = f[F.INFLOW_TIME] > 0.0
+        if any_lane(moves):
+            out[S.INFLOW] = select(moves, _inflow(x, u, time, f), out[S.INFLOW])
         upper, lower = _speeds_asked_for(u, f)
         out[S.OMEGA_U] = _follow(x[S.OMEGA_U], upper, time, f[F.MOTOR_LAG_U])
         out[S.OMEGA_L] = _follow(x[S.OMEGA_L], lower, time, f[F.MOTOR_LAG_L])
@@ -220,10 +241,12 @@ def _mean_rotor_accelerations(x, u, h, f):
 def _rotor_accelerations(x, u, f):
     """The rotors' accelerations now: a lagging rotor still speeds up, one without lag has arrived."""
     upper, lower = _speeds_asked_for(u, f)
-    if f[F.MOTOR_LAG_U] > 10.0 * READING_DELAY:
-        f[F.OMEGA_U_DOT] = (upper - x[S.OMEGA_U]) / f[F.MOTOR_LAG_U]
-    if f[F.MOTOR_LAG_L] > 10.0 * READING_DELAY:
-        f[F.OMEGA_L_DOT] = (lower - x[S.OMEGA_L]) / f[F.MOTOR_LAG_L]
+    for rotor, lag, change, asked in (
+        (S.OMEGA_U, F.MOTOR_LAG_U, F.OMEGA_U_DOT, upper),
+        (S.OMEGA_L, F.MOTOR_LAG_L, F.OMEGA_L_DOT, lower),
+    ):
+        slow = f[lag] > 10.0 * READING_DELAY
+        f[change] = select(slow, (asked - x[rotor]) / f[lag], f[change])
 
 
 @compiled(forceinline=True)
@@ -250,11 +273,11 @@ def _rates_in_flight(x, p, f, dx):
     f[F.HEIGHT] = -x[S.Z]
 
     f[F.AIR_U], f[F.AIR_V], f[F.AIR_W] = x[S.U], x[S.V], x[S.W]
-    if WITH_EFFECTS and p[effects.AIR] != 0.0:
+    if WITH_EFFECTS and _acts(p, effects.AIR):
         _air_effects(x, f, p)
 
     f[F.DELTA_LON], f[F.DELTA_LAT] = x[S.SWASH_LON], x[S.SWASH_LAT]
-    if WITH_EFFECTS and p[effects.SWASH] != 0.0:
+    if WITH_EFFECTS and _acts(p, effects.SWASH):
         _swash_effects(x, f, p)
 
     # (15)-(20); upper tilt by the fly-bar, (30)-(31)
@@ -268,7 +291,7 @@ def _rates_in_flight(x, p, f, dx):
     f[F.BETA_U] = p[P.FLYBAR_TO_ROTOR_LAT] * x[S.BETA_F]
     alpha_l, beta_l = x[S.ALPHA_L], x[S.BETA_L]
     f[F.ALPHA_L], f[F.BETA_L] = alpha_l, beta_l
-    if WITH_EFFECTS and p[effects.ROTOR] != 0.0:
+    if WITH_EFFECTS and _acts(p, effects.ROTOR):
         _rotor_effects(x, f, p)
 
     # (26)-(27)
@@ -304,9 +327,9 @@ def _rates_in_flight(x, p, f, dx):
     f[F.MOMENT_X] += x[S.GUST_L] * f[F.INERTIA_XX] / p[P.GUST_INERTIA_XX]
     f[F.MOMENT_Y] += x[S.GUST_M] * f[F.INERTIA_YY] / p[P.GUST_INERTIA_YY]
     f[F.MOMENT_Z] += (x[S.GUST_N] + x[S.TRIM_N]) * f[F.INERTIA_ZZ] / p[P.GUST_INERTIA_ZZ]
-    if WITH_EFFECTS and p[effects.LOAD] != 0.0:
+    if WITH_EFFECTS and _acts(p, effects.LOAD):
         _load_effects(x, f, p)
-    if WITH_EFFECTS and p[effects.UNLISTED] != 0.0:
+    if WITH_EFFECTS and _acts(p, effects.UNLISTED):
         _unlisted_terms(x, f, p)
 
     # (32)-(34)
@@ -344,7 +367,7 @@ def _switched_on(p):
     return flown + p[effects.UNLISTED]
 
 
-_rates_bare, _rates_with_effects = _rates_in_flight
+_rates_bare, _rates_with_effects, _ = _rates_in_flight
 
 
 @compiled()
@@ -356,7 +379,7 @@ def _rates_where_on(x, p, f, dx):
         _rates_bare(x, p, f, dx)
 
 
-_rates: Any = Variants(_rates_bare, _rates_where_on)
+_rates: Any = _rates_in_flight._replace(with_effects=_rates_where_on)
 
 
 _GUST_MEMORY = (
@@ -394,12 +417,26 @@ def _copy(state, out):
         out[i] = state[i]
 
 
+def _parts(dt):
+    """In how many parts a row of `dt` seconds is flown; where rows are of different lengths in a
+    register, none is longer than LONGEST_STEP.
+    """
+    return max(1, math.ceil(dt / LONGEST_STEP - 1e-9))
+
+
+@by_type(_parts)
+def _parts_of(dt):
+    if is_register(dt):
+        return lambda dt: 1
+    return lambda dt: max(1, math.ceil(dt / LONGEST_STEP - 1e-9))
+
+
 @bare_and_with_effects(lazily=True)
 def _step(x, u, dt, p, work, out):
     """`step`. RK4 on the paper's states; actuators and gusts exactly, at each stage's own time."""
     f, stage = work[:_STATE], work[_STATE:_SLOPE]
     slope, total = work[_SLOPE:_TOTAL], work[_TOTAL:WORK_SIZE]
-    parts = max(1, math.ceil(dt / LONGEST_STEP - 1e-9))
+    parts = _parts(dt)
     h = dt / parts
     _copy(x, out)
     _properties(out, u, p, f)
@@ -427,7 +464,7 @@ def _step(x, u, dt, p, work, out):
             out[i] = stage[i]
 
 
-step_bare, _step_with_effects = _step
+step_bare, _step_with_effects, _ = _step
 """`step_bare`: `step` for a vehicle whose effects are all off: less to compile, and fit for SIMD
 batches (kernel/simd.py)."""
 
@@ -463,14 +500,13 @@ def _read(x, now, slope, p, f, out):
     z[Z.VN], z[Z.VE], z[Z.VD] = slope[S.X], slope[S.Y], slope[S.Z]
     z[Z.PN], z[Z.PE] = x[S.X], x[S.Y]
     z[Z.V] = math.sqrt(x[S.U] * x[S.U] + x[S.V] * x[S.V] + x[S.W] * x[S.W])
-    if WITH_EFFECTS and p[effects.SENSOR] != 0.0:
+    if WITH_EFFECTS and _acts(p, effects.SENSOR):
         _sensor_effects(x, f, p)
     for i in range(N_CHANNELS):
         out[i] = z[i]
 
 
-@with_effects
-def drift_and_readings(x, u, dt, p, work, out):
+def _drift_and_readings(x, u, dt, p, work, out):
     """What a row adds to the full state, and the readings at its start, from one look at the rates.
 
     For derivatives with respect to states and parameters: the drift is first order in `dt` for the
@@ -504,6 +540,9 @@ def drift_and_readings(x, u, dt, p, work, out):
     _read(x, now, slope, p, f, out[N_FULL:])
 
 
+drift_and_readings = with_effects(_drift_and_readings)
+
+
 @bare_and_with_effects(lazily=True)
 def _measure(x, u, p, work, out):
     """`measure`."""
@@ -517,7 +556,7 @@ def _measure(x, u, p, work, out):
     _read(x, now, slope, p, f, out)
 
 
-measure_bare, _measure_with_effects = _measure
+measure_bare, _measure_with_effects, _ = _measure
 
 
 @compiled()
@@ -532,6 +571,51 @@ def measure(x, u, p, work, out):
         _measure_with_effects(x, u, p, work, out)
     else:
         measure_bare(x, u, p, work, out)
+
+
+def _always(p, stage):
+    """What `_acts` is where the stages hold those effects only that are on."""
+    return True
+
+
+def _never(p):
+    """What `_has_inflow` is without the effect."""
+    return False
+
+
+def _stages_with(used: Collection[str] | None = None) -> dict[str, Any]:
+    """Names of what differs where some effects alone are in the kernel, or all, and what they mean."""
+    return {
+        "WITH_EFFECTS": True,
+        "_air_effects": effects.stage_source(effects.AIR, used),
+        "_swash_effects": effects.stage_source(effects.SWASH, used),
+        "_rotor_effects": effects.stage_source(effects.ROTOR, used),
+        "_load_effects": effects.stage_source(effects.LOAD, used),
+        "_unlisted_terms": effects.stage_source(effects.UNLISTED, used),
+        "_sensor_effects": effects.stage_source(effects.SENSOR, used),
+        "_property_effects": effects.stage_source(effects.PROPERTY, used),
+    }
+
+
+def drift_and_measure_of_registers() -> tuple[Any, Any]:
+    """`drift_and_readings` and `measure` with every effect, to be called with SIMD registers."""
+    names = _stages_with()
+    drift, measure = inlined((_drift_and_readings, _measure), names, "of_registers", forced=False)
+    return drift, measure
+
+
+def step_and_measure_with(used: Collection[str], kind: str) -> tuple[Any, Any]:
+    """`step` and `measure` with some effects alone in them, all inlined: for SIMD batches.
+
+    Args:
+        used: full names of the parameters that may be away from their off-values.
+        kind: one word that tells this choice from others.
+    """
+    names = _stages_with(used) | {"_acts": _always}
+    if not any(name.startswith("dynamic_inflow.") for name in used):
+        names["_has_inflow"] = _never
+    step_with, measure_with = inlined((_step, _measure), names, kind)
+    return step_with, measure_with
 
 
 @with_effects

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numba import njit
 
 from coax_env.errors import InputError
 from coax_env.kernel.compilation import BORROWING, name_apart
+from coax_env.model import generic_terms
 from coax_env.model import parameters as P
 from coax_env.model.layout import CHANNELS
 
@@ -69,7 +71,8 @@ class Effect:
     not in the kernel. ``line``: found by its line in the spectrum (vibration.py), not by a signature.
     ``generic``: unlisted terms, of which a vehicle file holds those that are not zero. ``damps``: its
     one parameter damps the motion, and so changes what a filter makes of gusts. ``named_as``: the
-    effect by whose name it is found, where it acts in jumps that no filter can follow.
+    effect by whose name it is found, where it acts in jumps that no filter can follow. ``users``:
+    from a user's file.
     """
 
     name: str
@@ -85,6 +88,7 @@ class Effect:
     generic: bool = False
     damps: bool = False
     named_as: str = ""
+    users: bool = False
     index: int = -1
 
     def names(self) -> tuple[str, ...]:
@@ -140,8 +144,8 @@ def effect(
         for channel in channels.split():
             if channel not in CHANNELS:
                 raise InputError(f"effect {own!r}: no channel {channel!r}")
-        users = not function.__module__.startswith("coax_env.")  # which may make arrays
-        function_compiled = njit(**{**BORROWING, "_nrt": users})(name_apart(function))
+        own_code = function.__module__.startswith("coax_env.")  # a user's may make arrays
+        function_compiled = njit(**{**BORROWING, "_nrt": not own_code})(name_apart(function))
         entry = Effect(
             name=own,
             stage=stage,
@@ -156,6 +160,7 @@ def effect(
             generic=generic,
             damps=damps,
             named_as=named_as,
+            users=not own_code,
             index=n_parameters(),
         )
         GROUPS[own] = entry
@@ -236,8 +241,39 @@ def set_switches(vector: np.ndarray) -> None:
 
     Of one parameter vector, or of many at once, shape (..., n_parameters()).
     """
+    vector[..., SWITCHES] = switched_on(vector[..., _FIRST:], np.arange(_FIRST, n_parameters()))
+
+
+def switched_on(numbers: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Which stages have an effect away from its off-value among some parameters, (..., stages) bool.
+
+    Args:
+        numbers: values of effects' parameters, (..., k). places: theirs in a parameter vector, (k,).
+    """
     off, throws = _offs()
-    vector[..., P.N_FIXED : _FIRST] = (vector[..., _FIRST:] != off) @ throws > 0.0
+    return np.asarray((numbers != off[places - _FIRST]) @ throws[places - _FIRST] > 0.0)
+
+
+def acting(vectors: np.ndarray, places: Collection[int] = ()) -> tuple[str, ...]:
+    """Full names of the parameters of every effect that may be on; of a generic group, its terms.
+
+    Args:
+        vectors: parameter vectors, (m, n_parameters()). places: of parameters that may be others.
+    """
+    names = []
+    for entry in GROUPS.values():
+        own = range(entry.index, entry.index + len(entry.parameters))
+        away = [
+            k in places or bool((vectors[:, k] != p.off).any())
+            for k, p in zip(own, entry.parameters, strict=True)
+        ]
+        if entry.generic:
+            names += [name for name, is_away in zip(entry.names(), away, strict=True) if is_away]
+        elif any(
+            a and not (p.shape or p.held) for a, p in zip(away, entry.parameters, strict=True)
+        ):
+            names += entry.names()
+    return tuple(names)
 
 
 def completed(effect_name: str, table: Mapping[str, Any], make: Callable) -> dict[str, Any]:
@@ -259,13 +295,34 @@ def completed(effect_name: str, table: Mapping[str, Any], make: Callable) -> dic
 
 
 def stage_function(stage: int) -> Callable:
-    """One function that runs all effects of a stage in the catalogue's order, for compiled code.
+    """One function that runs all effects of a stage in the catalogue's order, for compiled code."""
+    return njit(**BORROWING)(stage_source(stage))
+
+
+def stage_source(stage: int, used: Collection[str] | None = None) -> FunctionType:
+    """As `stage_function`, not compiled, and of some effects only.
 
     Written out as source, one call a line: a chain of closures takes numba three times as long.
+
+    Args:
+        stage: one of STAGES. used: full names of parameters; an effect is called where one of its
+            own is among them, of a generic group those terms alone. None: all.
     """
-    entries = [e for e in GROUPS.values() if e.stage == stage]
-    calls = [f"    {e.name}(x, f, p, {e.index})" for e in entries]
-    names = {"__name__": __name__, **{e.name: e.function for e in entries}}
+    calls, names = [], {"__name__": __name__}
+    for entry in GROUPS.values():
+        own = [n for n in entry.names() if used is None or n in used]
+        if entry.stage != stage or not own:
+            continue
+        if entry.generic and used is not None:
+            numbers = [entry.names().index(name) for name in own]
+            calls += [
+                f"    {line}" for line in generic_terms.sum_of(entry.name, numbers, entry.index)
+            ]
+            names["term_value"] = generic_terms.term_value
+        else:
+            calls.append(f"    {entry.name}(x, f, p, {entry.index})")
+            names[entry.name] = entry.function
     exec("\n".join(["def run(x, f, p):", *calls, "    pass"]), names)
-    names["run"].__qualname__ = f"stage_{stage}"
-    return njit(**BORROWING)(names["run"])
+    run: Any = names["run"]
+    run.__qualname__ = f"stage_{stage}"
+    return run

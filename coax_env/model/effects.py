@@ -16,6 +16,10 @@ in place. It runs at its *stage* of the kernel (dynamics.py):
 - ``UNLISTED``: the generic terms of what no effect here explains (generic_terms.py);
 - ``SENSOR``: readings.
 
+The same function flies one helicopter and, handed registers, SIMD_WIDTH of them (kernel/simd.py):
+where helicopters differ there is no ``if`` but `select`. ``if p[e] != 0.0`` may stay: it asks whether
+the effect is on in any, so what follows must change nothing where it is zero.
+
 An effect with a memory of its own uses one: rotor speeds and the plate's tilt are states of the
 kernel (MOTOR_LAG_*, SERVO_*, discretised exactly, so that zero is a limit and not a branch); a
 pure delay of the commands is a shift of the input (helicopter.py), of a reading its rate of change.
@@ -32,6 +36,7 @@ the other sign is explaining something else.
 import math
 
 from coax_env.kernel.compilation import compiled
+from coax_env.kernel.simd import any_lane, select
 from coax_env.model import channels as Z
 from coax_env.model import generic_terms
 from coax_env.model import parameters as P
@@ -51,6 +56,7 @@ from coax_env.model.effect_registry import (
     UNLISTED,
     Effect,
     EffectParameter,
+    acting,
     completed,
     effect,
     forget,
@@ -61,6 +67,8 @@ from coax_env.model.effect_registry import (
     parameter_index,
     set_switches,
     stage_function,
+    stage_source,
+    switched_on,
 )
 from coax_env.model.layout import RPM_PER_RAD_S
 
@@ -78,6 +86,7 @@ __all__ = [
     "UNLISTED",
     "Effect",
     "EffectParameter",
+    "acting",
     "completed",
     "effect",
     "forget",
@@ -88,6 +97,8 @@ __all__ = [
     "parameter_index",
     "set_switches",
     "stage_function",
+    "stage_source",
+    "switched_on",
 ]
 
 DEGREE = math.pi / 180.0
@@ -349,7 +360,7 @@ def servo_rate(x, f, p, e):
     There is no slope at the off-value: a tenth of a radian takes 10 ms at it, a row of a log, and what
     is faster no flight shows. Its signature is that of 1 rad/s, two and a quarter usual sizes off.
     """
-    f[F.SERVO_RATE] = p[e] if p[e] < NO_RATE_LIMIT else 0.0
+    f[F.SERVO_RATE] = select(p[e] < NO_RATE_LIMIT, p[e], 0.0)
 
 
 # --- air ------------------------------------------------------------------------------------------
@@ -470,8 +481,7 @@ def axial_damping(x, f, p, e):
 def wake_interference(x, f, p, e):
     """Lower thrust times 1 - gain (share of the load on the upper rotor)."""
     total = f[F.THRUST_U] + f[F.THRUST_L]
-    if total > 0.0:
-        f[F.THRUST_L] *= 1.0 - p[e] * f[F.THRUST_U] / total
+    f[F.THRUST_L] *= select(total > 0.0, 1.0 - p[e] * f[F.THRUST_U] / total, 1.0)
 
 
 @effect(
@@ -482,10 +492,11 @@ def wake_interference(x, f, p, e):
 )
 def thrust_exponent(x, f, p, e):
     """Thrust goes as speed to the power 2 + excess, unchanged at the bare model's hover speed."""
-    if p[e] != 0.0 and f[F.OMEGA_U] > 0.0 and f[F.OMEGA_L] > 0.0:
+    if p[e] != 0.0:
         hover_u, hover_l = generic_terms.hover_speeds(p)
-        f[F.THRUST_U] *= (f[F.OMEGA_U] / hover_u) ** p[e]
-        f[F.THRUST_L] *= (f[F.OMEGA_L] / hover_l) ** p[e]
+        turning = (f[F.OMEGA_U] > 0.0) & (f[F.OMEGA_L] > 0.0)
+        f[F.THRUST_U] *= select(turning, (f[F.OMEGA_U] / hover_u) ** p[e], 1.0)
+        f[F.THRUST_L] *= select(turning, (f[F.OMEGA_L] / hover_l) ** p[e], 1.0)
 
 
 @effect(
@@ -501,10 +512,10 @@ def dynamic_inflow(x, f, p, e):
     which follows s with the time constant; both less one. Small changes (|s - v| below 0.2), slow
     climbs, and one inflow for both rotors.
     """
-    if p[e] > 0.0:
+    if any_lane(p[e] > 0.0):
         speed = 0.5 * (f[F.OMEGA_U] / f[F.HOVER_U] + f[F.OMEGA_L] / f[F.HOVER_L])
         ahead = speed - 1.0 - x[S.INFLOW]
-        rise = max(1.0 + INFLOW_GAIN * ahead, 0.0)
+        rise = select(p[e] > 0.0, max(1.0 + INFLOW_GAIN * ahead, 0.0), 1.0)
         f[F.THRUST_U] *= rise
         f[F.THRUST_L] *= rise
 
@@ -950,8 +961,7 @@ def attitude_bias(x, f, p, e):
 def sonar_tilt(x, f, p, e):
     """The height reading is the slant range (on = 1), not the height (on = 0)."""
     slant = f[F.COS_PHI] * f[F.COS_THETA]
-    if slant > 0.1:
-        f[_HEIGHT] *= 1.0 + p[e] * (1.0 / slant - 1.0)
+    f[_HEIGHT] *= select(slant > 0.1, 1.0 + p[e] * (1.0 / slant - 1.0), 1.0)
 
 
 @effect(

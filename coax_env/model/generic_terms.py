@@ -12,7 +12,7 @@ the direction in which this row moves it on, which is what play in its linkage a
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -138,7 +138,8 @@ _DIRECTION = _ROTORS + 3
 def hover_speeds(p: np.ndarray) -> tuple[float, float]:
     """Rotor speeds [rad/s] at which the bare model hovers, its download on the fuselage left out."""
     weight = p[P.MASS] * p[P.GRAVITY]
-    k_T = p[P.AIR_DENSITY] * math.pi * p[P.ROTOR_RADIUS] ** 4
+    radius = p[P.ROTOR_RADIUS]
+    k_T = p[P.AIR_DENSITY] * math.pi * radius * radius * radius * radius
     ratio2 = p[P.C_QU] / p[P.C_QL]  # (omega_l / omega_u)^2 where torques balance
     upper = math.sqrt(weight / (k_T * (p[P.C_TU] + p[P.C_TL] * ratio2)))
     return upper, upper * math.sqrt(ratio2)
@@ -202,6 +203,16 @@ AXIS_FUNCTIONS = {
     for group, (unit, place) in AXES.items()
 }
 """Group -> the function that adds its axis' terms, for the kernel."""
+
+
+def sum_of(group: str, which: Sequence[int], index: int) -> list[str]:
+    """Source of some terms of an axis, a line each, for a function of (x, f, p).
+
+    Args:
+        group: of AXES. which: places in TERMS. index: of its first coefficient in `p`.
+    """
+    place = AXES[group][1]
+    return [f"f[{place}] += p[{index + i}] * term_value({i}, x, f, p)" for i in which]
 
 
 def unit_of(group: str, term: Term) -> str:

@@ -11,6 +11,9 @@ The file imports from `coax_env.model.effects` and decorates a function, as the 
     def heading_moment(x, f, p, e):
         "A pitching moment that follows the heading, k sin(3 psi)."
         f[F.MOMENT_Y] += p[e] * math.sin(3.0 * x[S.PSI])
+
+In a batch of envs an effect is flown for several helicopters at once (kernel/simd.py) where it has no
+``if`` on their states; `coax_env.kernel.simd.select` stands for one.
 """
 
 import importlib.util

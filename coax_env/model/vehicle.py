@@ -199,8 +199,12 @@ class Vehicle:
 
     def draw(self, rng: np.random.Generator) -> "Vehicle":
         """A vehicle drawn from this one's spread; positive base parameters are log-normal."""
+        return self.at(rng.standard_normal(len(self.spread().names)))
+
+    def at(self, z: np.ndarray) -> "Vehicle":
+        """The vehicle at independent standard normal numbers (n,), in the order of `values`."""
         spread = self.spread()
-        values = spread.at(rng.standard_normal(len(spread.names)))
+        values = spread.at(z)
         drawn = {
             name: value
             for name, value, std in zip(spread.names, values, spread.std, strict=True)

@@ -48,6 +48,23 @@ def bode(omega: np.ndarray, responses: Mapping[str, np.ndarray]) -> Figure:
     return figure_of(data, 400, **layout)
 
 
+def gains(omega: np.ndarray, curves: Mapping[str, np.ndarray]) -> Figure:
+    """Gains [dB] over frequency [Hz].
+
+    Args:
+        omega: [rad/s], (w,).
+        curves: name -> gain (w,).
+    """
+    layout = stacked_axes([1.0], ["gain [dB]"], spacing=0.0)
+    layout["xaxis"] |= {"type": "log", "title": {"text": "frequency [Hz]"}}
+    data = []
+    for k, (name, values) in enumerate(curves.items()):
+        line = {"color": CYCLE[k % len(CYCLE)], "width": 1.7, "dash": DASHES[k % 3]}
+        decibels = 20.0 * np.log10(values + 1e-12)
+        data.append(curve(omega / (2.0 * math.pi), decibels, name, "", 1, line=line))
+    return figure_of(data, 280, **layout)
+
+
 # --- histories ------------------------------------------------------------------------------------
 
 

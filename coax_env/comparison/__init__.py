@@ -1,0 +1,1 @@
+"""What happened to a machine between two flights, or over many."""

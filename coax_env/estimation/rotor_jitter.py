@@ -1,0 +1,179 @@
+"""Rotor speeds that jitter: noise with a memory on top of the commanded speeds, and what it does.
+
+Motors and their controllers hold a speed to some parts in a thousand, and lose it for tens of
+milliseconds. Thrust and torque follow, measured speeds show it, and the body takes up the angular
+momentum that a rotor gains. A rate that is shaken so and comes back looks like a damped one: taken for
+the air's noise alone, such jitter was called yaw damping (and a gyro's scale) on clean flights.
+
+Two states more than the helicopter's own, in the filter alone, each with an exponential memory. The
+rotors' commands are the logged ones plus these; the yaw rate is the helicopter's plus what is taken up.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from coax_env.estimation import helicopter_noise
+from coax_env.estimation.helicopter import MEASURE, STEP, HeliModel, _take_in_innovations
+from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY
+from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
+from coax_env.kernel.compilation import compiled, pointer
+from coax_env.model import dynamics, effects
+from coax_env.model import inputs as U
+from coax_env.model import parameters as P
+from coax_env.model import state as S
+from coax_env.model.generic_terms import hover_speeds
+from coax_env.model.layout import N_CHANNELS, N_FULL, N_INPUTS
+
+JITTER = slice(N_FULL, N_FULL + 2)
+"""Of the upper and of the lower rotor [rad/s]."""
+N_JITTERY = JITTER.stop
+
+REACTION = FreeParameter("rotor_jitter.reaction", 1.0, 0.5, 0.0, 2.0)
+"""Share of a rotor's angular momentum that the body takes up: all, where a motor shakes the rotor, less
+where the air does; the prior is ours."""
+JITTER_START = 1e-3
+"""Share of the hover speeds with which a fit begins; ours."""
+MEMORY_START, MEMORY_SPREAD = 0.05, 1.0
+"""Median [s] of the jitter's memory and std of its logarithm; ours."""
+MEMORY_BOUNDS = (0.015, 2.0)
+"""[s]: below, it is white at 100 Hz; above, a trim."""
+
+# behind the kernel's parameters
+_MEMORY, _REACTION = -2, -1
+_SPIN_UP = effects.parameter_index("spin_up_reaction.gain")
+
+# of the scratch, behind the kernel's: the state without jitter, the input with it, drift and readings
+_STATE = dynamics.WORK_SIZE
+_INPUT = _STATE + N_FULL
+_OUT = _INPUT + N_INPUTS
+_WORK_SIZE = _OUT + N_FULL + N_CHANNELS
+
+
+@compiled()
+def _taken_up(x, p):
+    """Yaw rate [rad/s] that the body has taken up of the rotors' jitter.
+
+    What the effect `spin_up_reaction` gives to every change of a speed is not counted twice.
+    """
+    share = (p[p.size + _REACTION] - p[_SPIN_UP]) / p[P.GUST_INERTIA_ZZ]
+    upper = p[P.ROTOR_INERTIA_U] + p[P.FLYBAR_INERTIA]
+    return share * (upper * x[N_FULL] - p[P.ROTOR_INERTIA_L] * x[N_FULL + 1])
+
+
+@compiled()
+def _shaken(x, u, p, work):
+    """State and input as the helicopter's own model takes them, into the scratch; what is taken up."""
+    taken = _taken_up(x, p)
+    for i in range(N_FULL):
+        work[_STATE + i] = x[i]
+    work[_STATE + S.R] += taken
+    for i in range(N_INPUTS):
+        work[_INPUT + i] = u[i]
+    work[_INPUT + U.OMEGA_U] += x[N_FULL]
+    work[_INPUT + U.OMEGA_L] += x[N_FULL + 1]
+    return taken
+
+
+@pointer(STEP)
+def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """The helicopter's step; jitter fades."""
+    for i in range(N_JITTERY):
+        out[i] = x[i]
+    _take_in_innovations(u, p, out)
+    taken = _shaken(out, u, p, work)
+    state = work[_STATE:_INPUT]
+    dynamics.step(state, work[_INPUT:_OUT], dt, p, work, state)
+    for i in range(N_FULL):
+        out[i] = state[i]
+    out[S.R] -= taken
+    left = math.exp(-dt / p[p.size + _MEMORY])
+    for i in range(N_FULL, N_JITTERY):
+        out[i] = left * x[i]
+
+
+@pointer(MEASURE)
+def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
+    """The helicopter's readings."""
+    _shaken(x, u, p, work)
+    dynamics.measure(work[_STATE:_INPUT], work[_INPUT:_OUT], p, work, out)
+
+
+@pointer(STEP)
+def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """The helicopter's; jitter fades exactly."""
+    _shaken(x, u, p, work)
+    own = work[_OUT:_WORK_SIZE]
+    dynamics.drift_and_readings(work[_STATE:_INPUT], work[_INPUT:_OUT], dt, p, work, own)
+    _take_in_innovations(u, p, own)
+    faded = math.expm1(-dt / p[p.size + _MEMORY])
+    for i in range(N_FULL):
+        out[i] = own[i]
+    for i in range(N_FULL, N_JITTERY):
+        out[i] = faded * x[i]
+    for i in range(N_CHANNELS):
+        out[N_JITTERY + i] = own[N_FULL + i]
+
+
+class JitteryModel(HeliModel):
+    """A vehicle whose rotor speeds jitter, through the engine's protocol."""
+
+    step = _step
+    measure = _measure
+    drift_and_readings = _drift_and_readings
+    exact = np.append(HeliModel.exact, [True, True])
+    work_size = _WORK_SIZE
+    state_scale = np.append(HeliModel.state_scale, [1e-2, 1e-2])
+    noise_places = np.insert(HeliModel.noise_places, N_FULL, [[N_FULL] * 2, [N_FULL + 1] * 2], 0)
+
+    @property
+    def side_by_side(self) -> None:
+        """None: the two states more are not in the helicopter's derivatives of registers."""
+
+    @classmethod
+    def like(cls, model: HeliModel) -> "JitteryModel":
+        """Of the same vehicle."""
+        return cls(model.vehicle, model.bare_values)
+
+    def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
+        """The helicopter's parameter vector, and behind it the jitter's memory and reaction."""
+        own = {name: value for name, value in values.items() if name != REACTION.name}
+        memory = MEMORY_START if noise is None else noise.process.get(JITTER_MEMORY, MEMORY_START)
+        tail = [memory, values.get(REACTION.name, REACTION.value)]
+        return np.append(super().vector(own, noise), tail)
+
+    def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
+        """First state (31,) and its covariance, without what the noise levels add."""
+        x, covariance = super().start(record)
+        return np.append(x, [0.0, 0.0]), np.pad(covariance, (0, 2))
+
+    def start_noise(self, noise: Noise) -> np.ndarray:
+        """Variances that the noise levels add to the first state (31,)."""
+        variance = noise.process.get(JITTER_LEVEL, 0.0) ** 2
+        return np.append(super().start_noise(noise), [variance, variance])
+
+    def process_noise(self, noise: Noise, vector: np.ndarray) -> ProcessNoise:
+        """What the noise adds to the covariance, by entry of `noise_places`."""
+        own = helicopter_noise.process_noise(noise, vector)
+        memory = float(vector[_MEMORY])
+        intensity = 2.0 * noise.process.get(JITTER_LEVEL, 0.0) ** 2 / memory
+        return ProcessNoise(
+            np.insert(own.intensity, N_FULL, [intensity] * 2),
+            np.insert(own.decay, N_FULL, [1.0 / memory] * 2),
+        )
+
+
+def with_jitter(noise: Noise, model: HeliModel) -> Noise:
+    """Noise levels with the jitter's, where their fit begins."""
+    speed = float(np.mean(hover_speeds(model.vehicle.vector)))
+    first = JITTER_START * speed
+    return replace(
+        noise,
+        process={**noise.process, JITTER_LEVEL: first, JITTER_MEMORY: MEMORY_START},
+        floor={**noise.floor, JITTER_LEVEL: 0.01 * first, JITTER_MEMORY: MEMORY_BOUNDS[0]},
+        ceiling={**noise.ceiling, JITTER_LEVEL: 50.0 * first, JITTER_MEMORY: MEMORY_BOUNDS[1]},
+        prior={**noise.prior, JITTER_MEMORY: (MEMORY_START, MEMORY_SPREAD)},
+    )

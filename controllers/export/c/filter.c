@@ -1,0 +1,133 @@
+
+/* --- the Kalman filter ----------------------------------------------------------------------------- */
+
+/* What blends the design points: the one before the speed asked for, and the next one. */
+typedef struct {
+    const design_point *point[2];
+    float weight[2];
+    int count;
+} blend;
+
+static void deviation(const float *state, const design_point *point, float *out)
+{
+    for (int j = 0; j < STATES; j++)
+        out[j] = state[j] - point->state_trim[j];
+}
+
+void coax_reset(coax_controller *c)
+{
+    for (int j = 0; j < STATES; j++)
+        c->state[j] = FIRST_STATE[j];
+    for (int j = 0; j < INTEGRALS; j++)
+        c->integral[j] = 0.0f;
+    for (int j = 0; j < COAX_COMMANDS; j++)
+        c->action[j] = c->asked[j] = 0.0f;
+    c->asked[DOWN] = -HOVER_HEIGHT;
+    c->speed = 0.0f;
+    c->row = 0;
+    c->started = 0;
+}
+
+/* The setpoint has moved: so has the estimate, which is relative to it. */
+static void follow(coax_controller *c, const float *before, float heading)
+{
+    float forward = c->asked[NORTH] - before[NORTH], right = c->asked[EAST] - before[EAST];
+    turn(&forward, &right, -heading);
+    if (STATE_X >= 0)
+        c->state[STATE_X] -= forward;
+    if (STATE_Y >= 0)
+        c->state[STATE_Y] -= right;
+    if (STATE_Z >= 0)
+        c->state[STATE_Z] -= c->asked[DOWN] - before[DOWN];
+    if (STATE_PSI >= 0)
+        c->state[STATE_PSI] -= wrapped(c->asked[HEADING] - before[HEADING]);
+}
+
+/* One design's part: readings as deviations from its trim, added to `reading`, and what those that are
+ * new make of the state, added to `change`; both by weight.
+ */
+static void correct_by(const coax_controller *c, const design_point *p, float weight,
+                       const float *seen, float *reading, float *change)
+{
+    const float(*gain)[STATES] = c->started ? p->gain[c->row] : p->first_gain;
+    float y[READINGS], expected[READINGS], dx[STATES], du[COAX_COMMANDS];
+
+    deviation(c->state, p, dx);
+    for (int j = 0; j < COAX_COMMANDS; j++)
+        du[j] = p->offset[j] + ACTION_SCALE[j] * c->action[j];
+    for (int k = 0; k < READINGS; k++) {
+        expected[k] = 0.0f;
+        for (int j = 0; j < STATES; j++)
+            expected[k] += p->C[k][j] * dx[j];
+        for (int j = 0; j < COAX_COMMANDS; j++)
+            expected[k] += p->D[k][j] * du[j];
+        y[k] = seen[PLACE[k]];
+    }
+    if (READ_PSI >= 0) { /* horizontal pairs, turned into the heading */
+        if (!isfinite(y[READ_PSI]))
+            y[READ_PSI] = expected[READ_PSI] + p->reading_trim[READ_PSI];
+        for (int j = 0; j < PAIRS; j++)
+            turn(&y[PAIR[j][0]], &y[PAIR[j][1]], -y[READ_PSI]);
+    }
+    for (int k = 0; k < READINGS; k++) {
+        float innovation;
+        y[k] -= p->reading_trim[k];
+        if (!isfinite(y[k])) { /* no number, no information */
+            reading[k] += weight * expected[k];
+            continue;
+        }
+        if (k == READ_PSI)
+            y[k] = wrapped(y[k]);
+        reading[k] += weight * y[k];
+        if (FLAG[k] >= 0 && !(seen[FLAG[k]] > 0.5f))
+            continue;
+        innovation = weight * (k == READ_PSI ? wrapped(y[k] - expected[k]) : y[k] - expected[k]);
+        for (int j = 0; j < STATES; j++)
+            change[j] += innovation * gain[k][j];
+    }
+}
+
+/* Readings as deviations from trim into `reading`, and the state corrected by those that are new. */
+static void correct(coax_controller *c, const blend *b, const float *seen, float *reading)
+{
+    float change[STATES] = {0.0f};
+
+    for (int k = 0; k < READINGS; k++)
+        reading[k] = 0.0f;
+    for (int s = 0; s < b->count; s++)
+        correct_by(c, b->point[s], b->weight[s], seen, reading, change);
+    for (int j = 0; j < STATES; j++)
+        c->state[j] += change[j];
+}
+
+/* On by one control period under the action that was given. */
+static void predict(coax_controller *c, const blend *b, const float *reading, int there)
+{
+    float next[STATES] = {0.0f}, dx[STATES], du[COAX_COMMANDS];
+
+    for (int s = 0; s < b->count; s++) {
+        const design_point *p = b->point[s];
+        deviation(c->state, p, dx);
+        for (int j = 0; j < COAX_COMMANDS; j++)
+            du[j] = p->offset[j] + ACTION_SCALE[j] * c->action[j];
+        for (int i = 0; i < STATES; i++) {
+            float sum = p->state_trim[i] + p->advance[i];
+            for (int j = 0; j < STATES; j++)
+                sum += p->A[i][j] * dx[j];
+            for (int j = 0; j < COAX_COMMANDS; j++)
+                sum += p->B[i][j] * du[j];
+            next[i] += b->weight[s] * sum;
+        }
+    }
+    for (int i = 0; i < STATES; i++)
+        c->state[i] = next[i];
+    if (STATE_PSI >= 0)
+        c->state[STATE_PSI] = wrapped(c->state[STATE_PSI]);
+    for (int k = 0; k < INTEGRALS; k++) {
+        if (there)
+            c->integral[k] += PERIOD * reading[INTEGRATED[k]];
+        c->integral[k] = within(c->integral[k], -MOST[k], MOST[k]);
+    }
+    c->row = (c->row + 1) % CYCLE;
+    c->started = 1;
+}

@@ -1,0 +1,38 @@
+
+/* --- the flight, seen from the target ------------------------------------------------------------- */
+
+/* The observation as that of a hover at the target, or on the way to it.
+ *
+ * asked: the setpoint, x y z psi; without a way or a reading that it takes, it stays the last one.
+ * Returns whether the setpoint is the target itself.
+ */
+static int see_from_target(const float *observation, const float *way, float *asked, float *seen)
+{
+    const float x = observation[AT_NORTH], y = observation[AT_EAST];
+    const float z = HEIGHT_SIGN * observation[AT_HEIGHT], psi = observation[AT_HEADING];
+    const float measured = x + y + z + psi, wanted = way[0] + way[1] + way[2] + way[3];
+    int there = 1;
+    if (isfinite(measured) && isfinite(wanted)) {
+        const float distance = fmaxf(hypotf(way[FORWARD], way[RIGHT]), LEAST_DISTANCE);
+        const float share = fminf(1.0f, REACH_PLACE / distance);
+        const float up = within(way[UP], -REACH_HEIGHT, REACH_HEIGHT);
+        const float turned = within(way[TURN], -REACH_HEADING, REACH_HEADING);
+        float north = way[FORWARD] * share, east = way[RIGHT] * share;
+        there = share >= 1.0f && up == way[UP] && turned == way[TURN];
+        turn(&north, &east, psi);
+        asked[NORTH] = x + north;
+        asked[EAST] = y + east;
+        asked[DOWN] = -z - up;
+        asked[HEADING] = psi + turned;
+    }
+    for (int k = 0; k < COAX_OBSERVED; k++)
+        seen[k] = observation[k];
+    seen[AT_NORTH] = x - asked[NORTH];
+    seen[AT_EAST] = y - asked[EAST];
+    turn(&seen[AT_NORTH], &seen[AT_EAST], -asked[HEADING]);
+    seen[AT_HEIGHT] = HEIGHT_SIGN * (HOVER_HEIGHT + z + asked[DOWN]);
+    seen[AT_HEADING] = wrapped(psi - asked[HEADING]);
+    if (AT_SPEED_NORTH >= 0)
+        turn(&seen[AT_SPEED_NORTH], &seen[AT_SPEED_EAST], -asked[HEADING]);
+    return there;
+}

@@ -1,0 +1,235 @@
+"""Two flights of one machine: what changed is named, and "the same" is the answer where nothing did."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shared_flights import shared_flight
+from study import pairs
+
+import coax_env
+from coax_env.comparison.candidates import scored
+from coax_env.comparison.compare import compare
+from coax_env.comparison.information import Information
+from coax_env.comparison.logbook import logbook, over_time
+from coax_env.comparison.two_flights import ROTOR_SPEED, MachineModel, read_two
+from coax_env.diagnosis.problem import Problem
+from coax_env.errors import InputError
+from coax_env.estimation.engine import Engine
+from coax_env.estimation.helicopter import record_of
+from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.estimation.parted_engine import Part, PartedEngine, joint_noise
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import FreeParameter
+from coax_env.logs.edits import edited
+from coax_env.logs.flight import Flight, Run, read_flight, write_flight
+from coax_env.model.vehicle_file import load_vehicle
+
+BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
+
+
+@cache
+def flight() -> Flight:
+    """Two runs, four seconds each."""
+    runs = []
+    for run in read_flight(BUNDLED).select(("lon_3211", "yaw_3211")).runs:
+        rows = run.t < run.t[0] + 4.0
+        measured = {c: values[rows] for c, values in run.measured.items()}
+        runs.append(replace(run, t=run.t[rows], command=run.command[rows], measured=measured))
+    return replace(read_flight(BUNDLED), runs=tuple(runs))
+
+
+# --- one likelihood of two flights ------------------------------------------------------------------
+
+
+@cache
+def two() -> tuple[PartedEngine, dict[str, float], object, list[FreeParameter]]:
+    """A run each, the second one's mass a number of its own."""
+    vehicle = load_vehicle("lama400d").in_air(flight().air)
+    model = MachineModel(vehicle)
+    engines = [Engine(model, [record_of(run)]) for run in flight().runs]
+    engine = PartedEngine([Part(n, e) for n, e in zip("AB", engines, strict=True)])
+    noise = starting_noise(flight(), vehicle)
+    values = {**vehicle.values(), "added_mass.mass": 0.0, "added_mass.mass@B": -0.03}
+    free = [
+        FreeParameter("added_mass.mass", 0.0, 0.05),
+        FreeParameter("added_mass.mass@B", 0.0, 0.05),
+    ]
+    return engine, values, joint_noise({"A": noise, "B": noise}), free
+
+
+def test_the_joint_likelihood_is_the_parts_sum():
+    engine, values, noise, _ = two()
+    apart = [
+        part.engine.log_likelihood(
+            {n: v for n, v in values.items() if "@" not in n}
+            | {"added_mass.mass": -0.03 if part.name == "B" else 0.0},
+            part.noise(noise),
+        )
+        for part in engine.parts
+    ]
+    assert engine.log_likelihood(values, noise) == pytest.approx(sum(apart), rel=1e-12)
+
+
+def test_a_change_is_the_second_flights_share_of_a_number():
+    """Its column is the number's own in B, and nothing in A."""
+    engine, values, noise, free = two()
+    _, lin = engine.linearise(values, noise, free)
+    of_a, of_b = lin.information
+    np.testing.assert_allclose(of_b, of_b[0, 0], rtol=1e-9)
+    assert of_a[0, 0] > 0.0 and not of_a[1].any() and not of_a[:, 1].any()
+    np.testing.assert_allclose(lin.slope[1], lin.slope[1, 0], rtol=1e-9)
+
+
+def test_rotors_that_turn_faster_per_command_are_commands_that_are_larger():
+    vehicle = load_vehicle("lama400d")
+    run = flight().runs[0]
+    values = vehicle.values()
+    model = MachineModel(vehicle)
+    faster = model.inputs(record_of(run), model.vector({**values, ROTOR_SPEED: 0.04}))
+    larger = record_of(edited(flight(), {"rotor_scale": 1.04}).runs[0])
+    np.testing.assert_allclose(faster, model.inputs(larger, model.vector(values)), rtol=1e-12)
+
+
+def test_a_changes_score_is_its_log_bayes_factor():
+    """One number x under N(0, s2), data N(x, 1/information): closed form, Jeffreys 1961."""
+    information, z, s = 400.0, 0.3, 0.2
+    quadratic = Quadratic(
+        ("x@B",), np.array([[information]]), np.array([-information * z]), np.zeros(1), np.zeros(1),
+        np.array([1.0 / s**2]), np.array([-10.0]), np.array([10.0]),
+        np.zeros((1, 1)), np.zeros((1, 1)),
+    )  # fmt: skip
+    group = (FreeParameter("x@B", 0.0, s),)
+    problem = Problem(None, None, (), {})
+    score = scored(problem, quadratic, "x", group)
+    spread = s**2 + 1.0 / information  # of z under the change; without it 1 / information
+    exact = 0.5 * z**2 * (information - 1.0 / spread) - 0.5 * np.log(spread * information)
+    assert score.nats == pytest.approx(exact, rel=1e-12)
+
+
+# --- what is refused --------------------------------------------------------------------------------
+
+
+def test_parts_of_one_flight_are_named_by_its_card(tmp_path):
+    first, second = flight().runs
+    both = replace(flight(), runs=(replace(first, part="A"), replace(second, part="B")))
+    write_flight(both, tmp_path / "f")
+    a, b = read_two(tmp_path / "f", None, None)
+    assert (a.flight.run_names, b.flight.run_names) == (("lon_3211",), ("yaw_3211",))
+    with pytest.raises(InputError, match=r'no \[\[run\]\] says part = "A"'):
+        read_two(flight(), None, None)
+    card = tmp_path / "f" / "card.toml"
+    card.write_text(card.read_text().replace('part = "B"', 'part = "C"'))
+    with pytest.raises(InputError, match=r'run\]\] 2 part should be "A" or "B", found \'C\''):
+        read_flight(tmp_path / "f")
+
+
+def test_flights_of_two_vehicles_are_refused():
+    with pytest.raises(InputError, match="flights of two vehicles, lama400d and skybotix_coax"):
+        read_two(flight(), replace(flight(), vehicle="skybotix_coax"), None)
+
+
+def test_a_logbook_needs_two_flights(tmp_path):
+    write_flight(flight(), tmp_path / "one")
+    with pytest.raises(InputError, match="1 flights; a logbook needs two"):
+        logbook(tmp_path)
+    write_flight(flight(), tmp_path / "two")
+    with pytest.raises(InputError, match="the same flight as"):
+        logbook(tmp_path)
+
+
+# --- numbers over flights ---------------------------------------------------------------------------
+
+
+def says(value: float, std: float) -> Information:
+    """A flight that knows one number."""
+    return Information(
+        ("mass",), np.array([value]), np.zeros(1), np.array([[1.0 / std**2]]), np.array([0.8]),
+        np.array([0.1]), 1.0,
+    )  # fmt: skip
+
+
+def link(a: Information, b: Information, changes: list[dict]) -> dict:
+    return {"information": [a.as_json(), b.as_json()], "changes": changes, "shared": []}
+
+
+def test_the_posterior_of_the_last_flight_is_the_prior_of_the_next():
+    first, second = says(0.78, 0.02), says(0.80, 0.01)
+    rows = over_time([link(first, second, [])])["mass"]["flights"]
+    precision = 1.0 / np.array([0.1, 0.02, 0.01]) ** 2
+    told = np.cumsum(precision * [0.8, 0.78, 0.80])
+    for row, k in zip(rows, (1, 2), strict=True):
+        assert row["value"] == pytest.approx(told[k] / precision[: k + 1].sum())
+        assert row["std"] == pytest.approx(precision[: k + 1].sum() ** -0.5)
+    alone = (precision[0] * 0.8 + precision[2] * 0.80) / (precision[0] + precision[2])
+    assert rows[1]["alone"] == pytest.approx(alone)
+
+
+def test_what_a_flight_says_is_kept_to_the_last_digit():
+    rng = np.random.default_rng(0)
+    square = rng.normal(size=(3, 3))
+    kept = Information(
+        ("a", "b", "c"), *rng.normal(size=(2, 3)), square @ square.T, *rng.normal(size=(2, 3)), 1.3
+    )
+    back = Information.of_json(kept.as_json())
+    for name in ("at", "slope", "matrix", "mean", "std"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(kept, name))
+    assert (back.names, back.inflation) == (kept.names, kept.inflation)
+
+
+# --- planted changes --------------------------------------------------------------------------------
+
+
+def pair(change: dict[str, dict[str, float]], seed: int) -> pairs.Pair:
+    """Still air, other densities, pilots and batteries; the same faults in both."""
+    return pairs.Pair(
+        0, change, pairs.FAULTS[0], ({"gusts": "none"}, {"gusts": "none"}), (1.2, 1.09),
+        ("usual", "slow_human"), 0.98, seed,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change", [{}, {"added_mass": {"mass": -0.06}}, {"swash_offset": {"lon": 0.012, "lat": 0.0}}]
+)
+def test_what_changed_is_named_and_nothing_else(change, tmp_path):
+    a, b = pairs.fly(pair(change, 5), tmp_path)
+    found = compare(a, b).changes
+    assert [c["effect"] for c in found["changes"]] == list(change), found["changes"]
+    assert found["verdict"] == ("changed" if change else "same")
+    for c in found["changes"]:
+        for name, p in c["parameters"].items():
+            planted = change[c["effect"]].get(name.partition(".")[2], 0.0)
+            assert abs(p["change"] - planted) < 3.0 * p["std"], name
+
+
+@pytest.mark.slow
+def test_a_logbook_grows_by_one_comparison(tmp_path):
+    pairs.fly(pair({}, 20), tmp_path)
+    first = logbook(tmp_path)
+    assert first["changes"] == [] and len(first["links"]) == 1
+    again = logbook(tmp_path, kept=first, done=lambda content: pytest.fail("compared again"))
+    assert again["numbers"] == first["numbers"]
+
+
+@pytest.mark.slow
+@pytest.mark.needs_shared_flights
+def test_halves_of_a_real_flight_are_the_same():
+    """The second CoaX, 20 s against the next 20 s: coloured innovations, and no change."""
+    log = read_flight(shared_flight("skybotix_second")).select(["4x5ft_2"])
+    a, b = (replace(log, runs=tuple(_half(run, late) for run in log.runs)) for late in (0, 1))
+    assert compare(a, b).changes["changes"] == []
+
+
+def _half(run: Run, late: int) -> Run:
+    """The first half of a run, or the second."""
+    rows = (run.t >= 0.5 * (run.t[0] + run.t[-1])) == bool(late)
+    return replace(
+        run,
+        t=run.t[rows],
+        command=run.command[rows],
+        measured={c: values[rows] for c, values in run.measured.items()},
+        battery=None if run.battery is None else run.battery[rows],
+    )

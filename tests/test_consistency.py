@@ -1,0 +1,308 @@
+"""A log that contradicts itself is refused with the line of its card to change; a sound one never is.
+
+Errors are planted through the card of a sound log, so that the right line is known: the entry
+without the error.
+"""
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import injector
+import numpy as np
+import pytest
+from shared_flights import shared_flight
+
+import coax_env
+from coax_env.consistency.agreement import Agreement, agreement, refuse_disagreement
+from coax_env.consistency.checks import names
+from coax_env.consistency.even_rows import STEP, weak
+from coax_env.errors import InputError
+from coax_env.estimation.flown import flown_parts
+from coax_env.logs.flight import Flight, read_flight, write_flight
+from coax_env.model.sensors import log_suite
+from coax_env.model.vehicle_file import load_vehicle
+from coax_env.simulation.simulate import fly_all, log_flight
+
+BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
+RUNS = (
+    "lon_3211",
+    "lat_3211",
+    "yaw_3211",
+    "climb_descend",
+    "forward_run",
+    "side_run",
+    "heading_turn",
+)
+"""Of a flight, that its errors are planted into: every axis."""
+MANEUVERS = ("lon_3211", "lat_3211", "heading_turn", "climb_descend")
+
+
+def checked(flight: Flight, waive: tuple[str, ...] = ()) -> Agreement:
+    vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
+    return agreement(flown_parts(flight, vehicle), vehicle, waive)
+
+
+@cache
+def with_positions(folder: Path) -> Path:
+    """A simulated flight with motion capture beside the default sensors."""
+    lama = load_vehicle("lama400d")
+    flown = fly_all(lama, MANEUVERS, seed=5)
+    flight = log_flight(lama, flown, log_suite("mocap"), noise=True, seed=5)
+    return write_flight(flight, folder)
+
+
+def planted(sound: Path, folder: Path, columns: str) -> Flight:
+    """The flight with these lines under [columns] of its card."""
+    shutil.copytree(sound, folder)
+    card = folder / "card.toml"
+    head, *runs = card.read_text().split("[[run]]")
+    asked = [run for run in runs if any(f'"{name}"' in run for name in RUNS)]
+    card.write_text("[[run]]".join([f"{head}\n[columns]\n{columns}\n", *asked]))
+    return read_flight(folder)
+
+
+# --- errors of a card -----------------------------------------------------------------------------
+
+
+def flipped(channel: str) -> tuple[str, str]:
+    return f"{channel} = {{ sign = -1 }}", own(channel)
+
+
+def own(channel: str, column: str = "") -> str:
+    return f'{channel} = {{ name = "{column or channel}" }}'
+
+
+def in_unit(unit: str, *channels: str) -> tuple[str, str]:
+    lines = "\n".join(f'{c} = {{ unit = "{unit}" }}' for c in channels)
+    return lines, "|".join(own(c) for c in channels)
+
+
+def swapped(*pairs: tuple[str, str]) -> tuple[str, str]:
+    both = [(a, b) for pair in pairs for a, b in (pair, pair[::-1])]
+    lines = "\n".join(own(a, b) for a, b in both)
+    return lines, "|".join(own(a) for a, _ in both)
+
+
+SIGNS = "p q r ax ay az phi theta psi h vn ve vd delta_lon delta_lat"
+PULSES = "delta_lon = { scale = 2500.0, offset = 0.6 }"
+ROTORS = (("rpm_upper_cmd", "rpm_lower_cmd"), ("rpm_upper", "rpm_lower"))
+ERRORS: Mapping[str, tuple[str, str]] = {
+    **{f"{channel} turned": flipped(channel) for channel in SIGNS.split()},
+    "gyros taken for deg/s": in_unit("deg/s", "p", "q", "r"),
+    "one gyro taken for deg/s": in_unit("deg/s", "q"),
+    "roll taken for deg": in_unit("deg", "phi"),
+    "attitude taken for deg": in_unit("deg", "phi", "theta", "psi"),
+    "attitude in turns": in_unit("rev", "theta"),
+    "accelerometers taken for g": in_unit("g", "ax", "ay", "az"),
+    "down accelerometer taken for g": in_unit("g", "az"),
+    "height in cm": in_unit("cm", "h"),
+    "velocities in km/h": in_unit("km/h", "vn", "ve", "vd"),
+    "swash in deg": in_unit("deg", "delta_lon", "delta_lat"),
+    "rotors in rev/s": in_unit("rev/s", "rpm_upper_cmd", "rpm_lower_cmd"),
+    "a rotor in rad/s": in_unit("rad/s", "rpm_upper_cmd"),
+    "rotors swapped": swapped(*ROTORS),
+    "rotor commands swapped": swapped(ROTORS[0]),
+    "gyros swapped": swapped(("p", "q")),
+    "roll and pitch swapped": swapped(("phi", "theta")),
+    "accelerometers swapped": swapped(("ax", "ay")),
+    "velocities swapped": swapped(("vn", "ve")),
+    "swash commands swapped": swapped(("delta_lon", "delta_lat")),
+    "z up, y left": (
+        "\n".join(flipped(c)[0] for c in ("q", "r", "ay", "az")),
+        "|".join(own(c) for c in ("q", "r", "ay", "az")),
+    ),
+    "heading half a turn off": ("psi = { offset = 3.14159 }", "psi = {"),
+    "swash as pulse widths": (PULSES, "delta_lon reaches|calibration = [["),
+    "rotor as pulse widths": (
+        "rpm_upper_cmd = { scale = 0.25, offset = 4000.0 }",
+        "rpm_upper_cmd-range|calibration = [[",
+    ),
+}
+ERRORS_OF_POSITIONS: Mapping[str, tuple[str, str]] = {
+    "pn turned": flipped("pn"),
+    "pe turned": flipped("pe"),
+    "positions swapped": swapped(("pn", "pe")),
+    "positions in feet": in_unit("ft", "pn", "pe"),
+    "position taken for cm": in_unit("cm", "pe"),
+    "psi turned": flipped("psi"),
+    "ve turned": flipped("ve"),
+}
+
+
+@pytest.mark.parametrize("what", ERRORS)
+def test_an_error_of_a_card_is_refused_with_the_line_to_change(tmp_path, what):
+    columns, right = ERRORS[what]
+    said_right(planted(BUNDLED, tmp_path / "f", columns), right)
+
+
+@pytest.mark.parametrize("what", ERRORS_OF_POSITIONS)
+def test_and_where_positions_are_logged(tmp_path, tmp_path_factory, what):
+    columns, right = ERRORS_OF_POSITIONS[what]
+    sound = with_positions(tmp_path_factory.getbasetemp() / "positions")
+    said_right(planted(sound, tmp_path / "f", columns), right)
+
+
+def said_right(flight: Flight, right: str) -> None:
+    vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
+    with pytest.raises(InputError) as caught:
+        refuse_disagreement(flown_parts(flight, vehicle), vehicle)
+    message = str(caught.value)
+    assert "\n" not in message
+    for words in right.split("|"):
+        assert words in message, message
+
+
+# --- sound logs -----------------------------------------------------------------------------------
+
+
+def test_the_bundled_flight_is_sound():
+    found = checked(read_flight(BUNDLED))
+    assert found.faults == () and found.advice is None and found.unseen == ()
+
+
+@pytest.mark.needs_shared_flights
+@pytest.mark.parametrize(
+    "name",
+    [
+        "open_none",
+        "open_near_ground",
+        "open_rigging",
+        "open_outside",
+        "skybotix_coax",
+        "skybotix_second",
+    ],
+)
+def test_no_shared_flight_is_refused(name):
+    assert checked(read_flight(shared_flight(name))).faults == ()
+
+
+FAULTS_OF_MACHINES = {
+    "swash phase of half a radian": {"swash_phase": {"angle": 0.5, "per_rpm": 0.0}},
+    "swash phase the other way": {"swash_phase": {"angle": -0.5, "per_rpm": 0.0}},
+    "turned markers": {"frame_yaw": 0.5},
+    "gyro bias": {"gyro_bias": {"x": 0.15, "y": -0.15, "z": 0.15}},
+    "weak swash": {"swash_gain": -0.5},
+    "slow motors and servos": {"motor_lag": {"upper": 0.3, "lower": 0.3}, "servo_lag": 0.1},
+    "late poses": {"pose_delay": 0.15},
+    "wind on a draggy rotor": {"wind": {"north": 3.0, "east": -3.0}, "rotor_drag": 7e-4},
+    "bent sensors": {
+        "imu_tilt": {"x": 0.1, "y": -0.1},
+        "attitude_bias": {"x": 0.08, "y": 0.08, "z": 0.3},
+    },
+    "wrong torques": {"torque_balance": 0.2, "yaw_inertia": 0.6, "yaw_damping": 0.01},
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS_OF_MACHINES)
+def test_a_fault_of_the_machine_is_none_of_the_log(tmp_path, fault):
+    """Strong ones, in gusts, with positions: each is for the diagnosis to find."""
+    effects = FAULTS_OF_MACHINES[fault]
+    runs = ("lon_3211", "lat_3211", "yaw_3211", "forward_run")
+    folder = injector.fly(
+        tmp_path / "f", effects, gusts=True, sensors="pose" if "pose_delay" in effects else "full",
+        runs=runs, seed=11,
+    )  # fmt: skip
+    assert checked(read_flight(folder)).faults == ()
+
+
+# --- what is asked --------------------------------------------------------------------------------
+
+
+def test_a_weak_derivative_is_the_derivative():
+    """Of a cubic, whose mean derivatives over a symmetric window are known; noise is averaged."""
+    t = STEP * np.arange(500)
+    starts = np.array([0, 50, 120])
+    middle = t[starts] + 1.0
+    spread = 1.0 / 9.0  # variance of the weight (1 - s^2)^3
+    np.testing.assert_allclose(
+        weak(t**3, starts, 2.0, 0), middle**3 + 3 * middle * spread, atol=1e-3
+    )
+    np.testing.assert_allclose(weak(t**3, starts, 2.0, 1), 3 * (middle**2 + spread), rtol=2e-3)
+    np.testing.assert_allclose(weak(t**3, starts, 2.0, 2), 6.0 * middle, rtol=2e-3)
+
+
+def test_a_column_that_was_written_in_another_unit_is_found():
+    """Not by the card: the roll column itself is in degrees already divided by 57.3 once too often."""
+    flight = read_flight(BUNDLED).select(RUNS)
+    runs = tuple(
+        replace(r, measured={c: y / 57.29578 if c == "phi" else y for c, y in r.measured.items()})
+        for r in flight.runs
+    )
+    found = checked(replace(flight, runs=runs))
+    assert found.advice is not None and found.advice.left == ()
+    assert found.advice.lines == ("phi = { scale = 57.2958 }",)
+
+
+def test_a_check_can_be_waived(tmp_path):
+    flight = planted(BUNDLED, tmp_path / "f", "h = { sign = -1 }")
+    vehicle = load_vehicle("lama400d").in_air(flight.air)
+    assert {f.check for f in checked(flight).faults} == {"h-vd", "h-range"}
+    remarks = refuse_disagreement(flight, vehicle, ("h-vd", "h-range"))
+    assert [r.partition(":")[0] for r in remarks] == ["check h-vd waived", "check h-range waived"]
+    card = tmp_path / "f" / "card.toml"
+    card.write_text(card.read_text() + '\n[checks]\nwaive = ["h-vd"]\n')
+    assert {f.check for f in checked(read_flight(tmp_path / "f")).faults} == {"h-range"}
+    with pytest.raises(InputError, match=r"no check 'theta-qq' to waive: 'theta-q' is meant\?"):
+        refuse_disagreement(flight, vehicle, ("theta-qq",))
+
+
+def test_every_fault_can_be_waived_by_its_name(tmp_path):
+    known = names()
+    for what in ("down accelerometer taken for g", "swash as pulse widths", "rotors swapped"):
+        flight = planted(BUNDLED, tmp_path / what, ERRORS[what][0])
+        failed = tuple(f.check for f in checked(flight).faults)
+        assert failed and set(failed) <= set(known)
+        assert checked(flight, failed).faults == ()
+
+
+def test_air_of_another_planet_and_unlogged_swash_are_refused(tmp_path):
+    shutil.copytree(BUNDLED, tmp_path / "f")
+    card = tmp_path / "f" / "card.toml"
+    card.write_text(card.read_text().replace("density = 1.14", "density = 1140"))
+    assert [f.check for f in checked(read_flight(tmp_path / "f")).faults] == ["density-range"]
+    card.write_text(card.read_text().replace("density = 1140", "density = 1.14"))
+    csv = tmp_path / "f" / "hover.csv"
+    csv.write_text(csv.read_text().replace("delta_lat", "aileron_pwm", 1))
+    (swash,) = checked(read_flight(tmp_path / "f")).faults
+    assert swash.check == "swash-logged" and "aileron_pwm" in swash.words
+
+
+@pytest.mark.parametrize(
+    ("change", "check"),
+    [
+        ({"theta": -1.0}, "theta-q"), ({"delta_lon": -1.0}, "q-delta_lon"), ({"rpm": 0.1047},
+        "cmd-range"),
+    ],
+)  # fmt: skip
+def test_a_run_whose_file_is_unlike_the_others_is_named(change, check):
+    """Pooled with sound runs it only weakens them; no line of the card would be right for all."""
+    flight = read_flight(BUNDLED)
+    odd = flight.run("lon_3211")
+    speed = change.get("rpm", 1.0)
+    odd = replace(
+        odd,
+        measured={c: change.get(c, 1.0) * y for c, y in odd.measured.items()},
+        command=odd.command * [speed, speed, change.get("delta_lon", 1.0), 1.0],
+    )
+    runs = tuple(odd if run.name == odd.name else run for run in flight.runs)
+    found = checked(replace(flight, runs=runs))
+    assert any(f.check.endswith(check) and "in run lon_3211" in f.words for f in found.faults)
+    assert all("correct the file of that run" in f.hint for f in found.faults)
+
+
+@pytest.mark.parametrize("script", ["diagnose", "identify", "replay"])
+def test_the_scripts_refuse_in_one_line(tmp_path, monkeypatch, script):
+    """What ran for 290 s before and gave false causes; nothing is written."""
+    import importlib
+
+    planted(BUNDLED, tmp_path / "f", "theta = { sign = -1 }")
+    module = importlib.import_module(script)
+    monkeypatch.setattr(
+        "sys.argv", [f"{script}.py", str(tmp_path / "f"), "--out", str(tmp_path / "out")]
+    )
+    with pytest.raises(InputError, match=r'theta = \{ name = "theta" \}.*--waive theta-q,vn-theta'):
+        module.main()
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,179 @@
+"""Rotors that jitter: what the filter's two states more do, and what is named where they are flown.
+
+Without jitter the model is the helicopter's own; with it, its steps and readings follow from the
+helicopter's by a command and a yaw rate that are shifted, and its likelihood's slopes from differences.
+"""
+
+import math
+from dataclasses import replace
+
+import injector
+import numpy as np
+import pytest
+from injector_air import GUSTY
+
+from coax_env import diagnose, load_vehicle, simulate
+from coax_env.diagnosis.searched import SHOWN_BY
+from coax_env.estimation.engine import Engine
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import (
+    JITTER_LEVEL,
+    JITTER_MEMORY,
+    fitted_levels,
+    starting_noise,
+)
+from coax_env.estimation.noise_levels import fit_noise, level_slopes
+from coax_env.estimation.rotor_jitter import JITTER, N_JITTERY, REACTION, JitteryModel, with_jitter
+from coax_env.estimation.state_space import Noise
+from coax_env.model import dynamics
+from coax_env.model import state as S
+from coax_env.model.layout import CHANNELS, N_CHANNELS, N_FULL, RPM_PER_RAD_S
+
+LAMA = load_vehicle("lama400d")
+PLAIN = HeliModel(LAMA)
+MODEL = JitteryModel.like(PLAIN)
+LEVELS = Noise({JITTER_LEVEL: 0.5, JITTER_MEMORY: 0.08})
+HOVER, COMMAND = dynamics.hover_trim(LAMA)
+DT = 0.01
+
+
+def vector(reaction: float = 1.0) -> np.ndarray:
+    return MODEL.vector({REACTION.name: reaction}, LEVELS)
+
+
+def state(upper: float, lower: float) -> np.ndarray:
+    x = np.zeros(N_JITTERY)
+    x[:N_FULL] = dynamics.full_state(HOVER, COMMAND, LAMA)
+    x[S.R], x[S.U] = 0.2, 0.5
+    x[JITTER] = upper, lower
+    return x
+
+
+def read(model: HeliModel, x: np.ndarray, command: np.ndarray, p: np.ndarray) -> np.ndarray:
+    out, work = np.zeros(N_CHANNELS), np.zeros(model.work_size)
+    model.measure.__wrapped__(x, dynamics.kernel_input(command), p, work, out)
+    return out
+
+
+def stepped(model: HeliModel, x: np.ndarray, command: np.ndarray, p: np.ndarray) -> np.ndarray:
+    out, work = np.zeros(x.size), np.zeros(model.work_size)
+    model.step.__wrapped__(x, dynamics.kernel_input(command), DT, p, work, out)
+    return out
+
+
+def taken_up(upper: float, lower: float) -> float:
+    """Angular momentum of both rotors, over the body's yaw inertia."""
+    own = LAMA.values()
+    momentum = (own["rotor_inertia_upper"] + own["flybar_inertia"]) * upper
+    return (momentum - own["rotor_inertia_lower"] * lower) / own["inertia_zz"]
+
+
+@pytest.mark.parametrize("reaction", [0.0, 0.7])
+def test_jitter_is_speed_on_top_of_the_command_and_turns_the_body(reaction):
+    """As commands and a yaw rate that are shifted by it do; and it fades by its memory."""
+    x, p = state(1.5, -0.8), vector(reaction)
+    faster = COMMAND + [1.5, -0.8, 0.0, 0.0]
+    turned = x[:N_FULL].copy()
+    turned[S.R] += reaction * taken_up(1.5, -0.8)
+    shown = read(MODEL, x, COMMAND, p)
+    np.testing.assert_allclose(shown, read(PLAIN, turned, faster, LAMA.vector), rtol=1e-12)
+    at_rest = read(MODEL, state(0.0, 0.0), COMMAND, p)
+    assert shown[0] - at_rest[0] == pytest.approx(1.5 * RPM_PER_RAD_S)
+    rate = CHANNELS.index("r")
+    assert shown[rate] - at_rest[rate] == pytest.approx(reaction * taken_up(1.5, -0.8))
+    later = stepped(MODEL, x, COMMAND, p)
+    expected = stepped(PLAIN, turned, faster, LAMA.vector)
+    expected[S.R] -= reaction * taken_up(1.5, -0.8)
+    np.testing.assert_allclose(later[:N_FULL], expected, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(later[JITTER], math.exp(-DT / 0.08) * x[JITTER])
+
+
+def test_a_reaction_that_the_vehicle_has_is_not_counted_twice():
+    """The effect `spin_up_reaction` gives the body all that a change of speed does: no more is left."""
+    p = MODEL.vector({"spin_up_reaction.gain": 1.0, REACTION.name: 1.0}, LEVELS)
+    rate = CHANNELS.index("r")
+    assert read(MODEL, state(1.5, -0.8), COMMAND, p)[rate] == pytest.approx(0.2)
+
+
+def test_without_jitter_it_is_the_helicopters_own_model_to_the_last_digit():
+    x, p = state(0.0, 0.0), vector()
+    assert np.array_equal(read(MODEL, x, COMMAND, p), read(PLAIN, x[:N_FULL], COMMAND, LAMA.vector))
+    alone = stepped(PLAIN, x[:N_FULL], COMMAND, LAMA.vector)
+    assert np.array_equal(stepped(MODEL, x, COMMAND, p)[:N_FULL], alone)
+
+
+def test_the_drift_is_what_the_step_adds_to_first_order():
+    x, p = state(1.5, -0.8), vector()
+    out, work = np.zeros(N_JITTERY + N_CHANNELS), np.zeros(MODEL.work_size)
+    u = dynamics.kernel_input(COMMAND)
+    MODEL.drift_and_readings.__wrapped__(x, u, 1e-4, p, work, out)
+    later = np.zeros(N_JITTERY)
+    MODEL.step.__wrapped__(x, u, 1e-4, p, work, later)
+    np.testing.assert_allclose(out[:N_JITTERY], later - x, rtol=2e-2, atol=1e-7)
+    np.testing.assert_allclose(out[N_JITTERY:], read(MODEL, x, COMMAND, p), rtol=1e-9)
+
+
+def test_jitter_is_stationary_at_its_level():
+    """x' = -x / tau + w has variance q tau / 2; all else is the helicopter's noise."""
+    noise = with_jitter(Noise({}), PLAIN).with_levels({JITTER_LEVEL: 0.5, JITTER_MEMORY: 0.08})
+    q, decay = MODEL.process_noise(noise, vector())
+    plain = PLAIN.process_noise(Noise({}), LAMA.vector)
+    assert q[JITTER] / (2.0 * decay[JITTER]) == pytest.approx([0.25, 0.25])
+    assert MODEL.start_noise(noise)[JITTER] == pytest.approx([0.25, 0.25])
+    assert np.array_equal(np.delete(q, [N_FULL, N_FULL + 1]), plain.intensity)
+    places = MODEL.noise_places
+    assert places.shape == (q.size, 2) and np.array_equal(places[JITTER], [[29, 29], [30, 30]])
+
+
+@pytest.fixture(scope="module")
+def engine_and_noise():
+    """Six seconds whose measured rotor speeds jitter by 0.6 rad/s for 60 ms, made here."""
+    flight = simulate(LAMA, "yaw_3211", seed=3, sensors="onboard")
+    record = record_of(flight.runs[0])
+    rows = record.t < record.t[0] + 6.0
+    z, rng = record.z[rows].copy(), np.random.default_rng(4)
+    left = math.exp(-0.01 / 0.06)
+    jitter = np.zeros(2)
+    for row in z:
+        jitter = left * jitter + math.sqrt(1.0 - left**2) * 0.6 * rng.standard_normal(2)
+        row[:2] += RPM_PER_RAD_S * jitter
+        row[CHANNELS.index("r")] += taken_up(*jitter)
+    short = replace(record, t=record.t[rows], command=record.command[rows], z=z)
+    noise = with_jitter(starting_noise(flight, LAMA), PLAIN)
+    return Engine(MODEL, [short]), noise
+
+
+def test_slopes_in_level_and_memory_are_those_of_the_likelihood(engine_and_noise):
+    """That in the memory is half as large again here, why is not known; it leads to where it should."""
+    engine, noise = engine_and_noise
+    noise = replace(noise.with_levels({JITTER_LEVEL: 0.4, JITTER_MEMORY: 0.1}), prior={})
+    values = engine.model.bare_values
+    score = engine.noise_score(values, noise)
+    for name, off in ((JITTER_LEVEL, 0.1), (JITTER_MEMORY, 0.5)):
+        found = level_slopes(engine, values, noise, name, score)[0].sum()
+        sides = [
+            engine.log_likelihood(values, noise.with_levels({name: f * noise.level(name)}))
+            for f in (1.02, 1.0 / 1.02)
+        ]
+        exact = (sides[0] - sides[1]) / (2.0 * math.log(1.02))
+        assert found == pytest.approx(exact, rel=off), name
+
+
+def test_a_planted_level_and_memory_return(engine_and_noise):
+    engine, noise = engine_and_noise
+    found = fit_noise(engine, engine.model.bare_values, noise, fitted_levels(noise), 20, 0.1)
+    assert found.level(JITTER_LEVEL) == pytest.approx(0.6, rel=0.15)
+    assert found.level(JITTER_MEMORY) == pytest.approx(0.06, rel=0.35)
+
+
+@pytest.mark.slow
+def test_nothing_is_named_where_rotor_speeds_jitter(tmp_path):
+    """Before, it was a yaw damping and a gyro's scale, and coloured rotor speeds."""
+    air = GUSTY._replace(trim_thrust=0.002, trim_torque=0.003, jitter=0.5)
+    runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "forward_run", "heading_turn")
+    injector.fly(tmp_path, {}, gusts=air, seed=11, runs=runs, longest=14.0)
+    found = diagnose(tmp_path)
+    assert [c["effect"] for c in found.findings["causes"]] == []
+    assert not {u["channel"] for u in found.findings["unexplained"]} & set(SHOWN_BY)
+    assert found.findings["noise"][JITTER_LEVEL]["value"] == pytest.approx(0.5, rel=0.15)
+    assert found.findings["noise"][JITTER_MEMORY]["value"] == pytest.approx(0.05, rel=0.4)

@@ -1,0 +1,93 @@
+"""Derivatives by SIMD lanes, in portions of a run, against one move after the other."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import coax_env
+from coax_env.estimation import engine as engines
+from coax_env.estimation.engine import Engine
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.estimation.sparse import find_non_zeros, padded, with_places
+from coax_env.estimation.state_space import part
+from coax_env.logs.flight import read_flight
+from coax_env.model import effects
+from coax_env.model.vehicle_file import load_vehicle
+
+WINDY = Path(coax_env.__file__).parent / "logs/flights/windy"
+ACTIVE = {"motor_lag.upper": 0.07, "motor_lag.lower": 0.06, "servo_rate.limit": 3.0,
+          "wind.north": -1.0, "rotor_drag.coefficient": 3e-4, "gyro_bias.y": -0.01}  # fmt: skip
+
+
+class OneByOne(HeliModel):
+    """The same helicopter, its derivatives taken one after the other."""
+
+    side_by_side = None
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """A vehicle, three seconds of a flight, its noise, and every parameter that may be free."""
+    flight = read_flight(WINDY)
+    vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
+    record = record_of(flight.runs[0])
+    record = part(record, record.t < record.t[0] + 3.0)
+    model = HeliModel(vehicle)
+    free = model.base_parameters()
+    for name, entry in effects.CATALOGUE.items():
+        if not entry.line and not entry.named_as:
+            free += model.effect_parameters(name)
+    values = {f.name: f.value for f in free} | model.bare_values
+    return vehicle, record, starting_noise(flight, vehicle), free, values
+
+
+@pytest.mark.parametrize("active", [{}, ACTIVE], ids=["bare", "six effects"])
+def test_derivatives_in_lanes_are_those_one_by_one(flown, active):
+    """Likelihood and signatures to the rounding of their differences, effects on or off."""
+    vehicle, record, noise, free, values = flown
+    both = []
+    for kind in (HeliModel, OneByOne):
+        (run,), lin = Engine(kind(vehicle), [record]).linearise({**values, **active}, noise, free)
+        both.append((run.log_likelihood, lin))
+    (ours, lanes), (theirs, single) = both
+    assert_allclose(ours, theirs, atol=1e-6)
+    size = np.sqrt(np.diag(single.information[0])) + 1e-30
+    scale = np.outer(size, size)
+    assert_allclose(lanes.information[0] / scale, single.information[0] / scale, atol=1e-6)
+    assert_allclose(lanes.blocks / size, single.blocks / size, atol=1e-5)
+    assert_allclose(
+        lanes.by_channel[0].sum(1), np.diag(lanes.information[0]), rtol=1e-9, atol=1e-30
+    )
+
+
+def test_portions_of_a_run_are_the_run(flown, monkeypatch):
+    vehicle, record, noise, free, values = flown
+    found = []
+    for count in (1, 100):
+        monkeypatch.setattr(engines, "BLOCKS_AT_ONCE", count)
+        found.append(Engine(HeliModel(vehicle), [record]).linearise(values, noise, free)[1])
+    for name in ("information", "blocks", "by_channel"):
+        one, whole = getattr(found[0], name), getattr(found[1], name)
+        assert_allclose(one, whole, rtol=1e-8, atol=1e-9 * np.abs(whole).max())
+
+
+def test_rows_between_jacobians_follow_the_clock():
+    """Every 40 ms on a log faster than 100 Hz, every fourth row of a slower one."""
+    rows = [
+        engines._rows_between_jacobians(np.full(50, 1.0 / rate)) for rate in (25, 100, 200, 500)
+    ]
+    assert rows == [4, 4, 8, 20]
+
+
+def test_non_zeros_are_found_again_where_they_change():
+    A = with_places(np.zeros((3, padded(20))), 20)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        A.values[:, :20] = rng.normal(size=(3, 20)) * (rng.random((3, 20)) < 0.3)
+        A.values[1, 7] = np.nan
+        find_non_zeros(A)
+        for row, places, count in zip(A.values, A.places, A.counts, strict=True):
+            assert list(places[:count]) == list(np.flatnonzero(row[:20] != 0.0))
