@@ -12,7 +12,11 @@ CHANNEL_NAMES = {
     "pn": "position north", "pe": "position east", "v": "speed",
 }  # fmt: skip
 
-UNITS = {"m/s2": "m/s²", "kg m2": "kg m²", "m2": "m²", "1": "", "N m": "N m", "rev/min": "rpm"}
+UNITS = {
+    "m/s2": "m/s²", "kg m2": "kg m²", "m2": "m²", "1": "", "rev/min": "rpm",
+    "rad": "°", "rad/s": "°/s",
+}  # fmt: skip
+"""Units as files have them -> as they are read; angles and rates in degrees, see `read_factor`."""
 
 
 def plain(name: str) -> str:
@@ -37,8 +41,31 @@ def channel_name(channel: str) -> str:
 
 
 def unit_name(unit: str) -> str:
-    """``m/s2`` as ``m/s²``."""
+    """``m/s2`` as ``m/s²``, ``rad`` as ``°``."""
     return UNITS.get(unit, unit)
+
+
+def read_factor(unit: str) -> float:
+    """What a number in a file's unit is multiplied by to be in `unit_name`'s: 57.3 for angles."""
+    return math.degrees(1.0) if unit in ("rad", "rad/s") else 1.0
+
+
+def with_unit(value: float | None, unit: str, digits: int = 3) -> str:
+    """``0.30 m/s²``; an angle of 0.1 rad as ``5.73°``; a dash for none.
+
+    Args:
+        value: in `unit`.
+        unit: as vehicle files write it, ``"m/s2"``.
+        digits: significant ones.
+    """
+    if value is None or not math.isfinite(value):
+        return number(None)
+    return _joined(number(read_factor(unit) * value, digits), unit_name(unit))
+
+
+def _joined(text: str, shown: str) -> str:
+    """A number and its unit: no space before the sign of a degree."""
+    return f"{text}{shown}" if shown.startswith("°") else f"{text} {shown}".strip()
 
 
 def seconds(time: float) -> str:
@@ -84,17 +111,18 @@ def with_std(value: float, std: float | None, unit: str) -> str:
         std: its standard deviation in the same unit; 0, None or not finite: the number alone.
         unit: as vehicle files write it, ``"m/s2"``.
     """
-    shown = UNITS.get(unit, unit)
+    shown = unit_name(unit)
     if not std or not math.isfinite(std):
-        return f"{number(value)} {shown}".strip()
+        return with_unit(value, unit)
+    value, std = read_factor(unit) * value, read_factor(unit) * std
     place = max(1 - math.floor(math.log10(abs(std))), 0)
     if place > 5:
         power = math.floor(math.log10(max(abs(value), std)))
         scale = 10.0**-power
-        return f"({value * scale:.2f} ± {std * scale:.2f})·10^{power} {shown}".replace(
-            "-", "−"
-        ).strip()
-    return f"{value:.{place}f} ± {std:.{place}f} {shown}".replace("-", "−").strip()
+        text = f"({value * scale:.2f} ± {std * scale:.2f})·10^{power}"
+    else:
+        text = f"{value:.{place}f} ± {std:.{place}f}"
+    return _joined(text.replace("-", "−"), shown)
 
 
 def whole_percent(value: float | None) -> str:
@@ -111,15 +139,15 @@ def bounds(value: float, half: float, unit: str, signed: bool = False) -> str:
         unit: as vehicle files write it, ``"m/s2"``.
         signed: with a plus where positive.
     """
-    shown = UNITS.get(unit, unit)
-    space = "" if shown.startswith("°") or not shown else " "
+    value, half = read_factor(unit) * value, read_factor(unit) * half
+    shown = unit_name(unit)
     if not half or not math.isfinite(half):
         plus = "+" if signed and value > 0.0 else ""
-        return f"{plus}{number(value)}{space}{shown}"
+        return _joined(f"{plus}{number(value)}", shown)
     power = math.floor(math.log10(half))
     place = max(-power if half >= 3.0 * 10.0**power else 1 - power, 0)
     ends = f"({_to_place(value - half, place)} to {_to_place(value + half, place)})"
-    return f"{_to_place(value, place, signed)}{space}{shown} {ends}"
+    return f"{_joined(_to_place(value, place, signed), shown)} {ends}"
 
 
 def _to_place(value: float, place: int, signed: bool = False) -> str:

@@ -3,19 +3,19 @@
 import argparse
 import os
 import re
+import shlex
 import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from tqdm import tqdm
-
 from coax_env.errors import InputError, MissingPackage
 from coax_env.files import read_toml, write_text
+from coax_env.progress import shown
 from coax_env.workers import BACKENDS
 
+progress = shown
+"""A bar with the step and the time; one plain line a step where output is a file."""
 BAD_INPUT = 2
 INTERRUPTED = 130
 called_as_verb = False
@@ -163,6 +163,15 @@ def as_called(text: str) -> str:
     return re.sub(r"\bscripts/(\w+)\.py", r"coax \1", text)
 
 
+def typed(name: str) -> str:
+    """The command line as it was typed: what makes the results again.
+
+    Args:
+        name: of the script.
+    """
+    return as_called(f"scripts/{name}.py {shlex.join(sys.argv[1:])}")
+
+
 def print_columns(rows: Sequence[Sequence[str]]) -> None:
     """Rows of words in aligned columns."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
@@ -182,28 +191,6 @@ def write_report(path: Path, make: Callable[[], str]) -> str:
     except MissingPackage as error:
         return f"no report: {error}"
     return f"report {path}"
-
-
-@contextmanager
-def progress(name: str) -> Iterator[Callable[[str], None]]:
-    """A spinner with the time and what is being done; one plain line a step where output is a file."""
-    if not sys.stderr.isatty():
-        yield lambda text: print(f"{name}: {text}", file=sys.stderr, flush=True)
-        return
-    with tqdm(bar_format="{desc} [{elapsed}]", desc=name) as bar:
-        stop = threading.Event()
-
-        def tick() -> None:
-            while not stop.wait(0.5):
-                bar.refresh()
-
-        thread = threading.Thread(target=tick, daemon=True)
-        thread.start()
-        try:
-            yield lambda text: bar.set_description_str(f"{name}: {text}")
-        finally:
-            stop.set()
-            thread.join()
 
 
 def run(main: Callable[[], None]) -> NoReturn:

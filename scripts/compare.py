@@ -1,8 +1,6 @@
 """Find what changed in a machine between two flights, or between two parts of one."""
 
 import argparse
-import shlex
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +19,7 @@ def main() -> None:
 
     with command_line.progress("comparison") as report_progress:
         result = compare(options.a, options.b, options.vehicle, progress=report_progress)
-    save(result, options.out, "scripts/compare.py " + shlex.join(sys.argv[1:]))
+    save(result, options.out, command_line.typed("compare"))
     print("\n".join(summary(result.changes)))
     print(f"changes {options.out / 'changes.json'}, report {options.out / 'report.html'}")
 

@@ -2,8 +2,6 @@
 
 import argparse
 import os
-import shlex
-import sys
 from pathlib import Path
 
 import command_line
@@ -34,7 +32,7 @@ def main() -> None:
         )  # fmt: skip
     write_json(options.out / "models.json", content)
     write_text(options.out / "vehicle.toml", vehicle_toml(result.vehicle_after))
-    words = "scripts/compare_models.py " + shlex.join(sys.argv[1:])
+    words = command_line.typed("compare_models")
     page = model_comparison.models_page(content, controllers, machine, words)
     write_text(options.out / "report.html", page)
 
@@ -69,7 +67,7 @@ def compare_machines(options: argparse.Namespace) -> None:
         ):  # fmt: skip
             results.append(found)
             write_json(options.out / f"{kind}.json", machines.summary(results))
-    words = "scripts/compare_models.py " + shlex.join(sys.argv[1:])
+    words = command_line.typed("compare_models")
     write_text(options.out / "report.html", machines.machines_page(results, words))
     command_line.print_columns([machines.HEADER, *machines.rows(results)])
     print("\n".join(machines.in_words(machines.summary(results))))

@@ -6,6 +6,8 @@ present, they follow.
 """
 
 import json
+import shlex
+import sys
 from pathlib import Path
 from time import monotonic
 
@@ -14,7 +16,7 @@ import diagnose as diagnose_script
 
 import coax_env
 from coax_env import plain_words
-from coax_env.diagnosis.diagnose import Diagnosis, diagnose
+from coax_env.diagnosis.diagnose import SHARES, Diagnosis, diagnose
 from coax_env.files import write_json
 from coax_env.logs.flight import read_flight
 from coax_env.model.vehicle import Vehicle
@@ -44,14 +46,16 @@ def main() -> None:
     )
     print("   both flown in CoaxHeli-v0 on the true machine, 20 episodes of 20 s:")
     scores = compare_controllers(result, true_vehicle(truth), options.out)
-    save(result, options.out, scores)
+    save(result, options.out, shlex.join(["scripts/demo", *sys.argv[1:]]), scores)
 
     if REAL.is_dir() and not options.no_real:
         print(
             "\n3. Real flights of a Skybotix CoaX (M. Faessler, GRASP Lab, 2011): fitted on hover"
         )
         print("   and vertical_sine, predicted on circles, which is held out of the fit.")
-        save(diagnose_and_print("real", REAL, ["circles"]), options.out / "real")
+        real = diagnose_and_print("real", REAL, ["circles"])
+        out = options.out / "real"
+        save(real, out, f"scripts/diagnose.py {REAL} --hold-out circles --out {out}")
     print(f"\n{monotonic() - start:.0f} s in all. Open {options.out / 'report.html'} in a browser.")
 
 
@@ -63,22 +67,24 @@ def diagnose_and_print(name: str, flight: Path, hold_out: list[str] | None) -> D
         flight: its folder.
         hold_out: runs on which the gain is measured; None: chosen by the diagnosis.
     """
-    with command_line.progress(name) as report_progress:
+    with command_line.progress(name, SHARES) as report_progress:
         result = diagnose(read_flight(flight), hold_out=hold_out, progress=report_progress)
     print_errors(result)
     print(indented(diagnose_script.summary(result)))
     return result
 
 
-def save(result: Diagnosis, out: Path, scores: ControllerScores | None = None) -> None:
+def save(
+    result: Diagnosis, out: Path, command: str, scores: ControllerScores | None = None
+) -> None:
     """Write a diagnosis and its report.
 
     Args:
         result: of the diagnosis.
         out: folder of the results.
+        command: that makes them again.
         scores: of controllers designed on both models.
     """
-    command = f"scripts/diagnose.py {result.flight.path} --out {out}"
     print(f"   {diagnose_script.save(result, out, command, scores)}")
 
 

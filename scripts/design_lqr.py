@@ -1,8 +1,6 @@
 """Design a hover controller (LQR with integral action, and a Kalman filter) on a vehicle."""
 
 import argparse
-import shlex
-import sys
 
 import command_line
 
@@ -43,7 +41,7 @@ def main() -> None:
     extreme = margins.worst_over_spread(controller, vehicle, seed=options.seed)
     page = design_page(
         controller, vehicle, inputs, disk, score, worst, spread,
-        "scripts/design_lqr.py " + shlex.join(sys.argv[1:]), extreme,
+        command_line.typed("design_lqr"), extreme,
     )  # fmt: skip
     make_folder(options.out)
     path = controller.save(options.out / "controller.json")

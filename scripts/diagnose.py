@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -35,11 +34,18 @@ def main() -> None:
         return
     for file in options.effect:
         load_effect(file)
-    with command_line.progress("diagnosis") as report_progress:
+    with command_line.progress("diagnosis", time_shares()) as report_progress:
         result, page = diagnosed(flights[0], options, options.out, report_progress)
     print(summary(result))
     print(f"findings {options.out / 'findings.json'}, corrected vehicle "
           f"{options.out / 'vehicle.toml'}, {page}")  # fmt: skip
+
+
+def time_shares() -> Mapping[str, float]:
+    """When a diagnosis' steps come, for the time that is left; imports what it needs late."""
+    from coax_env.diagnosis.diagnose import SHARES
+
+    return SHARES
 
 
 def diagnosed(
@@ -67,7 +73,7 @@ def diagnosed(
         waive=options.waive,
     )
     scores = fly_both(result, report_progress) if options.fly else None
-    return result, save(result, out, "scripts/diagnose.py " + shlex.join(sys.argv[1:]), scores)
+    return result, save(result, out, command_line.typed("diagnose"), scores)
 
 
 # --- many flights -----------------------------------------------------------------------------------
@@ -103,7 +109,7 @@ def of_many(flights: Sequence[Path], options: argparse.Namespace) -> None:
 
     ordered = [rows[flight] for flight in flights]
     read = [row for row in ordered if not row["error"]]
-    page = report.many_flights_page(ordered, "scripts/diagnose.py " + shlex.join(sys.argv[1:]))
+    page = report.many_flights_page(ordered, command_line.typed("diagnose"))
     options.out.mkdir(parents=True, exist_ok=True)
     write_json(options.out / "summary.json", {"flights": ordered})
     write_text(options.out / "summary.html", page)

@@ -1,8 +1,6 @@
 """Fly a hover controller many times and score it from true states; or compare all of them."""
 
 import argparse
-import shlex
-import sys
 from typing import Any
 
 import command_line
@@ -109,7 +107,7 @@ def compare(options: argparse.Namespace, vehicle: Vehicle) -> None:
         )  # fmt: skip
     make_folder(options.out)
     path = write_json(options.out / "compare.json", content)
-    text = comparison.comparison_page(content, "scripts/evaluate.py " + shlex.join(sys.argv[1:]))
+    text = comparison.comparison_page(content, command_line.typed("evaluate"))
     page = write_text(options.out / "report.html", text)
     rows = comparison.rows(content["conditions"])
     command_line.print_columns(comparison.without_repeats(comparison.HEADER, rows))

@@ -1,8 +1,6 @@
 """Fit a vehicle's parameters to a flight; the result is a vehicle file for the env."""
 
 import argparse
-import shlex
-import sys
 
 import command_line
 
@@ -30,7 +28,7 @@ def main() -> None:
     make_folder(options.out)
     path = write_text(options.out / "vehicle.toml", vehicle_toml(result.after))
     print_result(result)
-    command = "scripts/identify.py " + shlex.join(sys.argv[1:])
+    command = command_line.typed("identify")
     page = command_line.write_report(
         options.out / "report.html", lambda: report_page(result, command)
     )

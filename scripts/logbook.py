@@ -2,8 +2,6 @@
 
 import argparse
 import json
-import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +26,7 @@ def main() -> None:
             options.folder, options.vehicle, kept, options.jobs, options.backend, done
         )
     write_json(options.out / "logbook.json", content)
-    command = "scripts/logbook.py " + shlex.join(sys.argv[1:])
+    command = command_line.typed("logbook")
     write_text(options.out / "logbook.html", report.logbook_page(content, command))
     print(f"{len(content['flights'])} flights, {len(content['changes'])} changes")
     for change in content["changes"]:

@@ -8,7 +8,6 @@ while its file stays as it is, one that survived while no source and no test has
 
 import json
 import queue
-import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -51,7 +50,7 @@ def main() -> None:
              "reason": equivalent.get((m.file, m.before, m.after), "")}
             for m in passed_over if (m.file, m.before, m.after) in equivalent
         ]  # fmt: skip
-        command = "scripts/mutate.py " + shlex.join(sys.argv[1:])
+        command = command_line.typed("mutate")
         write_text(options.out / "table.md", score.table_text(rows, reasons, command))
         summary = {"command": command, "score": score.share(rows), "count": len(rows)}
         write_json(options.out / "score.json", {**summary, "equivalent": reasons, "rows": rows})

@@ -1,8 +1,5 @@
 """Show what the simulation gets wrong on a flight: open-loop prediction error per channel."""
 
-import shlex
-import sys
-
 import command_line
 
 from coax_env import report
@@ -37,7 +34,7 @@ def main() -> None:
             if e.get("diverged") or e["rms"] is not None
         )
         print(f"{run}: {', '.join(cells)}")
-    command = "scripts/replay.py " + shlex.join(sys.argv[1:])
+    command = command_line.typed("replay")
     page = command_line.write_report(
         options.out / "report.html", lambda: report.replay_page(result, command)
     )

@@ -1,8 +1,6 @@
 """Fly maneuvers in simulation: a flight folder, a report, and the paper's doublet as a table."""
 
 import argparse
-import shlex
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,7 +38,7 @@ def main() -> None:
             print("holds:" if remark.holds else "DOES NOT HOLD:", remark.statement)
     for track in tracks:
         print(track.maneuver.name + ":", f"{track.t[-1]:.1f} s", track.ended)
-    command = "scripts/simulate.py " + shlex.join(sys.argv[1:])
+    command = command_line.typed("simulate")
     page = command_line.write_report(
         options.out / "report.html",
         lambda: report.simulation_page(tracks, vehicle, table, remarks, command),

@@ -1,8 +1,6 @@
 """How often is the diagnosis right? Flights whose truth is known, flown, diagnosed and counted."""
 
 import json
-import shlex
-import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -30,7 +28,7 @@ def main() -> None:
     if options.calibrate:
         flights = [f for f in flights if not f.effects]
     make_folder(options.out)
-    command = "scripts/study_diagnosis.py " + shlex.join(sys.argv[1:])
+    command = command_line.typed("study_diagnosis")
     waiting = store.missing(options.out, flights)
     done = len(flights) - len(waiting)
     try:

@@ -3,8 +3,6 @@
 import argparse
 import json
 import os
-import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +35,7 @@ def main() -> None:
     training: dict[str, Any] = {
         "steps": round(options.steps), "nominal": options.nominal, "sensors": options.sensors,
         "resume": options.resume, "tensorboard": options.tensorboard,
-        "command_line": shlex.join(["scripts/train_ppo.py", *sys.argv[1:]]),
+        "command_line": command_line.typed("train_ppo"),
         "settings": dict(setting(text) for text in options.set),
     }  # fmt: skip
     world: dict[str, Any] = command_line.air(options)

@@ -14,7 +14,7 @@ PACKAGES = ("coax_env", "controllers")
 
 FLOORS = (
     "errors plain_words",
-    "files workers",
+    "files progress workers",
     "kernel",
     "model",
     "env logs",

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -307,7 +308,8 @@ async def look(page):
     await page.ask(f"{LIBRARY}; scroll()")
     found["desk"] = await page.ask("state()")
     found["numbers"] = await page.ask(
-        "[...document.querySelectorAll('data')].map(d => [d.dataset.of, d.value, d.textContent])"
+        "[...document.querySelectorAll('data')].map("
+        "d => [d.dataset.of, d.value, d.textContent, Number(d.dataset.factor || 1)])"
     )
     found["played"] = await page.ask(PLAY)
     found["choices"] = await page.ask(EVERY_CHOICE)
@@ -364,14 +366,18 @@ def test_every_figure_is_drawn(seen):
 def test_every_number_shown_is_that_of_findings_json(seen, made):
     findings = json.loads((made / "findings.json").read_text())
     shown = set()
-    for place, exact, text in seen["numbers"]:
+    for place, exact, text, factor in seen["numbers"]:
         value = findings
         for step in place.split("/"):
             value = value[int(step) if isinstance(value, list) else step]
         assert float(exact) == value, place
+        assert factor in (1.0, pytest.approx(180.0 / math.pi)), place
         digits, _, power = re.search(r"-?[\d.]+(e-?\d+)?", text.replace("−", "-"))[0].partition("e")
         unit = 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))
-        assert abs(float(digits) * 10.0 ** int(power or 0) - value) <= 0.5001 * unit, (place, text)
+        assert abs(float(digits) * 10.0 ** int(power or 0) - factor * value) <= 0.5001 * unit, (
+            place,
+            text,
+        )
         shown.add(place)
     for k, cause in enumerate(findings["causes"]):
         assert f"causes/{k}/evidence" in shown

@@ -31,7 +31,6 @@ from coax_env.comparison.two_flights import ROTOR_SPEED, A, B, OneFlight, read_t
 from coax_env.diagnosis.changes import effective
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
-from coax_env.estimation.engine import Progress
 from coax_env.estimation.fitted_vehicle import median_step, with_timing
 from coax_env.estimation.parted_engine import of_part
 from coax_env.estimation.quadratic import Quadratic
@@ -40,6 +39,7 @@ from coax_env.logs.flight import Flight
 from coax_env.model import effects
 from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
+from coax_env.progress import Progress, reporter, shows_progress
 
 ROUNDS = 2
 """Times that shared effects and changes are looked for by turns; ours."""
@@ -62,11 +62,12 @@ class Comparison:
     state: Changed
 
 
+@shows_progress("comparison")
 def compare(
     a: Flight | str | Path,
     b: Flight | str | Path | None = None,
     vehicle: Vehicle | str | Path | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     settings: Settings = SETTINGS,
 ) -> Comparison:
     """What changed in a machine between two flights.
@@ -74,15 +75,15 @@ def compare(
     Args:
         a: a Flight or its folder. b: the later one; None: parts "A" and "B" of `a`, by its card.
         vehicle: a Vehicle, name or path; default the cards'.
-        progress: called with a line of text at every step.
+        progress: called with a line of text at every step; True: a bar on stderr.
         settings: thresholds and limits.
 
     Raises:
         InputError: no flight, no such parts, or flights of two vehicles.
     """
-    report = progress or (lambda text: None)
+    report = reporter(progress)
     flights = read_two(a, b, vehicle)
-    problem = joint_problem(flights, settings, progress)
+    problem = joint_problem(flights, settings, report)
     report("estimating gusts and noise of each flight")
     fit = joint_start(problem, flights)
     state = Changed(problem, fit, (), numbers(problem, flights))

@@ -14,11 +14,12 @@ from coax_env.diagnosis.fits import fitted, noise_fitted, start, with_latent_noi
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import Settings
-from coax_env.estimation.engine import Engine, Progress
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.parted_engine import Part, PartedEngine, joint_noise, of_part
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.model import parameters as P
+from coax_env.progress import Progress
 
 AIR = ("air_density", "gravity")
 """Numbers that are each flight's air's."""

@@ -11,7 +11,7 @@ their units: the log determinant of what is left beside the others, D_s-optimali
 Donev 1992, where numbers come in ties).
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,6 +35,7 @@ from coax_env.model.effects import CATALOGUE
 from coax_env.model.sensors import log_suite
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
+from coax_env.progress import Progress
 from coax_env.simulation.maneuvers import AXES, DEGREE, Maneuver
 from coax_env.simulation.multisine import multisines, steps
 from coax_env.simulation.simulate import Gusts, Track, fly
@@ -45,7 +46,6 @@ LENGTH = 10.0
 """Seconds of a multisine."""
 SIZES = {"collective": 0.04, "differential": 0.02, "delta_lon": 3.0 * DEGREE,
          "delta_lat": 3.0 * DEGREE}  # fmt: skip
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)

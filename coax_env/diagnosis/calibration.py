@@ -91,8 +91,19 @@ def differences(seen: Mapping[str, Any], described: Mapping[str, Any]) -> list[s
         number = isinstance(value, int | float) and not isinstance(value, bool)
         inside = allowed[0] <= value <= allowed[1] if number else value in allowed
         if not inside:
-            found.append(f"{key.replace('_', ' ')} {_words(value)}")
+            words = CLASS_WORDS.get(key, key.replace("_", " "))
+            there = f" ({_words(allowed[0])} to {_words(allowed[1])} there)" if number else ""
+            found.append(f"{words} {_words(value)}{there}")
     return found
+
+
+CLASS_WORDS = {
+    "rate_hz": "rows per second", "gap_share": "share of the time in gaps",
+    "card_noise": "sensor noise on the card:", "mass_kg": "mass in kg",
+    "gust_force": "gust forces per weight", "gust_moment": "gust moments per weight and radius",
+    "gust_memory_s": "memory of the gusts in s", "white_noise": "white noise above its floor:",
+}  # fmt: skip
+"""What a class is described by, in words where the key does not say it."""
 
 
 def _words(value: Any) -> str:

@@ -33,7 +33,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.errors import InputError
-from coax_env.estimation.engine import BLOCK, Engine, Progress
+from coax_env.estimation.engine import BLOCK, Engine
 from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import MOST_USUAL_SIZES, ROTORS, HeliModel, record_of
@@ -45,6 +45,7 @@ from coax_env.logs.flight import Flight
 from coax_env.model import effects
 from coax_env.model.layout import N_COMMANDS
 from coax_env.model.vehicle import Vehicle
+from coax_env.progress import Progress
 
 ROTOR_SPEED = "rotor_speed"
 """Change that no effect of the catalogue is: both rotors turn (1 + s) times as fast per command.

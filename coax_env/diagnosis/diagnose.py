@@ -41,7 +41,7 @@ from coax_env.diagnosis.searched import searched
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
-from coax_env.estimation.engine import Engine, Progress
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.fitted_vehicle import double_counting
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
@@ -54,6 +54,7 @@ from coax_env.model import effects
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
+from coax_env.progress import Progress, reporter, shows_progress
 
 TURN = 2.0 * math.pi
 SONAR = frozenset({"sonar_tilt", "sonar_scale", "sonar_delay"})
@@ -98,12 +99,20 @@ class Diagnosis:
     strongest: tuple[float, str] = (-math.inf, "")
 
 
+SHARES = {
+    "choosing": 0.0, "estimating": 0.05, "fitting": 0.1, "searching": 0.15, "weighing": 0.5,
+    "asking left-out": 0.6, "flying": 0.85, "asking whether": 0.9, "refitting": 0.95,
+}  # fmt: skip
+"""How a step's line begins -> share of the time that has passed."""
+
+
+@shows_progress("diagnosis", SHARES)
 def diagnose(
     flight: Flight | str | Path,
     vehicle: Vehicle | str | Path | None = None,
     hold_out: Sequence[str] | None = None,
     exclude: Collection[str] = (),
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     ceiling: bool = False,
     settings: Settings = SETTINGS,
     waive: Collection[str] = (),
@@ -115,7 +124,7 @@ def diagnose(
         vehicle: a Vehicle, name or path; default the card's.
         hold_out: names of the runs to hold out; None chooses them; empty: all data fitted, no gain.
         exclude: effects of the catalogue that must not be named.
-        progress: called with a line of text at every step.
+        progress: called with a line of text at every step; True: a bar on stderr.
         ceiling: also report what a black box removes of the error, which takes half as long again.
         settings: thresholds and limits; a calibrated false alarm rate is that of the default.
         waive: checks of the log with itself (consistency/) that are passed over, beside the card's.
@@ -137,12 +146,12 @@ def diagnose(
     model = HeliModel(vehicle, stated(flight))
     noise = starting_noise(calm, calm_vehicle)
     candidates = namable(exclude, vehicle, flight)
-    report = progress or (lambda text: None)
+    report = reporter(progress)
     report("choosing the runs to hold out")
     records = [record_of(run) for run in calm.runs]
     used, held = split(model, records, noise, hold_out, candidates, settings)
 
-    problem = Problem.of(model, used, candidates, settings, progress)
+    problem = Problem.of(model, used, candidates, settings, report)
     first = searched(problem, noise)
     problem, bare, refitted = first.problem, first.bare, first.refitted
     passes_before = problem.engine.filter(bare.values, bare.noise)

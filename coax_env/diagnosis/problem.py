@@ -11,13 +11,14 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from coax_env.diagnosis.settings import SETTINGS, Settings
-from coax_env.estimation.engine import Engine, Progress
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import GUST_LEVELS
 from coax_env.estimation.rotor_jitter import REACTION
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.model import effects
 from coax_env.model import parameters as P
+from coax_env.progress import Progress
 
 EXCLUSIVE = (
     frozenset({"servo_lag", "servo_delay"}),

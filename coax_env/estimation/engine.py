@@ -19,6 +19,7 @@ from coax_env.estimation import frozen_gains, kalman, noise_score
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.sparse import aligned, padded
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
+from coax_env.progress import Progress
 
 GATE = 8.0  # std of an innovation beyond which a reading counts as an outlier; ours
 REFRESH = 4  # rows between new Jacobians, at least
@@ -26,7 +27,6 @@ REFRESH_SECONDS = 0.04  # [s] in which they change little: more rows of a log fa
 BLOCK = 2.0  # [s] of the blocks whose scores are taken as independent
 BLOCKS_AT_ONCE = 5  # whose signatures are held at a time: 7 MB at 100 Hz with every parameter
 DIVERGED = 1e6  # whitened innovations [std] that only a diverging mean has
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from coax_env.estimation.engine import Engine, NoiseScore, Progress
+from coax_env.estimation.engine import Engine, NoiseScore
 from coax_env.estimation.state_space import Noise, Record
+from coax_env.progress import Progress
 
 STEP_OF_LOG = 1e-3  # of a noise level, for the slopes of the model's variances
 ASKS_FROM = 0.05  # nats that a level's own step must promise for it to be moved; ours

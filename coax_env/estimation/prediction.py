@@ -17,7 +17,7 @@ import numpy as np
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
 from coax_env.estimation import kalman
-from coax_env.estimation.engine import Engine, Progress, RunPass
+from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import AXES, fitted_levels, sensor_std, starting_noise
@@ -28,6 +28,7 @@ from coax_env.model import state as S
 from coax_env.model.layout import CHANNEL_UNITS, CHANNELS, GUSTS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
+from coax_env.progress import Progress
 
 HEADING = CHANNELS.index("psi")
 WARM_UP = 1.0  # [s] of filtering before the first start

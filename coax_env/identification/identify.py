@@ -6,7 +6,7 @@ parameters (and the effects the vehicle already has) free and nothing else. The 
 file that `gymnasium.make("CoaxHeli-v0", vehicle=...)` takes as it is.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, overload
@@ -41,9 +41,9 @@ from coax_env.identification.undetermined import left_open
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
+from coax_env.progress import Progress, reporter, shows_progress
 
 METHODS = ("ml", "paper")
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def identify(
     flight: Flight | str | Path,
     vehicle: Vehicle | str | Path | None = None,
     method: Literal["ml"] = "ml",
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
     hold_out: Collection[str] = (),
@@ -94,7 +94,7 @@ def identify(
     vehicle: Vehicle | str | Path | None = None,
     *,
     method: Literal["paper"],
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
     hold_out: Collection[str] = (),
@@ -107,7 +107,7 @@ def identify(
     flight: Flight | str | Path,
     vehicle: Vehicle | str | Path | None = None,
     method: str = "ml",
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
     hold_out: Collection[str] = (),
@@ -115,11 +115,12 @@ def identify(
 ) -> Identification | TwoStep: ...
 
 
+@shows_progress("identification")
 def identify(
     flight: Flight | str | Path,
     vehicle: Vehicle | str | Path | None = None,
     method: str = "ml",
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     channels: Collection[str] | None = None,
     also: Collection[str] = (),
     hold_out: Collection[str] = (),
@@ -131,7 +132,7 @@ def identify(
         flight: a Flight or its folder.
         vehicle: a Vehicle, name or path; default the card's.
         method: "ml", maximum likelihood on the full model; "paper", its two steps.
-        progress: called with a line of text at every step.
+        progress: called with a line of text at every step; True: a bar on stderr.
         channels: to use; None: all that were measured.
         also: effects of the catalogue whose parameters are free too ("gyro_bias", say); for "ml".
         hold_out: runs that are not fitted; with some, they alone are flown again.
@@ -144,7 +145,7 @@ def identify(
     """
     if method not in METHODS:
         raise InputError(f"no method {method!r}; there are {', '.join(METHODS)}")
-    report = progress or (lambda text: None)
+    report = reporter(progress)
     flight = flight if isinstance(flight, Flight) else read_flight(flight)
     if channels is not None:
         flight = with_channels(flight, channels)

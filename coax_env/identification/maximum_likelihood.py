@@ -6,7 +6,7 @@ numbers should not answer for.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from coax_env.estimation.quadratic import Linearised
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.whiteness import is_white
 from coax_env.model.effects import CATALOGUE
+from coax_env.progress import Progress
 
 MOST_TURNS = 8  # of numbers and noise levels, fitted in turn
 LEAST_GAIN = 1.0
@@ -31,7 +32,6 @@ MARGIN = 2.0
 MOST_WIDENING = 30.0  # factor on a prior's std; ours
 STEPS, TOLERANCE = 4, 0.3  # of one fit of the numbers; nats
 NOISE_EVALUATIONS = 8
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)

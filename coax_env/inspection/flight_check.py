@@ -9,7 +9,7 @@ Data flow::
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,10 +28,10 @@ from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
+from coax_env.progress import Progress
 
 NOT_BELIEVED = 0.02
 """Share of readings that no filter of this vehicle believes, above which something is wrong."""
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)

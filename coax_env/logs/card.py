@@ -27,7 +27,7 @@ from coax_env.logs.units import LOG_UNITS, PLACE_UNITS, factor_to_canonical
 from coax_env.model.layout import CHANNELS
 
 CARD = "card.toml"
-SECTIONS = ("date", "vehicle", "air", "noise", "columns", "checks", "run")
+SECTIONS = ("date", "synthetic", "vehicle", "air", "noise", "columns", "checks", "run")
 AIR = ("density", "gravity")
 RUN_KEYS = ("name", "file", "maneuver", "note", "part")
 QUATERNION_KEYS = ("names", "from")
@@ -58,6 +58,7 @@ class Card:
         quaternion: columns of the attitude, where it is logged as a quaternion.
         runs: in the card's order.
         waived: checks of the log that the card says to pass over.
+        synthetic: whether a simulator flew it; reports say so.
     """
 
     vehicle: str
@@ -67,6 +68,7 @@ class Card:
     quaternion: Quaternion | None
     runs: tuple[RunEntry, ...]
     waived: tuple[str, ...]
+    synthetic: bool
 
     @property
     def holds(self) -> dict[str, bool]:
@@ -89,7 +91,8 @@ def read_card(path: Path) -> Card:
     air = table.positive_numbers("air", AIR)
     noise = table.positive_numbers("noise", CHANNELS)
     columns, quaternion = _columns(table)
-    return Card(vehicle, air, noise, columns, quaternion, _runs(table), _waived(table))
+    runs, waived, synthetic = _runs(table), _waived(table), _synthetic(table)
+    return Card(vehicle, air, noise, columns, quaternion, runs, waived, synthetic)
 
 
 @dataclass(frozen=True)
@@ -283,6 +286,13 @@ def _waived(table: _Table) -> tuple[str, ...]:
     section = table.section("checks")
     table.check_keys(section, ("waive",), "key", "[checks] ")
     return table.texts(section, "waive", "[checks]")
+
+
+def _synthetic(table: _Table) -> bool:
+    value = table.content.get("synthetic", False)
+    if not isinstance(value, bool):
+        raise table.fault(f"synthetic should be true or false, found {shown(value)}")
+    return value
 
 
 def _runs(table: _Table) -> tuple[RunEntry, ...]:

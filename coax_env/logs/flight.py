@@ -115,6 +115,7 @@ class Flight:
         columns: channel -> the column that the card names for it.
         quaternion: the attitude's columns, where it was logged as one.
         waived: checks of the log with itself (consistency/) that the card passes over.
+        synthetic: whether a simulator flew it, as the card says.
     """
 
     vehicle: str
@@ -129,6 +130,7 @@ class Flight:
     columns: Mapping[str, Column] = field(default_factory=dict)
     quaternion: Quaternion | None = None
     waived: tuple[str, ...] = ()
+    synthetic: bool = False
 
     @property
     def run_names(self) -> tuple[str, ...]:
@@ -209,6 +211,7 @@ def read_flight(path: str | Path) -> Flight:
         columns=card.columns,
         quaternion=card.quaternion,
         waived=card.waived,
+        synthetic=card.synthetic,
     )
 
 
@@ -272,6 +275,8 @@ def write_flight(flight: Flight, path: str | Path) -> Path:
     """
     path = Path(path)
     card = tomlkit.document()
+    if flight.synthetic:
+        card["synthetic"] = True
     card["vehicle"] = {"name": flight.vehicle}
     for section, numbers in (("air", flight.air), ("noise", flight.noise)):
         if numbers:

@@ -1,5 +1,6 @@
 """The causes on a page: each with its size in words, interval, evidence and alternatives."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +13,7 @@ from coax_env.plain_words import (
     channel_name,
     number,
     plain,
+    read_factor,
     title,
     unit_name,
     whole_percent,
@@ -42,10 +44,9 @@ def cause_sections(findings: Findings, bare: Vehicle, corrected: Vehicle) -> lis
         corrected: the vehicle with the causes in it.
     """
     causes = findings["causes"]
-    alarms = prose(_false_alarms(findings["false_alarm_rate"], findings["class"]))
     if not causes:
         nothing = prose("No effect of the catalogue is named: these flights show none.")
-        return [Section("The causes", [nothing, alarms])]
+        return [Section("The causes", [nothing])]
     rows = [row for k, cause in enumerate(causes) for row in _rows(k, cause, bare)]
     header = ["parameter", "value", "std", "95 % interval", "unit", "usual size"]
     numbers = [
@@ -56,7 +57,6 @@ def cause_sections(findings: Findings, bare: Vehicle, corrected: Vehicle) -> lis
         ),
         folded_table("The parameters in numbers", header, rows),
         folded_table("Why a name is believed", _ROBUST_HEADER, map(_robust_row, causes)),
-        alarms,
     ]
     shown = {t: [(k, c) for k, c in enumerate(causes) if c["trust"] == t] for t in TRUST}
     sections = [
@@ -130,15 +130,16 @@ def _rows(index: int, cause: Mapping[str, Any], vehicle: Vehicle) -> list[list[s
     result = []
     for name, p in cause["parameters"].items():
         place, value, std = f"causes/{index}/parameters/{name}", p["value"], p["std"]
-        ends = [number(value + side * NORMAL_95 * std) for side in (-1.0, 1.0)]
+        by = read_factor(p["unit"])
+        ends = [number(by * (value + side * NORMAL_95 * std)) for side in (-1.0, 1.0)]
         result.append(
             [
                 capital(plain(name)),
-                datum(number(value), f"{place}/value", value),
-                datum(number(std, 2), f"{place}/std", std),
+                datum(number(by * value), f"{place}/value", value, by),
+                datum(number(by * std, 2), f"{place}/std", std, by),
                 " to ".join(ends) if p["determined"] else "not determined",
                 unit_name(p["unit"]) or "1",
-                number(usual.get(name), 2),
+                number(by * usual.get(name, math.nan), 2),
             ]
         )
     return result
@@ -177,15 +178,3 @@ def confounding_blocks(findings: Findings) -> list[str]:
             callout("No maneuver is known that would separate them at these sensors.", "note")
         )
     return blocks
-
-
-def _false_alarms(rate: float | None, seen: Mapping[str, Any]) -> str:
-    if rate is None:
-        return (
-            "**False alarms.** How often a cause is named where there is none is not known for flights "
-            f"of this class ({seen['why']})."
-        )
-    return (
-        f"**False alarms.** The threshold is calibrated on {seen['calibrated']} without any effect: a "
-        f"cause is named in {100 * rate:.2g} % of them."
-    )

@@ -12,8 +12,8 @@ from coax_env.plain_words import (
     number,
     plain,
     title,
-    unit_name,
     with_std,
+    with_unit,
 )
 from coax_env.report.consequences import NORMAL_95
 from coax_env.report.flight_data import data_blocks
@@ -134,18 +134,21 @@ def _changed(changes: Changes) -> list[str]:
             )
         )
         rows += [
-            [plain(name), *(number(p[key]) for key in ("before", "after", "change", "std")),
-             unit_name(p["unit"])]
+            [plain(name), *(with_unit(p[key], p["unit"]) for key in _SHOWN)]
             for name, p in c["parameters"].items()
         ]  # fmt: skip
     return [
         cards(shown),
-        table(["number", "before", "after", "change", "std", "unit"], rows),
+        table(["number", "before", "after", "change", "std"], rows),
         prose(
             "In brackets: 95 % intervals of the difference. Evidence is a log Bayes factor in nats: "
             "5 nats are odds of 150 to 1, and 14 are needed for a name."
         ),
     ]
+
+
+_SHOWN = ("before", "after", "change", "std")
+"""What the table shows of a number that changed."""
 
 
 def _unchanged(changes: Changes) -> list[str]:
@@ -157,7 +160,7 @@ def _unchanged(changes: Changes) -> list[str]:
         [
             plain(name),
             with_std(b["value"], b["std"], b["unit"]),
-            number(b["usual"]),
+            with_unit(b["usual"], b["unit"]),
             number(b["nats"]),
         ]
         for name, b in changes["bounds"].items()
@@ -213,7 +216,7 @@ def _circumstances(changes: Changes) -> list[str]:
         if name in a["own"] or name in b["own"]:
             rows.append([words, *(_own(f["own"].get(name), unit) for f in (a, b))])
     for name, (words, unit) in GUSTS.items():
-        rows.append([words, *(f"{number(f['gusts'][name])} {unit_name(unit)}" for f in (a, b))])
+        rows.append([words, *(with_unit(f["gusts"][name], unit) for f in (a, b))])
     return [
         prose(
             "Fitted for each flight, and never a change of the machine. A rotor speed per command that "

@@ -3,7 +3,7 @@
 One page for someone who was not there: two minutes to read, the details folded away at its end.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from coax_env.estimation.trajectories import RESTART, trajectories
@@ -26,6 +26,7 @@ from coax_env.report.gain import ControllerScores, controller_blocks, gain_block
 from coax_env.report.page import Section, bullets, callout, details, page, prose
 from coax_env.report.plot_style import AFTER, BEFORE
 from coax_env.report.prediction_errors import error_blocks
+from coax_env.report.trust_banner import trust_banner
 
 if TYPE_CHECKING:
     from coax_env.diagnosis.diagnose import Diagnosis
@@ -60,12 +61,14 @@ def diagnosis_page(
         Section("Details", detail_blocks(result, command_line)),
     ]
     flight = result.flight.path.name if result.flight.path else "without a folder"
+    kind = "synthetic flight" if result.flight.synthetic else "flight"
     return page(
         headline(findings),
         lead(findings),
         [section for section in sections if any(section.blocks)],
-        kicker=f"Diagnosis · flight {flight} · vehicle {bare.name}",
-        top=gain_tiles(findings) if findings["verdict"] != "consistent" else "",
+        kicker=f"Diagnosis · {kind} {flight} · vehicle {bare.name}",
+        top=(gain_tiles(findings) if findings["verdict"] != "consistent" else "")
+        + trust_banner(result),
     )
 
 
@@ -109,8 +112,6 @@ def lead(findings: Findings) -> list[str]:
         )
     elif not gain:
         sentences.append("No run was held out, so how well this predicts is not known.")
-    if findings["causes"]:
-        sentences.append(_trust_in_words(findings["causes"]))
     alternatives = sorted({name for c in findings["causes"] for name in c["confusable_with"]})
     if alternatives:
         sentences.append(
@@ -122,18 +123,6 @@ def lead(findings: Findings) -> list[str]:
         where = list(dict.fromkeys(channel_name(u["channel"]) for u in findings["unexplained"]))
         sentences.append(f"Unexplained structure is left in {and_list(where)}.")
     return sentences
-
-
-def _trust_in_words(causes: Sequence[Mapping[str, Any]]) -> str:
-    """Which names are sure, and which are doubtful."""
-    groups = {
-        trust: [plain(c["effect"]) for c in causes if c["trust"] == trust]
-        for trust in ("sure", "doubtful")
-    }
-    said = [f"{capital(trust)}: {and_list(names)}." for trust, names in groups.items() if names]
-    if groups["doubtful"]:
-        said.append("A doubtful name stands for something that improves the prediction.")
-    return " ".join(said)
 
 
 # --- the flights ----------------------------------------------------------------------------------
@@ -223,6 +212,6 @@ def _gusts_in_words(gusts: Mapping[str, Any], vehicle: Vehicle) -> str:
     largest = max(gusts["force_N"]) / vehicle["mass"].value
     return (
         f"**Gusts.** Forces of {force} mN and moments of {moment} mN m (std; x, y, z), "
-        f"correlated over {seconds(gusts['memory_s'])}: at most {number(largest, 2)} m/s² of "
+        f"correlated over {number(gusts['memory_s'], 2)} s: at most {number(largest, 2)} m/s² of "
         "acceleration. They are estimated with the causes, as noise, and are never a cause."
     )

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.plain_words import number
+from coax_env.plain_words import with_unit
 from coax_env.report.plot_style import (
     AFTER,
     BEFORE,
@@ -141,7 +141,7 @@ def prediction(
     """One channel of one run: measured and predicted above, the errors below.
 
     Args:
-        channel: what is measured.
+        channel: what is measured; numbers are in the unit in which it is read, angles in degrees.
         measured: times (n,) and readings (n,).
         predicted: model's name -> times (m,) at the horizon's end, predictions (m,), errors (m,);
             the first is drawn as *before*, the second as *after*.
@@ -177,7 +177,7 @@ def gain_bars(channels: Mapping[str, Mapping[str, Any]]) -> Figure:
     after, below, above = percent["after"], *_whiskers(channels, names)
 
     def trace(key: str, **style: Any) -> dict[str, Any]:
-        words = [f"{number(channels[c].get(key))} {channels[c].get('unit', '')}" for c in names]
+        words = [with_unit(channels[c].get(key), channels[c].get("unit", "")) for c in names]
         return {
             "y": labels, "x": percent[key], "name": _BARS[key], "customdata": words,
             "hovertemplate": "%{y}: %{customdata}<extra>" + _BARS[key] + "</extra>", **style,

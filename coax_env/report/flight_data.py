@@ -8,7 +8,7 @@ import numpy as np
 from coax_env.estimation.prediction import RunReplay
 from coax_env.logs.flight import Flight, Run
 from coax_env.model.layout import ANGLES, CHANNEL_UNITS, CHANNELS
-from coax_env.plain_words import channel_name, number, unit_name
+from coax_env.plain_words import channel_name, read_factor, with_unit
 from coax_env.report import figures
 from coax_env.report.page import bullets, details, prose, table
 from coax_env.report.plot_style import MOST_POINTS, Figure
@@ -65,7 +65,10 @@ def prediction_figure(
             predicted = np.interp(at, t[good], measured[good]) + error
         drawn = _drawn(error, measured[good])
         curves[name] = at, np.where(drawn, predicted, np.nan), np.where(drawn, error, np.nan)
-    return figures.prediction(channel, (t, measured), curves, noise, points)
+    by = read_factor(CHANNEL_UNITS[channel])
+    shown = {name: (at, by * values, by * error) for name, (at, values, error) in curves.items()}
+    band = noise and by * noise
+    return figures.prediction(channel, (t, by * measured), shown, band, points)
 
 
 def _rows_near(t: np.ndarray, predicted: np.ndarray) -> np.ndarray:
@@ -139,7 +142,7 @@ def data_blocks(
     levels = [
         [
             channel_name(c),
-            f"{number(stds[c])} {unit_name(CHANNEL_UNITS[c])}",
+            with_unit(stds[c], CHANNEL_UNITS[c]),
             "the card" if c in flight.noise else "estimated",
         ]
         for c in ordered(stds)

@@ -6,7 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from coax_env.model.generic_terms import AXES, TERMS
-from coax_env.plain_words import and_list, channel_name, number, seconds, unit_name, whole_percent
+from coax_env.plain_words import (
+    and_list,
+    channel_name,
+    number,
+    read_factor,
+    seconds,
+    unit_name,
+    whole_percent,
+)
 from coax_env.report import figures
 from coax_env.report.flight_data import ordered
 from coax_env.report.page import Markup, datum, figure, folded_table, prose, table, tiles
@@ -52,7 +60,7 @@ def gain_tiles(findings: Mapping[str, Any]) -> str:
         (_percent(gain, "refitted_base_percent"), "by refitting alone",
          "the bare model's own parameters"),
         (_percent(gain, "persistence_percent"), "by saying that nothing moves",
-         "the least that a model must beat"),
+         "the least to beat; below zero: worse than the bare model"),
     ]  # fmt: skip
     if gain.get("black_box_percent") is not None:
         items.append(
@@ -81,7 +89,7 @@ def gain_blocks(findings: Mapping[str, Any]) -> list[str]:
     caption = (
         f"Error of a {seconds(gain['horizon_s'])} prediction on the held-out runs "
         f"({and_list(gain['held_out'])}), as a share of the bare model's. Whisker: 95 % interval. "
-        "Green: the sensor's noise, which is in every reading: no model gets below it. "
+        "Green: the sensor's noise, which is in every reading: no model gets below it but by chance. "
     )
     if gain.get("black_box_percent") is None:
         caption += "With `--ceiling` a black box is fitted too, for comparison."
@@ -105,13 +113,14 @@ def _error_left(entry: Mapping[str, Any]) -> float:
 
 def _row(channel: str, entry: Mapping[str, Any]) -> list[str]:
     """A channel of the gain in a table."""
-    place = f"gain/channels/{channel}"
+    place, by = f"gain/channels/{channel}", read_factor(entry["unit"])
 
     def shown(key: str) -> str:
-        return datum(number(entry[key]), f"{place}/{key}", entry[key])
+        value = entry[key]
+        return datum(number(None if value is None else by * value), f"{place}/{key}", value, by)
 
     ends = [
-        datum(number(end), f"{place}/ci95/{k}", end)
+        datum(number(by * end), f"{place}/ci95/{k}", end, by)
         for k, end in enumerate(entry.get("ci95") or ())
     ]
     return [

@@ -9,6 +9,7 @@ from coax_env.plain_words import (
     count_word,
     number,
     plain,
+    read_factor,
     title,
     unit_name,
     with_std,
@@ -108,10 +109,15 @@ def _figures(content: Content, names: list[str]) -> list[str]:
     ]
 
 
+_SHOWN = ("value", "std", "alone", "alone_std")
+"""What a figure shows of a number in each flight."""
+
+
 def _over_time(content: Content, name: str) -> Figure:
     """One number over the flights."""
     known = content["numbers"][name]
-    rows = known["flights"]
+    by = read_factor(known["unit"])
+    rows = [{key: by * r[key] for key in _SHOWN} for r in known["flights"]]
     x = [f["name"] for f in content["flights"]]
     low = [r["value"] - NORMAL_95 * r["std"] for r in rows]
     high = [r["value"] + NORMAL_95 * r["std"] for r in rows]

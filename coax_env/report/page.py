@@ -86,15 +86,18 @@ def bullets(items: Iterable[str]) -> Markup:
     return _block("bullets", items)
 
 
-def datum(text: str, place: str, value: float | None) -> Markup:
+def datum(text: str, place: str, value: float | None, factor: float = 1.0) -> Markup:
     """A number in words, marked with its exact value and its place in findings.json.
 
     Args:
         text: the number as it is read.
         place: ``gain/channels/h/after``; parts of lists by their position.
         value: the number as it is in the file; None leaves the text unmarked.
+        factor: of the number as it is read: 57.3 where an angle is read in degrees.
     """
-    return inline(text) if value is None else _block("datum", text, place, repr(value))
+    if value is None:
+        return inline(text)
+    return _block("datum", text, place, repr(value), repr(factor))
 
 
 def command(text: str) -> Markup:
@@ -105,6 +108,11 @@ def command(text: str) -> Markup:
 def callout(text: str, kind: str = "note") -> Markup:
     """A framed remark; kind is ``note``, ``good`` or ``warning``."""
     return _block("callout", text, kind)
+
+
+def banner(heading: str, lines: Sequence[str], kind: str = "note") -> Markup:
+    """A framed list under a heading; kind as of `callout`."""
+    return _block("banner", heading, lines, kind)
 
 
 # --- tables and cards -----------------------------------------------------------------------------

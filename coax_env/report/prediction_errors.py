@@ -1,12 +1,13 @@
 """Where the bare model is wrong: its predictions against the held-out runs, the worst channel first."""
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from coax_env.estimation.prediction import RunReplay, rms
-from coax_env.plain_words import and_list, channel_name, number, seconds, unit_name
+from coax_env.plain_words import and_list, channel_name, seconds, with_unit
 from coax_env.report.flight_data import ordered, points_each, prediction_figure
 from coax_env.report.page import callout, chooser, prose
 from coax_env.report.plot_style import Figure
@@ -91,11 +92,21 @@ def _worst_in_words(findings: Findings) -> str:
     if not worst:
         return "On the held-out runs its error nowhere exceeds the sensors' noise."
     words = [
-        f"{channel_name(c)} by {number(errors[c]['before'], 2)} {unit_name(errors[c]['unit'])} "
-        f"({_times(ratio[c])} the sensor's noise)"
+        f"{channel_name(c)} {_missed(errors[c])} ({_times(ratio[c])} the sensor's noise)"
         for c in worst
     ]
     return f"Within {seconds(gain['horizon_s'])} the bare model misses {and_list(words)}."
+
+
+SPIN = math.radians(90.0)
+"""Error of an angle [rad] beyond which a model has turned away: the number says nothing more."""
+
+
+def _missed(entry: Mapping[str, Any]) -> str:
+    """By how much a channel is missed; that the model spins, where an angle is gone altogether."""
+    if entry["unit"] == "rad" and entry["before"] > SPIN:
+        return "altogether: it spins"
+    return f"by {with_unit(entry['before'], entry['unit'], 2)}"
 
 
 def _times(ratio: float) -> str:

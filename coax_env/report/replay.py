@@ -7,7 +7,16 @@ from typing import Any
 import numpy as np
 
 from coax_env.estimation.prediction import Replay
-from coax_env.plain_words import and_list, capital, channel_name, number, seconds, unit_name
+from coax_env.plain_words import (
+    and_list,
+    capital,
+    channel_name,
+    number,
+    read_factor,
+    seconds,
+    unit_name,
+    with_unit,
+)
 from coax_env.report import figures
 from coax_env.report.flight_data import data_blocks, ordered, points_each, prediction_figure
 from coax_env.report.page import Section, chooser, command, details, figure, page, table
@@ -55,7 +64,7 @@ def _summary(result: Replay, run: str, channel: str) -> tuple[str, list[str]]:
     title = f"Over {horizon} the simulation misses {channel_name(channel)} most"
     ratio = _error_over_noise(entry)
     if math.isfinite(ratio):
-        title += f": by {number(entry['rms'], 2)} {unit_name(entry['unit'])} in {run}"
+        title += f": by {with_unit(entry['rms'], entry['unit'], 2)} in {run}"
         sentences.append(
             f"That is {number(ratio, 2)} times the sensor's noise, the most of all runs and channels."
         )
@@ -79,7 +88,7 @@ def _overview(
     units = {c: e["unit"] for entries in tables.values() for c, e in entries.items()}
     header = ["run", *(f"{channel_name(c)} [{unit_name(units[c])}]" for c in channels)]
     numbers = [
-        [run, *("–" if e is None else number(e["rms"]) for e in row)]
+        [run, *("–" if e is None else _read(e) for e in row)]
         for run, row in zip(tables, cells, strict=True)
     ]
     return [
@@ -110,6 +119,12 @@ def _error_over_noise(entry: Entry | None, missing: float = math.nan) -> float:
     if entry is None or entry["rms"] is None or not entry["noise_rms"]:
         return missing
     return float(entry["rms"] / entry["noise_rms"])
+
+
+def _read(entry: Entry) -> str:
+    """The error in the unit of its column."""
+    rms = entry["rms"]
+    return number(None if rms is None else read_factor(entry["unit"]) * rms)
 
 
 def _cell(entry: Entry | None) -> str:

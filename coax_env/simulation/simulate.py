@@ -281,6 +281,7 @@ def log_flight(
         runs=tuple(runs),
         air={"density": vehicle["air_density"].value, "gravity": vehicle["gravity"].value},
         noise={s.name: s.noise for s in suite if s.noise > 0.0},
+        synthetic=True,
     )
 
 

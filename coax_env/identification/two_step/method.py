@@ -13,7 +13,7 @@ the file's own value and std by their precisions.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,13 +44,13 @@ from coax_env.identification.two_step.regression import Regression
 from coax_env.logs.flight import Flight, Run
 from coax_env.model.sensors import suite
 from coax_env.model.vehicle import Parameter, Vehicle
+from coax_env.progress import Progress
 
 TABLE_V = {sensor.name: sensor.noise for sensor in suite("paper")}
 """Std of the sensors as the paper assumes them; used where the card says nothing and the data show no
 noise at all."""
 QUIET = 1.0
 """Seconds at a run's start, before its maneuver, that serve as the noise record where no run hovers."""
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
