@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from coax_env.model.effects import CATALOGUE
+
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 ALL = sorted(
     p for p in ROOT.rglob("README.md") if not {"runs", ".venv"} & set(p.relative_to(ROOT).parts)
 )
-LONGEST = 240  # lines of the first README
+LONGEST = 200  # lines of the first README
 
 
 def folded(text: str) -> str:
@@ -87,3 +89,22 @@ def test_the_ten_lines_print_what_readme_says(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-1500:]
     assert folded(done.stdout) == printed
+
+
+def effects_table() -> str:
+    """The catalogue as the model's README shows it."""
+    rows = ["| effect | what it is | parameters, usual size | shows in |", "|---|---|---|---|"]
+    for effect in CATALOGUE.values():
+        sizes = ", ".join(
+            f"{p.name} {p.usual:.3g}" + (f" {p.unit}" if p.unit != "1" else "")
+            for p in effect.parameters
+        )
+        summary = (
+            " ".join(effect.summary.split()).partition(". ")[0].rstrip(".").replace("|", "\\|")
+        )
+        rows.append(f"| `{effect.name}` | {summary} | {sizes} | {', '.join(effect.channels)} |")
+    return "\n".join(rows) + "\n"
+
+
+def test_the_models_readme_has_every_effect():
+    assert (ROOT / "coax_env/model/README.md").read_text(encoding="utf-8").endswith(effects_table())

@@ -120,7 +120,7 @@ def _row(channel: str, entry: Mapping[str, Any]) -> list[str]:
         return datum(number(None if value is None else by * value), f"{place}/{key}", value, by)
 
     ends = [
-        datum(number(by * end), f"{place}/ci95/{k}", end, by)
+        datum(number(None if end is None else by * end), f"{place}/ci95/{k}", end, by)
         for k, end in enumerate(entry.get("ci95") or ())
     ]
     return [
