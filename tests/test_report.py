@@ -21,7 +21,7 @@ from coax_env.identification.maximum_likelihood import RunEstimate
 from coax_env.model import effects
 from coax_env.model.layout import STATES
 from coax_env.model.vehicle import Parameter
-from coax_env.report import consequences, figures, fit_figures, plot_style
+from coax_env.report import consequences, figures, fit_figures, plot_style, trust_banner
 from coax_env.report.flight_view import flight_view
 from coax_env.report.page import card, figure, inline, table
 from coax_env.simulation import simulate as sim
@@ -476,6 +476,55 @@ def test_a_finger_turns_the_flight(seen):
 )
 def test_every_verdict_has_its_words(changes, words):
     assert words in Outline(report.diagnosis_page(diagnosis(**changes))).text
+
+
+SURE = [finding("ground_effect", gain=0.5, decay=2.08)]
+DOUBTFUL = [finding("axial_damping", ["airframe_drag"], coefficient=0.07)]
+
+
+def gain_of(low):
+    return {"error_removed_percent": 50.0, "ci95": [low, 70.0], "persistence_percent": -1.0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind", "words"),
+    [
+        ({}, "good", "the names and the model"),
+        ({"gain": None}, "good", "the names and the model"),
+        ({"verdict": "consistent", "causes": []}, "good", "may be used as it is"),
+        ({"causes": SURE + DOUBTFUL}, "note", "the sure names"),
+        ({"unexplained": [{"channel": "q"}]}, "note", "the sure names"),
+        ({"model_check": {"words": ["roll: it is less"]}}, "note", "the sure names"),
+        ({"causes": DOUBTFUL}, "warning", "no name"),
+        ({"verdict": "unexplained", "causes": []}, "warning", "no name"),
+        ({"gain": gain_of(-3.0)}, "warning", "chance"),
+    ],
+)
+def test_the_banner_says_how_far_to_trust(changes, kind, words):
+    found = {
+        "verdict": "explained", "causes": SURE, "unexplained": [], "gain": gain_of(30.0),
+        "model_check": {"words": []},
+    }  # fmt: skip
+    said = trust_banner.how_far(found | changes)
+    assert said[0] == kind and words in said[1]
+
+
+def test_synthetic_flights_are_called_so():
+    result = diagnosis()
+    assert result.flight.synthetic  # simulate() says so
+    assert "synthetic flight" in Outline(report.diagnosis_page(result)).text
+    real = replace(result, flight=replace(result.flight, synthetic=False))
+    assert "synthetic" not in Outline(report.diagnosis_page(real)).text
+
+
+def test_angles_are_read_in_degrees_and_a_spin_is_called_so():
+    result = diagnosis()
+    channels = result.findings["gain"]["channels"]
+    channels["phi"] = entry(0.1, 0.02, "rad")
+    channels["psi"] = entry(5.9, 0.02, "rad")
+    text = Outline(report.diagnosis_page(result)).text
+    assert "roll by 5.7°" in text and "heading altogether: it spins" in text
+    assert "rad/s" not in text and " rad " not in text
 
 
 def test_numbers_that_are_missing_do_not_break_the_page():
