@@ -28,7 +28,7 @@ def many_flights_page(rows: Sequence[Mapping[str, Any]], command_line: str) -> s
     ]
     sections = [Section("Flights", blocks), Section("Causes", [_by_cause(read)])]
     return page(
-        "Many flights", lead, [*sections, Section("Again", [command(command_line)])], "Diagnosis"
+        "Many flights", lead, [*sections, Section("The command that made this", [command(command_line)])], "Diagnosis"
     )
 
 
