@@ -26,10 +26,12 @@ def many_flights_page(rows: Sequence[Mapping[str, Any]], command_line: str) -> s
     blocks += [
         callout(f"{row['flight']}: {row['error']}", "warning") for row in rows if row["error"]
     ]
-    sections = [Section("Flights", blocks), Section("Causes", [_by_cause(read)])]
-    return page(
-        "Many flights", lead, [*sections, Section("The command that made this", [command(command_line)])], "Diagnosis"
-    )
+    sections = [
+        Section("Flights", blocks),
+        Section("Causes", [_by_cause(read)]),
+        Section("The command that made this", [command(command_line)]),
+    ]
+    return page("Many flights", lead, sections, "Diagnosis")
 
 
 def summary_cells(row: Mapping[str, Any]) -> list[str]:
