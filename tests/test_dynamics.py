@@ -34,7 +34,13 @@ from coax_env.model.layout import (
 )
 
 LAMA = load_vehicle("lama400d")
-COUPLED = LAMA.with_values({"flap_coupling_lon": 0.2, "flap_coupling_lat": -0.3})
+COUPLED = LAMA.with_values(
+    {
+        "flap_coupling_lon": 0.2, "flap_coupling_lat": -0.3, "flybar_to_rotor_lat": 0.43,
+        "rotor_inertia_lower": 6e-4,
+    }
+)  # fmt: skip
+"""No two of its numbers are the same, so that none can stand in another's place."""
 NAMES = [name for name, _ in STATES]
 SEEDS = range(5)
 

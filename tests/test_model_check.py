@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from coax_env import load_vehicle, read_flight
-from coax_env.diagnosis.model_check import LARGE, ModelCheck, model_check
+from coax_env.diagnosis.model_check import LARGE, SEEN, ModelCheck, _spectra, model_check
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import one_step_against_a_second
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.engine import RunPass
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import RunReplay
-from coax_env.estimation.state_space import Noise
+from coax_env.estimation.state_space import Noise, Record
+from coax_env.model.layout import CHANNELS
 
 RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
 GUSTS = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003}
@@ -66,6 +68,27 @@ def test_a_sensor_louder_than_the_model_has_it_is_seen(gusty):
     assert {e["channel"] for e in check.spectrum} <= {"r", "psi"}, (
         "the heading follows from the rate"
     )
+
+
+def loud(rows: int, rate: float = 20.0) -> RunPass:
+    """A pass of which one channel has innovations of power 2 at every frequency."""
+    unseen = int(SEEN * rate) + 1
+    t = np.arange(unseen + rows) / rate
+    phases = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, rows // 2 + 1)
+    innovations = np.full((t.size, len(CHANNELS)), np.nan)
+    e = np.fft.irfft(np.sqrt(2.0 * rows) * np.exp(1j * phases), rows)
+    innovations[unseen:, CHANNELS.index("q")] = e
+    none = np.empty(0)
+    record = Record("loud", t, np.zeros((t.size, 4)), innovations)
+    return RunPass(record, none, 0.0, innovations, none, 0, none, none, none, none, none)
+
+
+def test_a_band_is_loud_where_so_much_power_is_no_chance():
+    """Of 8 lines of white noise a mean power of 2 is: 16 degrees of freedom, one in a hundred."""
+    bands = [e["band_hz"] for e in _spectra([loud(108)])]
+    assert [0.5, 2.0] not in bands and [2.0, 8.0] in bands
+    entries = [e for e in _spectra([loud(108)] * 8) if e["band_hz"] == [0.5, 2.0]]
+    assert entries == [{"channel": "q", "band_hz": [0.5, 2.0], "ratio": 1.41}]
 
 
 def test_innovations_that_follow_a_command_are_seen(tmp_path):

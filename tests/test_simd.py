@@ -297,6 +297,8 @@ FOUR = (
     .with_effect("gyro_bias", x=0.004, y=-0.012, z=0.002)
 )
 """What is hidden in the bundled flight."""
+FIVE = FOUR.with_effect("battery_sag", rate=0.002)
+"""And what follows each row's own clock."""
 NINE = (
     LAMA.with_effect("command_delay", time=0.068)
     .with_effect("hub_stiffness", upper=0.2, lower=0.1)
@@ -349,10 +351,10 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
         (2, {"sensors": "mocap", "task": "position"}),
         (SIMD_WIDTH + 1, {"randomize": "posterior", "gusts": (0.3, 0.01)}),
         (13, {"sensors": "mocap", "task": "waypoints", "target": [(0, 0, 1.5, 0), (0, 0, 1.6, 0)]}),
-        (11, {"vehicle": FOUR, "gusts": (0.3, 0.01)}),
-        (11, {"vehicle": FOUR, "sensors": "paper"}),
-        (11, {"vehicle": FOUR, "sensors": "state", "task": "waypoints"}),
-        (11, {"vehicle": FOUR, "sensors": "mocap", "task": "position"}),
+        (11, {"vehicle": FIVE, "gusts": (0.3, 0.01)}),
+        (11, {"vehicle": FIVE, "sensors": "paper"}),
+        (11, {"vehicle": FIVE, "sensors": "state", "task": "waypoints"}),
+        (11, {"vehicle": FIVE, "sensors": "mocap", "task": "position"}),
         pytest.param(
             11,
             {
@@ -382,7 +384,7 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
     ],
     ids=[
         "one group", "and three more", "fewer than a group", "own vehicles", "waypoints",
-        "four effects", "four, paper", "four, state", "four, mocap",
+        "five effects", "five, paper", "five, state", "five, mocap",
         "nine effects, each their own, in turbulence, late sensors", "a list",
         "nine effects", "nine effects, own vehicles", "ranges in wind",
     ],

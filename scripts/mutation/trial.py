@@ -37,6 +37,8 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/model/sampling.py": _ENV,
     "coax_env/model/*": _MODEL,
     "coax_env/env/fl*": (*_ENV, "tests/test_simd.py"),
+    "coax_env/env/simd_loops.py": ("tests/test_simd.py", *_ENV),
+    "coax_env/env/paths.py": ("tests/test_trajectory.py", *_ENV),
     "coax_env/env/turbulence.py": ("tests/test_turbulence.py", *_ENV),
     "coax_env/env/*": _ENV,
     "coax_env/simulation/multisine.py": ("tests/test_flight_plan.py",),
@@ -45,9 +47,15 @@ OWN: dict[str, tuple[str, ...]] = {
     "controllers/estimator.py": (
         "tests/test_estimator.py", "tests/test_faulty_sensors.py", "tests/test_controllers.py",
     ),
+    "coax_env/estimation/flown.py": ("tests/test_blinding_logs.py", "tests/test_estimation.py"),
+    "coax_env/estimation/parted_engine.py": ("tests/test_compare.py", "tests/test_estimation.py"),
     "coax_env/estimation/quadratic.py": ("tests/test_quadratic.py", "tests/test_diagnosis.py"),
     "coax_env/estimation/prediction.py": ("tests/test_prediction.py", "tests/test_diagnosis.py"),
     "coax_env/estimation/trajectories.py": ("tests/test_trajectories.py", "tests/test_report.py"),
+    "coax_env/estimation/*noise*": (
+        "tests/test_noise_levels.py", "tests/test_estimation.py", "tests/test_helicopter.py",
+        "tests/test_kalman.py", "tests/test_diagnosis.py",
+    ),
     "coax_env/estimation/*": (
         "tests/test_estimation.py", "tests/test_kalman.py", "tests/test_helicopter.py",
         "tests/test_fitted_vehicle.py",
@@ -59,6 +67,9 @@ OWN: dict[str, tuple[str, ...]] = {
         "tests/test_run_estimates.py", "tests/test_identification.py", "tests/test_two_step.py",
     ),
     "coax_env/diagnosis/gain.py": ("tests/test_gain.py", "tests/test_diagnosis.py"),
+    "coax_env/diagnosis/trust.py": ("tests/test_trust.py", "tests/test_diagnosis.py"),
+    "coax_env/diagnosis/replication.py": ("tests/test_trust.py", "tests/test_diagnosis.py"),
+    "coax_env/diagnosis/changes.py": ("tests/test_edits.py",),
     "coax_env/diagnosis/refinement.py": (
         "tests/test_refinement.py", "tests/test_diagnosis.py", "tests/test_unlisted.py",
     ),
@@ -79,8 +90,10 @@ WHOLE_FLIGHTS = ("coax_env/diagnosis/*", "coax_env/identification/identify.py")
 
 
 def own_tests(file: str) -> tuple[str, ...]:
-    """The tests of a file."""
-    return next((tests for pattern, tests in OWN.items() if fnmatchcase(file, pattern)), ())
+    """The tests of a file: those of its name, where there are any, and those of its pattern."""
+    named = f"tests/test_{Path(file).stem}.py"
+    fitting = next((tests for pattern, tests in OWN.items() if fnmatchcase(file, pattern)), ())
+    return tuple(dict.fromkeys((named, *fitting)))
 
 
 APART = (
