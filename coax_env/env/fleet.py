@@ -44,8 +44,8 @@ SIMD_FROM = 8
 """Fewer helicopters fly one by one: the SIMD batch takes seconds to compile."""
 
 SIMD_VARIANT_FROM = 128
-"""The same where they have effects, air or numbers of their own: that variant is theirs alone, and
-takes 6 to 15 s to compile, in which 100 of them fly a minute each one by one."""
+"""The same where they have effects, air or numbers of their own: that variant is theirs alone and takes
+6 to 15 s to compile, as long as 100 of them fly ten minutes each one by one."""
 
 _fly_rows = looked_up_once(flight_loop.fly_rows)
 _disturb_rows = looked_up_once(flight_loop.disturb_rows)
