@@ -30,7 +30,7 @@ TRUST = {
 def main() -> None:
     options = arguments()
     flights = flights_in(options.flight)
-    if not options.effect:  # those of a user are compiled with the rest
+    if not options.effect and all(map(Path.is_dir, flights)):  # a user's effect: with the rest
         from coax_env.estimation.compile_ahead import fill_cache
 
         fill_cache()
