@@ -485,7 +485,8 @@ def _predict(command, A_by_state, B_by_command, turn, state):
     """
     before = np.empty(state.shape[1])
     for i in range(len(state)):
-        before[:] = state[i]
+        for j in range(len(before)):
+            before[j] = state[i, j]
         state[i] = 0.0
         _add_product(A_by_state, before, state[i])
         _add_product(B_by_command, command[i], state[i])

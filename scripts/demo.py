@@ -17,6 +17,7 @@ import diagnose as diagnose_script
 import coax_env
 from coax_env import plain_words
 from coax_env.diagnosis.diagnose import SHARES, Diagnosis, diagnose
+from coax_env.estimation.compile_ahead import fill_cache
 from coax_env.files import write_json
 from coax_env.logs.flight import read_flight
 from coax_env.model.vehicle import Vehicle
@@ -37,6 +38,7 @@ def main() -> None:
     start = monotonic()
 
     print("1. A measured flight: 12 runs of a Lama 400D, synthetic, from an independent simulator.")
+    fill_cache()
     result = diagnose_and_print("demo", BUNDLED, None)
     truth = json.loads((BUNDLED / "truth.json").read_text())
     print(f"   hidden in it, for comparison: {', '.join(truth['hidden'])}\n")

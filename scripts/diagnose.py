@@ -29,6 +29,10 @@ TRUST = {
 def main() -> None:
     options = arguments()
     flights = flights_in(options.flight)
+    if not options.effect and all(map(Path.is_dir, flights)):  # a user's effect: with the rest
+        from coax_env.estimation.compile_ahead import fill_cache
+
+        fill_cache()
     if flights != options.flight or len(flights) > 1:
         of_many(flights, options)
         return

@@ -693,12 +693,14 @@ def _acting(commands, clock, dt, k, j, hidden, rotors):
     if hidden.command_delay > 0.0:  # packets come sooner or later by 3 ms
         common = hidden.command_delay + 0.003 * math.sin(2.4 * k)
     actual = commands[_late_row(clock, dt, k, j, common)].copy()
-    actual[2:4] = commands[_late_row(clock, dt, k, j, common + hidden.servo_delay), 2:4]
+    late = commands[_late_row(clock, dt, k, j, common + hidden.servo_delay)]
+    actual[2], actual[3] = late[2], late[3]
     actual[0] = _drooped(actual[0], hidden.droop_upper, rotors.hover_upper)
     actual[1] = _drooped(actual[1], hidden.droop_lower, rotors.hover_lower)
     if hidden.per_volt > 0.0:
         weaker = volts(commands[k, 0] * commands[k, 1], clock[k], rotors) / FULL
-        actual[:2] *= weaker ** (FULL * hidden.per_volt)
+        actual[0] *= weaker ** (FULL * hidden.per_volt)
+        actual[1] *= weaker ** (FULL * hidden.per_volt)
     sag = math.exp(-hidden.sag * max(clock[k], 0.0))
     actual[0] *= sag
     actual[1] *= sag

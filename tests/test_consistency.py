@@ -46,6 +46,11 @@ def checked(flight: Flight, waive: tuple[str, ...] = ()) -> Agreement:
 
 
 @cache
+def bundled() -> Flight:
+    return read_flight(BUNDLED)
+
+
+@cache
 def with_positions(folder: Path) -> Path:
     """A simulated flight with motion capture beside the default sensors."""
     lama = load_vehicle("lama400d")
@@ -132,13 +137,27 @@ ERRORS_OF_POSITIONS: Mapping[str, tuple[str, str]] = {
 }
 
 
-@pytest.mark.parametrize("what", ERRORS)
+QUICK = (
+    "p turned", "az turned", "theta turned", "h turned", "ve turned", "delta_lon turned",
+    "one gyro taken for deg/s", "attitude taken for deg", "accelerometers taken for g",
+    "height in cm", "rotors in rev/s", "rotors swapped", "velocities swapped", "z up, y left",
+    "swash as pulse widths", "rotor as pulse widths", "pn turned", "positions in feet",
+)  # fmt: skip
+"""An error of each kind; the others, on other channels, are in the slow tests."""
+
+
+def each(errors: Mapping[str, tuple[str, str]]) -> list:
+    slow = pytest.mark.slow
+    return [pytest.param(what, marks=() if what in QUICK else slow) for what in errors]
+
+
+@pytest.mark.parametrize("what", each(ERRORS))
 def test_an_error_of_a_card_is_refused_with_the_line_to_change(tmp_path, what):
     columns, right = ERRORS[what]
     said_right(planted(BUNDLED, tmp_path / "f", columns), right)
 
 
-@pytest.mark.parametrize("what", ERRORS_OF_POSITIONS)
+@pytest.mark.parametrize("what", each(ERRORS_OF_POSITIONS))
 def test_and_where_positions_are_logged(tmp_path, tmp_path_factory, what):
     columns, right = ERRORS_OF_POSITIONS[what]
     sound = with_positions(tmp_path_factory.getbasetemp() / "positions")
@@ -159,7 +178,7 @@ def said_right(flight: Flight, right: str) -> None:
 
 
 def test_the_bundled_flight_is_sound():
-    found = checked(read_flight(BUNDLED))
+    found = checked(bundled())
     assert found.faults == () and found.advice is None and found.unseen == ()
 
 
@@ -226,7 +245,7 @@ def test_a_weak_derivative_is_the_derivative():
 
 def test_a_column_that_was_written_in_another_unit_is_found():
     """Not by the card: the roll column itself is in degrees already divided by 57.3 once too often."""
-    flight = read_flight(BUNDLED).select(RUNS)
+    flight = bundled().select(RUNS)
     runs = tuple(
         replace(r, measured={c: y / 57.29578 if c == "phi" else y for c, y in r.measured.items()})
         for r in flight.runs
@@ -279,7 +298,7 @@ def test_air_of_another_planet_and_unlogged_swash_are_refused(tmp_path):
 )  # fmt: skip
 def test_a_run_whose_file_is_unlike_the_others_is_named(change, check):
     """Pooled with sound runs it only weakens them; no line of the card would be right for all."""
-    flight = read_flight(BUNDLED)
+    flight = bundled()
     odd = flight.run("lon_3211")
     speed = change.get("rpm", 1.0)
     odd = replace(

@@ -8,6 +8,7 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+from corrected import NINE
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
@@ -26,19 +27,6 @@ from coax_env.simulation.log import log_readings
 
 LAMA = coax_env.load_vehicle("lama400d")
 DELAYED = LAMA.with_effect("servo_delay", time=0.027).with_effect("rotor_drag", coefficient=4e-4)
-
-NINE = (
-    LAMA.with_effect("command_delay", time=0.068)
-    .with_effect("hub_stiffness", upper=0.2, lower=0.1)
-    .with_effect("swash_phase", angle=0.2)
-    .with_effect("yaw_damping", coefficient=0.003)
-    .with_effect("motor_droop", upper=0.2, lower=0.15)
-    .with_effect("flap_blowback", gain=0.006)
-    .with_effect("swash_offset", lon=0.01, lat=-0.01)
-    .with_effect("marker_offset", y=0.18)
-    .with_effect("vibration", tilt=2.1e-3, heave=3.3e-4)
-)
-"""What the diagnosis of the real CoaX names."""
 
 
 def actions(seed: int, *shape: int, size: float = 1.0) -> np.ndarray:

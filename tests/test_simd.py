@@ -9,6 +9,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from corrected import FOUR, NINE
 
 import coax_env
 from coax_env.env import fleet
@@ -31,6 +32,7 @@ from coax_env.model.dynamics import measure_bare as measure_any
 from coax_env.model.dynamics import step_bare as step_any
 from coax_env.model.layout import N_CHANNELS, N_FULL, N_INPUTS
 
+SLOW = pytest.mark.slow  # has a variant of its own to compile
 LAMA = coax_env.load_vehicle("lama400d")
 TERMS = (
     "unlisted_Z.abs_w_w", "unlisted_Z.height", "unlisted_L.u_q", "unlisted_M.sin_3psi",
@@ -290,27 +292,8 @@ def test_rows_go_into_registers_and_back_to_where_they_were(columns, kind):
 # --- the fleet ------------------------------------------------------------------------------------
 
 
-FOUR = (
-    LAMA.with_effect("motor_lag", upper=0.07, lower=0.05)
-    .with_effect("wind", north=-1.0, east=1.2)
-    .with_effect("rotor_drag", coefficient=3.5e-4)
-    .with_effect("gyro_bias", x=0.004, y=-0.012, z=0.002)
-)
-"""What is hidden in the bundled flight."""
 FIVE = FOUR.with_effect("battery_sag", rate=0.002)
-"""And what follows each row's own clock."""
-NINE = (
-    LAMA.with_effect("command_delay", time=0.068)
-    .with_effect("hub_stiffness", upper=0.2, lower=0.1)
-    .with_effect("swash_phase", angle=0.2)
-    .with_effect("yaw_damping", coefficient=0.003)
-    .with_effect("motor_droop", upper=0.2, lower=0.15)
-    .with_effect("flap_blowback", gain=0.006)
-    .with_effect("swash_offset", lon=0.01, lat=-0.01)
-    .with_effect("marker_offset", y=0.18)
-    .with_effect("vibration", tilt=2.1e-3, heave=3.3e-4)
-)
-"""What the diagnosis of the real CoaX names."""
+"""What is hidden in the bundled flight, and what follows each row's own clock."""
 LATE = FOUR.with_sensor("h", delay=0.033, dropout=0.2, bias_std=0.05).with_actuators(
     swash_travel=0.15, rotor_acceleration=2000.0
 )
@@ -325,7 +308,8 @@ def spread_out(vehicle, *names: str):
 
 def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str, np.ndarray]:
     """A flight of a batch through ends and resets: what came, (steps, count, ...)."""
-    monkeypatch.setattr(fleet, "SIMD_FROM", 2 if side_by_side else 10**9)
+    for fewest in ("SIMD_FROM", "SIMD_VARIANT_FROM"):
+        monkeypatch.setattr(fleet, fewest, 2 if side_by_side else 10**9)
     env = CoaxVectorEnv(count, max_episode_steps=90, threads=1, **arguments)
     env.reset(seed=7)
     rng = np.random.default_rng(2)
@@ -351,10 +335,10 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
         (2, {"sensors": "mocap", "task": "position"}),
         (SIMD_WIDTH + 1, {"randomize": "posterior", "gusts": (0.3, 0.01)}),
         (13, {"sensors": "mocap", "task": "waypoints", "target": [(0, 0, 1.5, 0), (0, 0, 1.6, 0)]}),
-        (11, {"vehicle": FIVE, "gusts": (0.3, 0.01)}),
-        (11, {"vehicle": FIVE, "sensors": "paper"}),
-        (11, {"vehicle": FIVE, "sensors": "state", "task": "waypoints"}),
-        (11, {"vehicle": FIVE, "sensors": "mocap", "task": "position"}),
+        pytest.param(11, {"vehicle": FIVE, "gusts": (0.3, 0.01)}, marks=SLOW),
+        pytest.param(11, {"vehicle": FIVE, "sensors": "paper"}, marks=SLOW),
+        pytest.param(11, {"vehicle": FIVE, "sensors": "state", "task": "waypoints"}, marks=SLOW),
+        pytest.param(11, {"vehicle": FIVE, "sensors": "mocap", "task": "position"}, marks=SLOW),
         pytest.param(
             11,
             {
@@ -363,13 +347,13 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
                 "randomize": "posterior", "wind": (1.0, -2.0), "turbulence": 5.0,
                 "gusts": (0.1, 0.01), "sensors": "mocap", "task": "waypoints",
             },
-            marks=pytest.mark.slow,
+            marks=SLOW,
         ),
         pytest.param(
             19, {"randomize": [LAMA, FOUR, LATE, "skybotix_coax"]}, marks=pytest.mark.slow
         ),
-        pytest.param(11, {"vehicle": NINE}, marks=pytest.mark.slow),
-        pytest.param(11, {"vehicle": NINE, "randomize": "posterior"}, marks=pytest.mark.slow),
+        pytest.param(11, {"vehicle": NINE}, marks=SLOW),
+        pytest.param(11, {"vehicle": NINE, "randomize": "posterior"}, marks=SLOW),
         pytest.param(
             11,
             {
@@ -379,7 +363,7 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
                 },
                 "wind": 1.0,
             },
-            marks=pytest.mark.slow,
+            marks=SLOW,
         ),
     ],
     ids=[
@@ -415,6 +399,17 @@ def test_a_batch_is_compiled_for_what_its_vehicles_have():
     assert not any(off.makeup)
 
 
+def test_few_helicopters_are_not_worth_a_variant():
+    few = fleet.SIMD_VARIANT_FROM - 1
+    for count, vehicle, expected in (
+        (fleet.SIMD_FROM - 1, LAMA, False),
+        (fleet.SIMD_FROM, LAMA, True),
+        (few, FOUR, False),
+        (few + 1, FOUR, True),
+    ):
+        assert CoaxVectorEnv(count, vehicle).fleet._side_by_side is expected
+
+
 @numba.njit
 def _branching(x, f, p, e):
     if x[S.R] > 0.0:
@@ -427,6 +422,7 @@ def _selecting(x, f, p, e):
 
 
 def test_a_users_effect_with_a_branch_flies_one_by_one_and_says_so(monkeypatch):
+    monkeypatch.setattr(fleet, "SIMD_VARIANT_FROM", SIMD_WIDTH)
     damped = LAMA.with_effect("yaw_damping", coefficient=0.004)
     for function, fits in ((_selecting, True), (_branching, False)):
         entry = replace(effects.GROUPS["yaw_damping"], users=True, function=function)

@@ -11,12 +11,13 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import coax_env
-from coax_env.env import hover, tasks
+from coax_env.env import fleet, hover, tasks
 from coax_env.env.gym_env import CoaxEnv
 from coax_env.env.period import DT
 from coax_env.env.turbulence import dryden
 from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.errors import InputError
+from coax_env.kernel.simd import SIMD_WIDTH
 from coax_env.model import dynamics, effects
 from coax_env.model.actuators import limit, limits
 from coax_env.model.layout import CHANNELS
@@ -32,6 +33,12 @@ EYED = (
     .with_sensor("psi", rate=10.0)
 )
 TRIM = dynamics.hover_trim(LAMA)
+
+
+@pytest.fixture
+def one_by_one(monkeypatch):
+    """Helicopters fly one by one: no variant is compiled for some steps (test_simd.py has those)."""
+    monkeypatch.setattr(fleet, "SIMD_VARIANT_FROM", 10**9)
 
 
 def actions(seed: int, *shape: int, size: float = 0.4) -> np.ndarray:
@@ -346,9 +353,12 @@ def test_what_is_logged_is_what_is_flown(vehicle, name):
     np.testing.assert_allclose(states, track.state[1:], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("count", [3, 19], ids=["one by one", "in lanes"])
-def test_what_is_under_way_in_a_late_servo_at_reset_is_the_trim(count):
+@pytest.mark.parametrize(
+    "count", [3, pytest.param(19, marks=pytest.mark.slow)], ids=["one by one", "in lanes"]
+)
+def test_what_is_under_way_in_a_late_servo_at_reset_is_the_trim(monkeypatch, count):
     """A machine rigged askew hovers with its plate tilted: nothing moves before a command does."""
+    monkeypatch.setattr(fleet, "SIMD_VARIANT_FROM", SIMD_WIDTH)
     rigged = LAMA.with_effect("swash_offset", lon=0.03, lat=-0.02)
     env = CoaxVectorEnv(count, rigged.with_effect("servo_delay", time=0.03), nominal=rigged)
     trim, command = dynamics.hover_trim(rigged)
@@ -388,6 +398,7 @@ def test_turbulence_acts_through_drag_and_not_on_a_bare_vehicle():
     assert np.abs(flown["dragged", 6.0] - flown["dragged", None])[:3].max() > 0.05
 
 
+@pytest.mark.usefixtures("one_by_one")
 def test_turbulence_rides_on_the_steady_wind():
     env = CoaxVectorEnv(300, DRAGGED, wind=(0.0, 5.0), turbulence=5.0)
     env.reset(seed=0)
@@ -402,6 +413,7 @@ def test_turbulence_rides_on_the_steady_wind():
     assert abs(up) < 0.2  # rotor drag lies in the rotor's plane
 
 
+@pytest.mark.usefixtures("one_by_one")
 def test_eddies_are_as_large_as_the_height_flown_at():
     """Dryden's lengths grow with height: what changes in a tenth of a second is a smaller part."""
     changes = []
@@ -621,6 +633,7 @@ def test_ranges_draw_uniformly_and_fly():
     assert info["_vehicle"].all()
 
 
+@pytest.mark.usefixtures("one_by_one")
 def test_a_list_draws_each_vehicle_with_its_own_sensors_and_limits():
     heavy = LAMA.with_effect("added_mass", mass=0.1).with_actuators(swash_travel=0.01)
     heavy = heavy.with_sensor("h", bias=1.0, noise=0.0)

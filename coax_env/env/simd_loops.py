@@ -94,11 +94,15 @@ def _by_phase(first, last, active, rows, order):
 # --- parameters -----------------------------------------------------------------------------------
 
 
-@compiled()
-def _same_for_all(world, p):
-    """The parameters that are read, into registers (n_parameters,): the same in every lane."""
+@compiled(makes_arrays=True)
+def _own_blocks(world, own):
+    """What become registers of the parameters, (n_parameters, SIMD_WIDTH), those that are read the same
+    in every lane, and of the numbers of each row's own, (k, SIMD_WIDTH)."""
+    p_block = np.empty((_N_PARAMETERS, SIMD_WIDTH))
     for k in world.read:
-        p[k] = world.params[k]
+        for j in range(SIMD_WIDTH):
+            p_block[k, j] = world.params[k]
+    return p_block, np.empty((own.shape[1], SIMD_WIDTH))
 
 
 @compiled()
@@ -132,10 +136,8 @@ def step_rows(kind, first, last, active, actions, x, flown, heli, world, mission
     single_, stream_ = simd_view(single_block), simd_view_uint64(stream_block)
     work, flown_ = simd_scratch(WORK_SIZE), simd_scratch(N_FULL)
     if OWN:
-        p_block = np.empty((_N_PARAMETERS, SIMD_WIDTH))
-        own_block = np.empty((own.shape[1], SIMD_WIDTH))
+        p_block, own_block = _own_blocks(world, own)
         p, own_ = simd_view(p_block), simd_view(own_block)
-        _same_for_all(world, p)
     else:
         p = world.params
     if TURBULENT:
@@ -218,10 +220,8 @@ def sense_rows(kind, first, last, active, x, heli, world, observations):
     )  # fmt: skip
     stream_ = simd_view_uint64(stream_block)
     if OWN:
-        p_block = np.empty((_N_PARAMETERS, SIMD_WIDTH))
-        own_block = np.empty((own.shape[1], SIMD_WIDTH))
+        p_block, own_block = _own_blocks(world, own)
         p, own_ = simd_view(p_block), simd_view(own_block)
-        _same_for_all(world, p)
     else:
         p = world.params
     if EFFECTS:

@@ -26,11 +26,13 @@ from coax_env.estimation.kalman import (
 )
 from coax_env.estimation.sparse import REORDER, aligned, padded, unpack, with_places
 from coax_env.kernel.angles import wrap_angle
-from coax_env.kernel.compilation import compiled
+from coax_env.kernel.compilation import compiled, compiled_when_called
 from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
 
 
-@compiled(boolean(MODEL, RUN_DATA, _A, _A, GAINS, int64, _M), makes_arrays=True, **REORDER)
+@compiled_when_called(
+    boolean(MODEL, RUN_DATA, _A, _A, GAINS, int64, _M), makes_arrays=True, **REORDER
+)
 def mean_pass(model, run, x0, p, gains, refresh, e):
     """Whitened innovations of the mean with the gains of a filter pass.
 
@@ -244,7 +246,7 @@ def _propagate(exact, F, w):
             s[i * blocks + b] = total
 
 
-@compiled(
+@compiled_when_called(
     types.void(MODEL, _A, TRACE, _A, MOVES, int64, PORTION, _M, _M, _M),
     makes_arrays=True, **REORDER,
 )  # fmt: skip

@@ -36,7 +36,7 @@ from coax_env.estimation.sparse import (
     with_places,
 )
 from coax_env.kernel.angles import wrap_angle
-from coax_env.kernel.compilation import compiled, pointer
+from coax_env.kernel.compilation import compiled, compiled_when_called, pointer
 from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
 
 _A = float64[::1]
@@ -599,7 +599,7 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
     return log_likelihood, deweighted
 
 
-@compiled(
+@compiled_when_called(
     types.Tuple((float64, int64))(
         MODEL, RUN_DATA, VARIANCES, _A, float64, int64, TRACE, COVARIANCES
     ),
@@ -624,7 +624,7 @@ def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
     nx, m = assumed.x0.size, assumed.R.size
     width = padded(nx)
     P = aligned(nx, width)
-    P[:, :nx] = assumed.P0
+    _store_matrix(assumed.P0, P[:, :nx])
     AH = aligned(nx + m, width)
     scratch = model.work_size if model.has_lanes else 0
     w = _Filter(
@@ -644,7 +644,7 @@ def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
     return _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w)
 
 
-@compiled(boolean(MODEL, _A, _M, _A, _A, int64, _N, _A), makes_arrays=True)
+@compiled_when_called(boolean(MODEL, _A, _M, _A, _A, int64, _N, _A), makes_arrays=True)
 def fly_open_loop(model, dt, u, x, p, first, targets, out):
     """Predict alone: fly from row `first` with the recorded inputs; read each channel at its own row.
 

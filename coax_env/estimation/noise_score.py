@@ -16,7 +16,7 @@ from coax_env.estimation.sparse import (
     unpack,
     with_places,
 )
-from coax_env.kernel.compilation import compiled
+from coax_env.kernel.compilation import compiled, compiled_when_called
 from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
 
 FEW = 4
@@ -180,7 +180,7 @@ def _noise_slopes(places, q, decay, w, in_noise, in_decay, expected):
             in_decay[e] += slope * q[e] * (w.left[e] - grown) / decay[e]
 
 
-@compiled(
+@compiled_when_called(
     types.void(_A, TRACE, int64[:, ::1], _A, _A, float64, int64, _N, SLOPES),
     makes_arrays=True, **REORDER,
 )  # fmt: skip

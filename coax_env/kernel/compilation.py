@@ -11,10 +11,15 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache, wraps
 from pathlib import Path
 from typing import Any
 
 import numba
+
+from coax_env.kernel.numba_internals import compile_uncollected
+
+compile_uncollected()
 
 PACKAGE = Path(__file__).parents[1]
 COMPILED_ROOMS = ("kernel", "model")
@@ -63,9 +68,9 @@ def include(path: Path) -> None:
 
 
 @contextmanager
-def _own_cache() -> Iterator[None]:
+def _own_cache(folder: Path | None = None) -> Iterator[None]:
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(CACHE_DIR)
+    numba.config.CACHE_DIR = str(folder or CACHE_DIR)
     try:
         yield
     finally:
@@ -97,11 +102,12 @@ time. numba refuses to compile what makes an array all the same; what returns on
 
 
 def compiled(
-    signature: Any = None, makes_arrays: bool = False, **options: Any
+    signature: Any = None, makes_arrays: bool = False, folder: Path | None = None, **options: Any
 ) -> Callable[[Callable], Any]:
     """``numba.njit`` that caches under CACHE_DIR and releases the GIL.
 
-    makes_arrays: the function makes arrays or returns them, see BORROWING.
+    makes_arrays: the function makes arrays or returns them, see BORROWING. folder: of the cache, or
+    CACHE_DIR.
     """
     settings = {
         "cache": True, "nogil": True, "no_cfunc_wrapper": True,
@@ -110,10 +116,32 @@ def compiled(
 
     def decorate(function: Callable) -> Any:
         name_apart(function)
-        with _own_cache():
+        with _own_cache(folder):
             if signature is None:
                 return numba.njit(**settings)(function)
             return numba.njit(signature, **settings)(function)
+
+    return decorate
+
+
+def compiled_when_called(signature: Any, **options: Any) -> Callable[[Callable], Any]:
+    """As `compiled`, but at the first call, or at that of its attribute ``prepare``.
+
+    For functions that Python alone calls, so that an import compiles only what others call.
+    """
+    folder = CACHE_DIR  # a user's file that is included later changes nothing in it
+
+    def decorate(function: Callable) -> Any:
+        @cache
+        def prepared() -> Any:
+            return compiled(signature, folder=folder, **options)(function)
+
+        @wraps(function)
+        def call(*arguments: Any) -> Any:
+            return prepared()(*arguments)
+
+        call.prepare = prepared  # type: ignore[attr-defined]
+        return call
 
     return decorate
 

@@ -5,13 +5,14 @@ names stand here and nowhere else (tests/test_simd.py), and pyproject.toml bound
 that the tests have run with. `context` and `builder` are those that numba hands to an intrinsic.
 """
 
+import gc
 import operator
 from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
+from numba.core import cgutils, event
 from numba.core.imputils import impl_ret_borrowed
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, Signature, infer_global, signature
@@ -27,6 +28,28 @@ unpack_tuple = cgutils.unpack_tuple
 """``unpack_tuple(builder, value, count)``: a tuple's elements."""
 if_unlikely = cgutils.if_unlikely
 """``with if_unlikely(builder, condition):`` code for what hardly ever happens."""
+
+
+class _Uncollected(event.Listener):
+    """No garbage collection while numba compiles: it takes a tenth of the time and frees little."""
+
+    depth, was_on = 0, True  # functions are compiled within one another, by one thread at a time
+
+    def on_start(self, event: Any) -> None:
+        if self.depth == 0:
+            self.was_on = gc.isenabled()
+            gc.disable()
+        self.depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self.depth -= 1
+        if self.depth == 0 and self.was_on:
+            gc.enable()
+
+
+def compile_uncollected() -> None:
+    """From now on, no garbage collection while numba compiles a function."""
+    event.register("numba:compile", _Uncollected())
 
 
 def define_call(

@@ -4,6 +4,7 @@ what is seldom needed lane by lane.
 
 import math
 import operator
+from collections.abc import Callable
 
 import numba
 import numpy as np
@@ -194,23 +195,19 @@ def _angle(y, x):
     return angle if is_register(x) and is_register(y) else None
 
 
-@by_type(math.asin)
-def _arc_sine(x):
-    def arc_sine(x):
-        out = 0.0 * x
-        for k in range(SIMD_WIDTH):
-            out = with_lane(out, k, math.asin(lane(x, k)))
-        return out
+def _lane_by_lane(function: Callable) -> None:
+    """Enter a function of one number for registers too."""
 
-    return arc_sine if is_register(x) else None
+    @by_type(function)
+    def _choose(x):
+        def of_lanes(x):
+            out = 0.0 * x
+            for k in range(SIMD_WIDTH):
+                out = with_lane(out, k, function(lane(x, k)))
+            return out
+
+        return of_lanes if is_register(x) else None
 
 
-@by_type(math.tanh)
-def _hyperbolic_tangent(x):
-    def hyperbolic_tangent(x):
-        out = 0.0 * x
-        for k in range(SIMD_WIDTH):
-            out = with_lane(out, k, math.tanh(lane(x, k)))
-        return out
-
-    return hyperbolic_tangent if is_register(x) else None
+_lane_by_lane(math.asin)
+_lane_by_lane(math.tanh)

@@ -79,18 +79,20 @@ def _filter(
     predicted, filtered = np.zeros((n, 5)), np.zeros((n, 5))
     P_predicted, P_filtered = np.zeros((n, 5, 5)), np.zeros((n, 5, 5))
     transition = np.zeros((n, 5, 5))
-    middle, slope = np.zeros(5), np.zeros(5)
+    slope = np.zeros(5)
     for k in range(n):
-        predicted[k], P_predicted[k] = x, P
+        _store_row(x, predicted[k])
+        _store_matrix(P, P_predicted[k])
         if np.isfinite(sonar[k]):
             gain = P[:, H].copy() / (P[H, H] + sonar_variance)
             x = x + gain * (sonar[k] - x[H])
             P = P - np.outer(gain, P[H].copy())
             P = 0.5 * (P + P.T)
-        filtered[k], P_filtered[k] = x, P
+        _store_row(x, filtered[k])
+        _store_matrix(P, P_filtered[k])
         after = min(k + 1, n - 1)
         _rates(x, q[k], ax[k], az[k], g, slope)
-        middle[:] = x + 0.5 * dt * slope
+        middle = x + 0.5 * dt * slope
         q_half, ax_half = 0.5 * (q[k] + q[after]), 0.5 * (ax[k] + ax[after])
         az_half = 0.5 * (az[k] + az[after])
         _rates(middle, q_half, ax_half, az_half, g, slope)
@@ -105,9 +107,22 @@ def _filter(
         G = np.zeros((5, 3))
         G[THETA, GYRO], G[U, GYRO], G[W, GYRO] = 1.0, -middle[W], middle[U]
         G[U, AX] = G[W, AZ] = 1.0
-        transition[k] = F
+        _store_matrix(F, transition[k])
         P = F @ P @ F.T + dt * dt * ((G * process_noise) @ G.T)
     return predicted, P_predicted, filtered, P_filtered, transition
+
+
+@compiled()
+def _store_row(row: np.ndarray, out: np.ndarray) -> None:
+    """One row of numbers into another: an assignment to a slice takes a second to compile."""
+    for k in range(len(row)):
+        out[k] = row[k]
+
+
+@compiled()
+def _store_matrix(A: np.ndarray, out: np.ndarray) -> None:
+    for i in range(len(A)):
+        _store_row(A[i], out[i])
 
 
 @compiled()

@@ -1,0 +1,85 @@
+"""Compilation: what is compiled, when, and by how many processes at once."""
+
+import gc
+import subprocess
+
+import numba
+import pytest
+from numba import float64
+from numba.extending import overload
+
+from coax_env.estimation import compile_ahead, frozen_gains, kalman, noise_score
+from coax_env.kernel import compilation
+from coax_env.kernel.compilation import compiled_when_called
+
+
+def test_what_only_python_calls_is_compiled_when_it_is_called(tmp_path, monkeypatch):
+    monkeypatch.setattr(compilation, "CACHE_DIR", tmp_path)
+
+    @compiled_when_called(float64(float64))
+    def doubled(x):
+        return x + x
+
+    assert not list(tmp_path.rglob("*doubled*"))
+    monkeypatch.setattr(compilation, "CACHE_DIR", tmp_path / "with a user's effect")
+    assert doubled(1.5) == 3.0 and doubled.prepare() is doubled.prepare()
+    assert list(tmp_path.rglob("*doubled*.nbc"))
+    assert not (tmp_path / "with a user's effect").exists()
+
+
+def probed(x):
+    """Of which the compiler asks, while it compiles, how it is to be compiled."""
+
+
+def test_no_garbage_is_collected_while_numba_compiles_and_it_is_again_afterwards():
+    seen = []
+
+    @overload(probed)
+    def _probed(x):
+        seen.append(gc.isenabled())
+        return (lambda x: x) if x == float64 else None
+
+    assert numba.njit(lambda x: probed(x))(3.0) == 3.0
+    with pytest.raises(numba.core.errors.TypingError):
+        numba.njit(lambda x: probed(x))("no number")
+    assert seen and not any(seen) and gc.isenabled()
+    gc.disable()
+    try:
+        numba.njit(lambda x: 3.0 * x)(1.0)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+def test_a_new_checkout_is_compiled_by_two_processes_and_a_filled_one_by_none(
+    tmp_path, monkeypatch
+):
+    begun, made = [], []
+
+    class Process:
+        def __init__(self, command, **options):
+            begun.append(command)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            made.append("waited")
+
+    monkeypatch.setattr(subprocess, "Popen", Process)
+    monkeypatch.setattr(compilation, "CACHE_DIR", tmp_path)
+    monkeypatch.setattr(compile_ahead, "compile_passes", lambda: made.append("passes"))
+    monkeypatch.setattr(compile_ahead.os, "cpu_count", lambda: 2)
+    compile_ahead.fill_cache()
+    assert [command[1:] for command in begun] == [["-m", "coax_env.estimation.compile_ahead"]]
+    assert made == ["passes", "waited"]
+    (tmp_path / "sources").mkdir()
+    (tmp_path / "sources" / f"{kalman.__name__.rpartition('.')[2]}.filter_pass-600.nbi").touch()
+    compile_ahead.fill_cache()
+    assert len(begun) == 1
+
+
+def test_every_pass_is_compiled_ahead():
+    rooms = (kalman, frozen_gains, noise_score)
+    passes = {f for room in rooms for f in vars(room).values() if hasattr(f, "prepare")}
+    assert len(passes) > 2 and set(compile_ahead.PASSES) == passes
