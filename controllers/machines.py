@@ -5,7 +5,8 @@ catalogue. It flies model_comparison.MANEUVERS in simulation, the flight is diag
 of the bare and of the corrected model fly the machine from the same seeds.
 
 What a controller takes from a model: LQG its filter and its gains, PPO the world it is trained in, PID
-the trim alone, as a feed-forward.
+the trim alone, as a feed-forward. ``lqg_hedged`` reckons with lags that its model does not name
+(lqr.HEDGE): what correcting is worth where that has been done.
 """
 
 import json
@@ -142,6 +143,7 @@ def _designs(
     """How a controller of each kind is made of a model and its name."""
     found: dict[str, Callable[[Vehicle, str], Controller]] = {
         "lqg": lambda model, _: lqr.design(model, bare),
+        "lqg_hedged": lambda model, _: lqr.design(model, bare, hedge=lqr.HEDGE),
         "pid": lambda model, _: pid.design(model, bare),
     }
     if ppo_steps:
@@ -203,7 +205,7 @@ def cost_ratio(scores: Mapping[str, Any], seed: int = 0) -> tuple[float, float, 
 def summary(results: Sequence[Mapping[str, Any]], seed: int = 0) -> dict[str, dict[str, Any]]:
     """By kind of controller: machines, median ratio with its interval over machines, the worst one."""
     found = {}
-    for kind in ("lqg", "ppo", "pid"):
+    for kind in ("lqg", "lqg_hedged", "ppo", "pid"):
         flown = [r for r in results if kind in r["scores"]]
         if not flown:
             continue
