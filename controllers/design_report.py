@@ -1,27 +1,38 @@
 """The report of a controller design: margins, a flight, and the estimator, on one page."""
 
+from collections.abc import Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from coax_env.env import hover
+from coax_env.env.period import DT
 from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.model.layout import ATTITUDE, FULL_STATES, N_STATES, STATES
+from coax_env.model.sensors import suite
 from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import unit_name
 from coax_env.report import figures
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from controllers.loading import Controller
-from controllers.lqr import LQG
-from controllers.margins import InputMargins, WorstVehicle, frequency_responses, sensitivities
+from controllers.lqr import HEDGE
+from controllers.margins import (
+    Design,
+    InputMargins,
+    WorstVehicle,
+    frequency_responses,
+    sensitivities,
+)
 from controllers.steps import StepResponse, step_responses
 
 MARGIN_HEADER = (
     "input", "gain margin down", "gain margin up", "phase margin", "least |1 + L|", "crossover",
 )  # fmt: skip
-LOWEST_SHOWN = 0.06
-"""Frequency from which the loops are drawn [rad/s]."""
+BESIDE_HEADER = ("design", "disk margin", "cost", "disk margin with lags", "cost with lags")
+SHOWN = (0.06, 0.9 * np.pi / DT)
+"""Frequencies from and to which the loops are drawn [rad/s]; at the end, 50 Hz, gains go to nought."""
 START = {"z": -hover.HEIGHT + 0.5, "psi": 0.5, "phi": 0.08, "u": 0.5}
 """Start of the flight that is shown: too low, turned, tilted, moving. SI."""
 
@@ -46,7 +57,7 @@ def _decibels(gain: float) -> str:
 
 
 def design_page(
-    controller: LQG,
+    controller: Design,
     vehicle: Vehicle,
     margins: list[InputMargins],
     disk: float,
@@ -55,6 +66,7 @@ def design_page(
     spread: np.ndarray,
     command_line: str = "",
     extreme: WorstVehicle | None = None,
+    beside: Sequence[Sequence[str]] = (),
 ) -> str:
     """The report as HTML text.
 
@@ -68,6 +80,7 @@ def design_page(
         spread: of `margins_over_spread` on it, (draws,).
         command_line: what was typed.
         extreme: of `worst_over_spread` on it.
+        beside: other designs, rows under BESIDE_HEADER.
     """
     gain, phase = disk_in_words(disk)
     lead = [
@@ -80,6 +93,7 @@ def design_page(
     ]
     response = figures.histories(*step_response(controller, vehicle))
     sections = [
+        *_beside_section(beside),
         Section("Margins", _margin_blocks(controller, margins)),
         Section("Sensitivity", _sensitivity_blocks(controller)),
         Section("Steps of the setpoint", _step_blocks(controller)),
@@ -91,10 +105,17 @@ def design_page(
     return page(f"Hover controller for {vehicle.name}", lead, sections, kicker="Controller design")
 
 
-def _margin_blocks(controller: LQG, margins: list[InputMargins]) -> list[str]:
+def _beside_section(beside: Sequence[Sequence[str]]) -> list[Section]:
+    """Rows under BESIDE_HEADER, with what the lags are; nothing without rows."""
+    lags = ", ".join(f"{name.replace('_', ' ')} {lag:g} s" for name, lag in HEDGE.items())
+    note = f"Cost per step of 50 flights. With lags: {lags}"
+    return [Section("Beside other designs", [table(BESIDE_HEADER, beside, note)])] if beside else []
+
+
+def _margin_blocks(controller: Design, margins: list[InputMargins]) -> list[str]:
     """Margins as a table, and the loops as a Bode diagram."""
     omega, _, single = frequency_responses(controller)
-    band = omega > LOWEST_SHOWN
+    band = (omega > SHOWN[0]) & (omega < SHOWN[1])
     loops = {m.input.replace("_", " "): h[band] for m, h in zip(margins, single.T, strict=True)}
     return [
         table(MARGIN_HEADER, margin_rows(margins), "One input at a time, the others closed"),
@@ -103,11 +124,11 @@ def _margin_blocks(controller: LQG, margins: list[InputMargins]) -> list[str]:
     ]
 
 
-def _sensitivity_blocks(controller: LQG) -> list[str]:
+def _sensitivity_blocks(controller: Design) -> list[str]:
     """S and T at the inputs over frequency, and their peaks."""
     omega, L, _ = frequency_responses(controller)
     S, T = sensitivities(L)
-    band = omega > LOWEST_SHOWN
+    band = (omega > SHOWN[0]) & (omega < SHOWN[1])
     curves = {"S": S[band], "T": T[band]}
     peaks = [
         f"{name}: largest {value.max():.2f} ({_decibels(value.max())}) at {hz:.1f} Hz"
@@ -144,7 +165,7 @@ def step_rows(responses: list[StepResponse]) -> list[list[str]]:
     ]  # fmt: skip
 
 
-def _step_blocks(controller: LQG) -> list[str]:
+def _step_blocks(controller: Design) -> list[str]:
     """Responses to steps of what is held, and their figures."""
     responses = step_responses(controller)
     panels = [(f"{one.name} [{one.unit}]", {one.name: one.value}) for one in responses]
@@ -166,20 +187,20 @@ def extreme_in_words(extreme: WorstVehicle) -> str:
     )
 
 
-def _estimator_blocks(controller: LQG) -> list[str]:
-    """Std of the estimation error of each state, with its unit where the state has one."""
+def _estimator_blocks(controller: Design) -> list[str]:
+    """Std of the estimation error of each state, those of one unit in a row."""
     estimator = controller.estimator
-    units = dict(FULL_STATES)
-    stds = [
-        f"{name}: {std:.2g} {unit_name(units.get(name, ''))}".rstrip()
-        for name, std in zip(estimator.states, estimator.spread, strict=True)
+    units = dict(FULL_STATES) | {f"bias_{s.name}": s.unit for s in suite(estimator.sensors)}
+    found = zip(estimator.states, estimator.spread, strict=True)
+    rows = [
+        [", ".join(name for name, _ in group), ", ".join(f"{std:.2g}" for _, std in group), unit]
+        for unit, members in groupby(found, key=lambda one: unit_name(units[one[0]]))
+        for group in (list(members),)
     ]
+    hidden = ", ".join(estimator.unobserved) or "none"
     return [
-        prose(
-            "Not observable with these sensors, and left out: "
-            f"{', '.join(estimator.unobserved) or 'none'}. Std of the estimation error, SI:"
-        ),
-        bullets(stds),
+        prose(f"Not observable with these sensors, and left out: {hidden}."),
+        table(("states", "std of the estimation error", "unit"), rows, "In the steady state"),
     ]
 
 

@@ -218,6 +218,32 @@ def plant(vehicle: Vehicle, design: EstimatorDesign) -> tuple[np.ndarray, ...]:
     return A[np.ix_(keep, keep)], B[keep], C_all[np.ix_(rows, keep)], D_all[rows]
 
 
+@dataclass(frozen=True)
+class NoiseLevels:
+    """What an estimator reckons with, as stds in the units of states and readings."""
+
+    first: np.ndarray  # (n,), of the state at a flight's start
+    process: np.ndarray  # (n,), of what a control period adds to it
+    reading: np.ndarray  # (m,), of readings at 100 Hz that tell as much as the suite's
+    ratio: np.ndarray  # (m,), periods from one sample to the next
+
+
+def noise_levels(vehicle: Vehicle, design: EstimatorDesign) -> NoiseLevels:
+    """The stds that a design was made with, every reading taken as one of 100 Hz.
+
+    Args:
+        vehicle: what it was designed on.
+        design: the filter.
+    """
+    first, process = _spreads(vehicle, design.command_trim)
+    keep = [_NAMES.index(name) for name in design.states]
+    used = {sensor.name: sensor for sensor in suite(design.sensors, vehicle)}
+    own = [used[name] for name in design.readings]
+    ratio = np.array([BASE_RATE / sensor.rate for sensor in own])
+    noise = np.array([max(sensor.noise, _FREE_OF_NOISE) for sensor in own])
+    return NoiseLevels(first[keep], process[keep], noise * np.sqrt(ratio), ratio)
+
+
 def _linear(vehicle: Vehicle, velocity: Sequence[float]) -> tuple[np.ndarray, ...]:
     """A, B, C, D of all states and readings, with disturbances and biases, and the trim."""
     A_flown, B_flown, C_channels, D_channels, x_trim, u_trim = sampled(

@@ -19,6 +19,8 @@ KINDS = {
     "scheduled": "lqg's designs over forward speed, blended: flies fast to targets (mocap)",
     "ppo": "a trained policy on that filter's estimate; shipped: hovers in still air on onboard",
     "ppo_outdoor": "another, added to lqg's feedback: hover, position, waypoints in wind; or mocap",
+    "hinf": "H-infinity hover controller on noisy sensors, for lags the model lacks (slycot)",
+    "mpc": "lqg's problem with the actions' bounds, planned by OSQP: a yardstick",
     "pid": "cascaded loops on the raw sensors, tuned by hand",
 }
 """The controllers by name."""
@@ -28,6 +30,8 @@ _CLASSES = {
     "lqi": ("state_feedback", "StateFeedback"),
     "lqg": ("lqr", "LQG"),
     "scheduled": ("schedule", "Schedule"),
+    "hinf": ("hinf", "HInfinity"),
+    "mpc": ("mpc", "MPC"),
     "pid": ("pid", "PID"),
 }
 
@@ -70,7 +74,7 @@ def make_controller(
         sensors: suite to design for (default: ``onboard``, ``mocap`` for ``scheduled``); ``lqi`` is
             given the exact state, the shipped policy of ``ppo`` and a file have suites of their own.
     """
-    from controllers import lqr, own_controller, pid, policy, schedule, state_feedback
+    from controllers import hinf, lqr, mpc, own_controller, pid, policy, schedule, state_feedback
 
     if (name in ("lqr", "lqi") and sensors == "state") or (name == "lqi" and sensors is None):
         return state_feedback.design(vehicle, nominal, integral=name == "lqi")
@@ -80,6 +84,8 @@ def make_controller(
         return lqr.design(vehicle, nominal, sensors or "onboard")
     if name == "scheduled":
         return schedule.design(vehicle, nominal, sensors or "mocap")
+    if name in ("hinf", "mpc"):
+        return (hinf if name == "hinf" else mpc).design(vehicle, nominal, sensors or "onboard")
     if name == "pid":
         return pid.design(vehicle, nominal, sensors or "onboard")
     if name == "ppo":

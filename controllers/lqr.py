@@ -17,7 +17,7 @@ from coax_env.env import hover
 from coax_env.env.actions import Nominal
 from coax_env.env.period import DT
 from coax_env.errors import InputError
-from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle import Parameter, Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 from controllers.estimator import (
     INTEGRAL_TIME,
@@ -76,6 +76,27 @@ BRISK = {"position": 0.5, "speed": 1.0}
 """Limits [m, m/s] that make a design go to its target sooner than hover.LIMITS do."""
 
 
+HEDGE = {"motor_lag.upper": 0.05, "motor_lag.lower": 0.05, "servo_lag.time": 0.02}
+"""Lags [s] of machines of this class, about two thirds of their usual sizes."""
+
+
+def hedged(vehicle: Vehicle, lags: Mapping[str, float]) -> Vehicle:
+    """A vehicle to design on: with lags of its actuators where its file names none.
+
+    A loop closed on them rolls off before the lags that a machine may have: they are the low-pass in
+    its inputs. What the file itself says of a lag stays as it is.
+
+    Args:
+        vehicle: what is known.
+        lags: parameter -> time [s], such as HEDGE.
+    """
+    known = vehicle.effects
+    lacking = {name: lag for name, lag in lags.items() if name.split(".")[0] not in known}
+    return vehicle.with_parameters(
+        {name: Parameter(lag, 0.0, "s", "a hedge, not measured") for name, lag in lacking.items()}
+    )
+
+
 def quadratic_cost(
     limits: Mapping[str, float] | None = None, weights: Mapping[str, float] | None = None
 ) -> dict[str, dict[str, float]]:
@@ -108,6 +129,7 @@ def design(
     limits: Mapping[str, float] | None = None,
     weights: Mapping[str, float] | None = None,
     velocity: Sequence[float] = (0.0, 0.0),
+    hedge: Mapping[str, float] | None = None,
 ) -> LQG:
     """Design a hover controller on a vehicle.
 
@@ -118,10 +140,11 @@ def design(
         limits: errors that count 1 in the cost, where not hover.LIMITS, such as BRISK.
         weights: of the errors, where not hover.COST_WEIGHTS.
         velocity: forward and right over ground [m/s], of the flight that it holds; 0: hover.
+        hedge: lags to reckon with where the vehicle has none, such as HEDGE, see `hedged`.
     """
     import control
 
-    vehicle = load_vehicle(vehicle)
+    vehicle = hedged(load_vehicle(vehicle), hedge or {})
     cost = quadratic_cost(limits, weights)
     estimator = design_estimator(vehicle, nominal, sensors, velocity)
     A, B, Q, R = regulator_problem(estimator, cost["limits"], cost["weights"])

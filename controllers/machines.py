@@ -5,7 +5,8 @@ catalogue. It flies model_comparison.MANEUVERS in simulation, the flight is diag
 of the bare and of the corrected model fly the machine from the same seeds.
 
 What a controller takes from a model: LQG its filter and its gains, PPO the world it is trained in, PID
-the trim alone, as a feed-forward.
+the trim alone, as a feed-forward. ``lqg_hedged`` reckons with lags that its model does not name
+(lqr.HEDGE): what correcting is worth where that has been done.
 """
 
 import json
@@ -16,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from coax_env.diagnosis.diagnose import diagnose
-from coax_env.files import write_json
+from coax_env.files import write_json, write_text
 from coax_env.model.usual_sizes import sized_for
 from coax_env.model.vehicle import Vehicle
-from coax_env.model.vehicle_file import load_vehicle
+from coax_env.model.vehicle_file import load_vehicle, vehicle_toml
 from coax_env.report import figures
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from coax_env.simulation.simulate import simulate
@@ -70,10 +71,14 @@ def fly_machine(
 ) -> dict[str, Any]:
     """Diagnose one machine's simulated flight, and fly it with controllers of both models.
 
+    What `result_path` says is done is not done again: neither the diagnosis, whose corrected model
+    lies beside the result as a vehicle file, nor the flights of a kind of controller.
+
     Args:
         seed: of the machine, its flight and the flights that are scored.
         bare: the model before the diagnosis.
-        out: folder of the policies; that of the bare model is trained once, for all machines.
+        out: folder of the results, and of the policies; that of the bare model is trained once, for
+            all machines.
         episodes: flights per controller.
         ppo_steps: env steps of each policy's training; 0: no PPO.
         truth: the corrected model is the machine itself, without a diagnosis: the most that any
@@ -85,33 +90,39 @@ def fly_machine(
         corrected.
     """
     report_progress = progress or (lambda text: None)
-    machine = draw_machine(bare, seed)
-    if truth:
-        corrected, named, verdict = machine, list(machine.effects), "the truth"
-    else:
+    machine, path = draw_machine(bare, seed), result_path(out, seed, truth)
+    found = _stored(path)
+    if found is None:
         report_progress(f"machine {seed}: {', '.join(machine.effects)}: diagnosing")
-        result = diagnose(simulate(machine, MANEUVERS, seed=seed), bare)
-        corrected = result.vehicle_after
-        named = [cause["effect"] for cause in result.findings["causes"]]
-        verdict = result.findings["verdict"]
-    kinds: dict[str, Callable[[Vehicle, str], Controller]] = {
-        "lqg": lambda model, _: lqr.design(model, bare),
-        "pid": lambda model, _: pid.design(model, bare),
-    }
-    if ppo_steps:
-        kinds["ppo"] = lambda model, name: _policy(model, name, seed, bare, out, ppo_steps)
-    flown: dict[str, dict[str, Any]] = {}
-    for kind, make in kinds.items():
-        flown[kind] = {}
+        found = _diagnosed(seed, machine, bare, path, truth)
+    corrected = load_vehicle(path.with_suffix(".toml"))
+    for kind, make in _designs(seed, bare, out, ppo_steps).items():
+        if kind in found["scores"]:
+            continue
+        flown = {}
         for name, model in zip(MODELS, (bare, corrected), strict=True):
             report_progress(f"machine {seed}: {kind} {name}")
             score = evaluate(
                 make(model, name), machine, episodes, seed=seed + FIRST_TEST_SEED, each_flight=True
             )
-            flown[kind][name] = {
-                key: score[key] for key in ("mean_cost", "success_rate", "flight_costs")
-            }
-    return {
+            flown[name] = {key: score[key] for key in ("mean_cost", "success_rate", "flight_costs")}
+        found["scores"][kind] = flown
+        write_json(path, found)
+    return found
+
+
+def _diagnosed(
+    seed: int, machine: Vehicle, bare: Vehicle, path: Path, truth: bool
+) -> dict[str, Any]:
+    """A machine's result without flights; it and the corrected vehicle are written to `path`."""
+    if truth:
+        corrected, named, verdict = machine, list(machine.effects), "the truth"
+    else:
+        result = diagnose(simulate(machine, MANEUVERS, seed=seed), bare)
+        corrected = result.vehicle_after
+        named = [cause["effect"] for cause in result.findings["causes"]]
+        verdict = result.findings["verdict"]
+    found = {
         "seed": seed,
         "hidden": {
             name: {key: parameter.value for key, parameter in group.items()}
@@ -119,8 +130,25 @@ def fly_machine(
         },
         "named": named,
         "verdict": verdict,
-        "scores": flown,
+        "scores": {},
     }
+    write_text(path.with_suffix(".toml"), vehicle_toml(corrected))
+    write_json(path, found)
+    return found
+
+
+def _designs(
+    seed: int, bare: Vehicle, out: Path, ppo_steps: int
+) -> dict[str, Callable[[Vehicle, str], Controller]]:
+    """How a controller of each kind is made of a model and its name."""
+    found: dict[str, Callable[[Vehicle, str], Controller]] = {
+        "lqg": lambda model, _: lqr.design(model, bare),
+        "lqg_hedged": lambda model, _: lqr.design(model, bare, hedge=lqr.HEDGE),
+        "pid": lambda model, _: pid.design(model, bare),
+    }
+    if ppo_steps:
+        found["ppo"] = lambda model, name: _policy(model, name, seed, bare, out, ppo_steps)
+    return found
 
 
 def _policy(
@@ -144,18 +172,10 @@ def fly_machines(
     truth: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """`fly_machine` of every seed whose OUT/machines/SEED.json is not there yet, each then written.
-
-    With `truth` they lie in OUT/truth. A result without PPO is flown again where PPO is asked for.
-    """
+    """`fly_machine` of every seed; arguments as there. With `truth` results lie in OUT/truth."""
     bare = load_vehicle(bare)
     for seed in seeds:
-        path = result_path(out, seed, truth)
-        found = _stored(path)
-        if found is None or (ppo_steps and "ppo" not in found["scores"]):
-            found = fly_machine(seed, bare, out, episodes, ppo_steps, truth, progress)
-            write_json(path, found)
-        yield found
+        yield fly_machine(seed, bare, out, episodes, ppo_steps, truth, progress)
 
 
 def result_path(out: Path, seed: int, truth: bool = False) -> Path:
@@ -164,7 +184,11 @@ def result_path(out: Path, seed: int, truth: bool = False) -> Path:
 
 
 def _stored(path: Path) -> dict[str, Any] | None:
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    """A result that lies there with its vehicle."""
+    if not (path.exists() and path.with_suffix(".toml").exists()):
+        return None
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found
 
 
 def cost_ratio(scores: Mapping[str, Any], seed: int = 0) -> tuple[float, float, float]:
@@ -181,7 +205,7 @@ def cost_ratio(scores: Mapping[str, Any], seed: int = 0) -> tuple[float, float, 
 def summary(results: Sequence[Mapping[str, Any]], seed: int = 0) -> dict[str, dict[str, Any]]:
     """By kind of controller: machines, median ratio with its interval over machines, the worst one."""
     found = {}
-    for kind in ("lqg", "ppo", "pid"):
+    for kind in ("lqg", "lqg_hedged", "ppo", "pid"):
         flown = [r for r in results if kind in r["scores"]]
         if not flown:
             continue

@@ -14,6 +14,7 @@ from coax_env.errors import InputError
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 from controllers.estimator import EstimatorDesign, integrated_readings, plant
+from controllers.hinf import HInfinity
 from controllers.lqr import LQG
 
 INPUT_NAMES = ("rotor_upper", "rotor_lower", "swash_lon", "swash_lat")
@@ -35,11 +36,12 @@ class InputMargins:
     crossover_hz: float  # where the phase margin is least
 
 
+Design = LQG | HInfinity
 Matrices = tuple[np.ndarray, ...]
 """A, B, C, D of a plant, see `estimator.plant`."""
 
 
-def open_loop(controller: LQG, vehicle: Vehicle | None = None) -> Any:
+def open_loop(controller: Design, vehicle: Vehicle | None = None) -> Any:
     """The loop broken at the plant's four inputs, as a discrete ``control.StateSpace``.
 
     The estimator is the single-rate equivalent of the periodic one: slow sensors taken as fast ones
@@ -52,7 +54,8 @@ def open_loop(controller: LQG, vehicle: Vehicle | None = None) -> Any:
     design = controller.estimator
     own = (design.A, design.B, design.C, design.D)
     model = own if vehicle is None else plant(vehicle, design)
-    return _regulator(controller) * _plant(model, design)
+    own_system = _regulator(controller) if isinstance(controller, LQG) else controller.as_system()
+    return own_system * _plant(model, design)
 
 
 def _plant(model: Matrices, design: EstimatorDesign) -> Any:
@@ -104,7 +107,7 @@ def _regulator(controller: LQG) -> Any:
 
 
 def frequency_responses(
-    controller: LQG, vehicle: Vehicle | None = None, points: int = 1000
+    controller: Design, vehicle: Vehicle | None = None, points: int = 1000
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frequency responses of `open_loop` up to Nyquist.
 
@@ -136,7 +139,7 @@ def sensitivities(L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.norm(S, 2, axis=(1, 2)), np.linalg.norm(np.eye(4) - S, 2, axis=(1, 2))
 
 
-def stability_margins(controller: LQG) -> tuple[list[InputMargins], float]:
+def stability_margins(controller: Design) -> tuple[list[InputMargins], float]:
     """Classical margins of each input with the others closed, and the disk margin of all four.
 
     The disk margin alpha allows every input at once a gain between (2 - alpha)/(2 + alpha) and its
@@ -153,7 +156,7 @@ def stability_margins(controller: LQG) -> tuple[list[InputMargins], float]:
 
 
 def margins_over_spread(
-    controller: LQG, vehicle: str | Vehicle, draws: int = 20, seed: int = 0
+    controller: Design, vehicle: str | Vehicle, draws: int = 20, seed: int = 0
 ) -> np.ndarray:
     """Disk margins on vehicles drawn from a vehicle's spread.
 
@@ -181,7 +184,7 @@ class WorstVehicle:
 
 
 def worst_over_spread(
-    controller: LQG,
+    controller: Design,
     vehicle: str | Vehicle,
     distance: float = WORST_DISTANCE,
     rounds: int = 3,
@@ -239,7 +242,7 @@ def worst_over_spread(
     return WorstVehicle(disk_margin(controller, vehicle.at(worst)), vehicle.at(worst), moves)
 
 
-def disk_margin(controller: LQG, vehicle: Vehicle, points: int = 1000) -> float:
+def disk_margin(controller: Design, vehicle: Vehicle, points: int = 1000) -> float:
     """Disk margin of all inputs at once on a vehicle; 0 where the loop is unstable.
 
     Args:

@@ -10,6 +10,7 @@ from coax_env.model.layout import FULL_STATES
 from coax_env.model.sampling import is_new
 from coax_env.model.sensors import suite
 from controllers.lqr import LQG
+from controllers.margins import Design
 
 STEPS = {"z": -0.2, "psi": 0.2, "u": 0.3, "v": 0.3, "x": 0.3, "y": 0.3}
 """State and the step of what is asked for [SI]; small enough for the actions not to clip."""
@@ -34,7 +35,7 @@ class StepResponse:
     settling_s: float  # from then on within 5 %
 
 
-def step_responses(controller: LQG, seconds: float = 15.0) -> list[StepResponse]:
+def step_responses(controller: Design, seconds: float = 15.0) -> list[StepResponse]:
     """Responses to STEPS of what the controller observes and holds, without noise.
 
     A speed is not held where the sensors show no position (its integral is): it returns to nought.
@@ -52,7 +53,7 @@ def step_responses(controller: LQG, seconds: float = 15.0) -> list[StepResponse]
     ]
 
 
-def _response(controller: LQG, name: str, size: float, seconds: float) -> StepResponse:
+def _response(controller: Design, name: str, size: float, seconds: float) -> StepResponse:
     """One step: plant and estimate both begin that far from the setpoint."""
     import control
 
@@ -61,7 +62,8 @@ def _response(controller: LQG, name: str, size: float, seconds: float) -> StepRe
     controller.reset(1)
     x, u = np.zeros(len(design.states)), np.zeros(4)
     x[at] = -size
-    controller.tracker.state[0, at] -= size
+    if isinstance(controller, LQG):  # the other takes it from the first reading
+        controller.tracker.state[0, at] -= size
     values = []
     for row in range(round(seconds / DT)):
         values.append(size + x[at])
@@ -80,7 +82,7 @@ def _response(controller: LQG, name: str, size: float, seconds: float) -> StepRe
     )  # fmt: skip
 
 
-def _observation(controller: LQG, deviation: np.ndarray, row: int) -> np.ndarray:
+def _observation(controller: Design, deviation: np.ndarray, row: int) -> np.ndarray:
     """What the env would show of readings (m,) about trim, without noise."""
     design = controller.estimator
     rates = {sensor.name: sensor.rate for sensor in suite(design.sensors)}

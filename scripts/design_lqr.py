@@ -7,9 +7,11 @@ import command_line
 from coax_env.env import hover
 from coax_env.files import make_folder, write_text
 from coax_env.model.sensors import SUITES
+from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from controllers import lqr, margins, schedule
+from controllers import hinf, lqr, margins, schedule
 from controllers.design_report import (
+    BESIDE_HEADER,
     MARGIN_HEADER,
     STEP_HEADER,
     design_page,
@@ -28,7 +30,13 @@ def main() -> None:
     vehicle = load_vehicle(options.vehicle)
     limits = command_line.numbers(options.limits, "--limits")
     weights = command_line.numbers(options.weights, "--weights")
-    controller = lqr.design(vehicle, options.nominal, options.sensors, limits, weights)
+    asked = (options.nominal, options.sensors, limits, weights)
+    designs: dict[str, margins.Design] = {"lqg": lqr.design(vehicle, *asked)}
+    if options.hedge:
+        designs["lqg, hedged"] = lqr.design(vehicle, *asked, hedge=lqr.HEDGE)
+    if options.method == "hinf":
+        designs["hinf"] = hinf.design(vehicle, *asked)
+    controller = list(designs.values())[-1]
     scheduled = (
         schedule.design(vehicle, options.nominal, options.sensors, options.speeds, limits, weights)
         if options.speeds
@@ -39,9 +47,10 @@ def main() -> None:
     worst = evaluate_spread(controller, vehicle, options.vehicles, 5, seed=options.seed)
     spread = margins.margins_over_spread(controller, vehicle, options.vehicles, options.seed)
     extreme = margins.worst_over_spread(controller, vehicle, seed=options.seed)
+    beside = beside_rows(designs, vehicle, options.seed) if len(designs) > 1 else []
     page = design_page(
         controller, vehicle, inputs, disk, score, worst, spread,
-        command_line.typed("design_lqr"), extreme,
+        command_line.typed("design_lqr"), extreme, beside,
     )  # fmt: skip
     make_folder(options.out)
     path = controller.save(options.out / "controller.json")
@@ -56,11 +65,33 @@ def main() -> None:
     )
     print(spread_in_words(worst, spread))
     print(extreme_in_words(extreme))
+    if beside:
+        command_line.print_columns([BESIDE_HEADER, *beside])
     command_line.print_columns([STEP_HEADER, *step_rows(step_responses(controller))])
     print(f"controller {path}, report {options.out / 'report.html'}")
 
 
-def print_margins(controller: lqr.LQG, inputs: list[margins.InputMargins], disk: float) -> None:
+def beside_rows(designs: dict[str, margins.Design], vehicle: Vehicle, seed: int) -> list[list[str]]:
+    """Designs side by side, on the vehicle and with lqr.HEDGE's lags in it.
+
+    Args:
+        designs: by name.
+        vehicle: what they were designed on.
+        seed: of the flights.
+    """
+    rows = []
+    for name, one in designs.items():
+        row = [name]
+        for flown in (vehicle, lqr.hedged(vehicle, lqr.HEDGE)):
+            score = evaluate(one, flown, episodes=50, seed=seed)
+            row += [f"{margins.disk_margin(one, flown):.2f}", f"{score['mean_cost']:.3g}"]
+        rows.append(row)
+    return rows
+
+
+def print_margins(
+    controller: margins.Design, inputs: list[margins.InputMargins], disk: float
+) -> None:
     """Stability margins, and the states that the sensors do not show.
 
     Args:
@@ -102,6 +133,14 @@ def arguments() -> argparse.Namespace:
         metavar="M/S",
         help="also a gain schedule over forward speed, rising from 0: DIR/schedule.json",
     )
+    parser.add_argument(
+        "--method", choices=("lqg", "hinf"), default="lqg",
+        help="hinf: H-infinity (slycot), beside LQG in the report (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--hedge", action="store_true",
+        help="reckon with lags of motors and servos that the vehicle file does not name",
+    )  # fmt: skip
     parser.add_argument(
         "--vehicles", type=int, default=20,
         help="how many to draw from the file's spread for the worst case (default: %(default)s)",

@@ -77,13 +77,13 @@ def arguments() -> argparse.Namespace:
     parser = command_line.parser("export", __doc__, seed=True)
     parser.add_argument(
         "controller",
-        help="lqg, scheduled, ppo, pid, or the path of a controller.json or policy.zip",
+        help="lqg, scheduled, ppo, ppo_outdoor, pid, or the path of a controller.json or policy.zip",
     )
     parser.add_argument(
         "--vehicle", default="lama400d", help="designed on, and flown (default: %(default)s)"
     )
     parser.add_argument("--nominal", help="vehicle whose trim centres the action (default: bare)")
-    parser.add_argument("--sensors", help="to design for (default: onboard; a file has its own)")
+    parser.add_argument("--sensors", help="to fly with (default: onboard; a file has its own)")
     parser.add_argument(
         "--task", default="hover", choices=("hover", "position", "waypoints"),
         help="flown for comparison (default: %(default)s)",

@@ -21,7 +21,7 @@ needs_compiler = pytest.mark.skipif(compiled.compiler() is None, reason="no C co
 
 KINDS = (
     ("lqg", "onboard"), ("lqg", "mocap"), ("scheduled", "mocap"), ("pid", "onboard"),
-    ("pid", "mocap"), ("ppo", None),
+    ("pid", "mocap"), ("ppo", None), ("ppo_outdoor", "onboard"), ("ppo_outdoor", "mocap"),
 )  # fmt: skip
 FAR = [(10.0, 0.0, 1.5, 0.0), (12.0, 0.5, 2.0, 0.5)]
 
@@ -84,6 +84,7 @@ def test_any_readings_give_the_same_commands(kind, sensors, exported):
         ("lqg", "mocap", {"task": "waypoints"}),
         ("scheduled", "mocap", {"task": "waypoints", "target": FAR}),
         ("pid", "mocap", {"task": "waypoints"}),
+        ("ppo_outdoor", "mocap", {"task": "waypoints", "wind": 4.0, "turbulence": "moderate"}),
     ],
 )
 def test_it_flies_the_same_flight(kind, sensors, flown, exported):
@@ -173,22 +174,27 @@ def test_a_literal_is_the_float_it_was():
         c_values.literal(np.nan)
 
 
-def test_the_network_as_onnx():
+@pytest.mark.parametrize(
+    ("kind", "sensors", "size"), [("ppo", None, 30.0), ("ppo_outdoor", "mocap", 1.0)]
+)
+def test_the_network_as_onnx(kind, sensors, size):
     onnx = pytest.importorskip("onnx")
     from onnx.reference import ReferenceEvaluator
 
     from controllers.export.onnx_network import onnx_bytes
 
-    policy = make_controller("ppo")
+    policy = make_controller(kind, sensors=sensors)
+    policy.reset(7)
     model = onnx.load_from_string(onnx_bytes(policy))
     onnx.checker.check_model(model, full_check=True)
-    known = 30.0 * policy.scales * np.random.default_rng(1).standard_normal((7, len(policy.scales)))
+    known = size * policy.scales * np.random.default_rng(1).standard_normal((7, len(policy.scales)))
     (found,) = ReferenceEvaluator(model).run(None, {"known": known.astype(np.float32)})
     wanted = np.clip(policy.actions_from_estimate(known), -1.0, 1.0)
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-5)
     assert found.std() > 0.1
     facts = {entry.key: entry.value for entry in model.metadata_props}
     assert facts["known"].split()[: len(policy.estimator.states)] == list(policy.estimator.states)
+    assert len(facts["known"].split()) == len(policy.scales)
 
 
 @needs_compiler

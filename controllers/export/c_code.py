@@ -39,18 +39,21 @@ def c_files(controller: Any) -> dict[str, str]:
         InputError: a kind that has no C code.
     """
     kinds: dict[type, Callable[[Any], tuple[list[str], list[str]]]] = {
-        LQG: lambda c: (c_numbers.lqg_numbers(c), ["filter", "one_point", "feedback", "step"]),
-        Schedule: lambda c: (
-            c_numbers.schedule_numbers(c),
-            ["filter", "schedule", "feedback", "step"],
+        LQG: lambda c: (
+            c_numbers.lqg_numbers(c), ["filter", "one_point", "feedback", "linear", "step"],
         ),
-        Policy: lambda c: (c_numbers.policy_numbers(c), ["filter", "one_point", "network", "step"]),
+        Schedule: lambda c: (
+            c_numbers.schedule_numbers(c), ["filter", "schedule", "feedback", "linear", "step"],
+        ),
+        Policy: lambda c: (
+            c_numbers.policy_numbers(c), ["filter", "one_point", _base(c), "network", "step"],
+        ),
         PID: lambda c: (c_numbers.pid_numbers(c), ["pid"]),
-    }
+    }  # fmt: skip
     if type(controller) not in kinds:
         raise InputError(
             f"a controller of kind {controller.kind!r} cannot be exported: "
-            "lqg, scheduled, ppo and pid can"
+            "lqg, scheduled, ppo, ppo_outdoor and pid can"
         )
     numbers, parts = kinds[type(controller)](controller)
     target = c_numbers.has_target(controller.sensors)
@@ -66,6 +69,11 @@ def c_files(controller: Any) -> dict[str, str]:
         "coax_controller.c": "".join(_part(name) for name in parts),
         "step_time.c": _part("step_time"),
     }  # fmt: skip
+
+
+def _base(policy: Policy) -> str:
+    """The part that a policy's outputs are added to."""
+    return "no_feedback" if policy.base_gain is None else "feedback"
 
 
 def _part(name: str) -> str:

@@ -13,7 +13,7 @@ from controllers.estimator import WINDUP, EstimatorDesign, horizontal_pairs, int
 from controllers.export.c_values import Fields, constant, literal, macro, structure, structures
 from controllers.lqr import LQG
 from controllers.pid import PID
-from controllers.policy import FEATURE_LIMIT, Policy
+from controllers.policy import BEYOND, FEATURE_LIMIT, Policy
 from controllers.schedule import BRAKING, GATHERING, Schedule
 from controllers.target import REACH, TargetView
 
@@ -62,13 +62,14 @@ def schedule_numbers(controller: Schedule) -> list[str]:
 
 
 def policy_numbers(controller: Policy) -> list[str]:
-    """Of a trained policy: its filter and its network."""
+    """Of a trained policy: its filter, the feedback that it is added to, and its network."""
     design, layers = controller.estimator, controller.network.layers
-    lines = _filter_numbers(design, [_point(design, None)])
+    lines = _filter_numbers(design, [_point(design, controller.base_gain)])
     lines += [
         macro("LAYERS", len(layers)),
         macro("WIDEST", max(max(weight.shape) for weight, _ in layers)),
         macro("FEATURE_LIMIT", FEATURE_LIMIT),
+        macro("BEYOND", len(BEYOND) if has_target(controller.sensors) else 0),
         _ACTIVATIONS[controller.network.activation],
         constant("PER_SCALE", 1.0 / controller.scales),
     ]

@@ -1,10 +1,14 @@
-"""A policy's network as ONNX: what the Kalman filter knows in, actions out.
+"""A policy's network, and its linear feedback where it has one, as ONNX: what the Kalman filter knows
+in, actions out.
 
 The filter has a memory and is not in it: it stays C or Python. Needs the package ``onnx``.
 """
 
+import numpy as np
+
 from controllers.estimator import integrated_readings
-from controllers.policy import FEATURE_LIMIT, Policy
+from controllers.policy import BEYOND, FEATURE_LIMIT, Policy
+from controllers.target import TargetView
 
 _OPSET = 17
 _IR_VERSION = 8  # of ONNX 1.13: readers of 2023 and later
@@ -12,8 +16,11 @@ _OPERATORS = {"tanh": "Tanh", "relu": "Relu"}
 
 
 def onnx_bytes(policy: Policy) -> bytes:
-    """An ONNX model: ``known`` (n, states + integrals), SI, to ``action`` (n, 4) within -1 .. 1."""
-    import numpy as np
+    """An ONNX model: ``known`` (n, k), SI, to ``action`` (n, 4) within -1 .. 1.
+
+    What is known are states and integrals and, on sensors that show a target, the way from the
+    setpoint on to it; the model's property ``known`` names them.
+    """
     from onnx import TensorProto, helper, numpy_helper
 
     design = policy.estimator
@@ -38,6 +45,14 @@ def onnx_bytes(policy: Policy) -> bytes:
             operator = _OPERATORS[policy.network.activation]
             nodes.append(helper.make_node(operator, [last], [f"layer_{k}"]))
             last = f"layer_{k}"
+    if policy.base_gain is not None:
+        feedback, feedforward = _base(policy)
+        constants |= {"feedback": feedback, "feedforward": feedforward}
+        nodes += [
+            helper.make_node("Gemm", ["known", "feedback", "feedforward"], ["base"], transB=1),
+            helper.make_node("Add", [last, "base"], ["whole"]),
+        ]
+        last = "whole"
     nodes.append(helper.make_node("Clip", [last, "action_low", "action_high"], ["action"]))
     graph = helper.make_graph(
         nodes,
@@ -49,6 +64,7 @@ def onnx_bytes(policy: Policy) -> bytes:
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)])
     model.ir_version = _IR_VERSION
     names = [*design.states, *(f"integral_{name}" for name in integrated_readings(design))]
+    names += BEYOND if TargetView(design.sensors).aims else []
     helper.set_model_props(
         model,
         {
@@ -60,3 +76,13 @@ def onnx_bytes(policy: Policy) -> bytes:
         },
     )
     return bytes(model.SerializeToString())
+
+
+def _base(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
+    """Minus the base's gain, 0 for what it does not feed back (4, k), and its feed-forward (4,)."""
+    gain, design = policy.base_gain, policy.estimator
+    assert gain is not None
+    feedback = np.zeros((4, len(policy.scales)), dtype=np.float32)
+    feedback[:, : gain.shape[1]] = -gain
+    offset = design.action_trim - design.command_trim
+    return feedback, (-offset / design.action_scale).astype(np.float32)

@@ -1,7 +1,7 @@
 
 /* --- linear feedback of the estimate and its integrals ------------------------------------------------ */
 
-static void act(const coax_controller *c, const blend *b, float *action)
+static void feed_back(const coax_controller *c, const blend *b, float *action)
 {
     float dx[STATES];
 

@@ -1,17 +1,34 @@
 
 /* --- a network on the estimate and its integrals ------------------------------------------------------- */
 
-static void act(const coax_controller *c, const blend *b, float *action)
+#if BEYOND
+/* What is left of the way at the setpoint; none without a way, or where it is no number. */
+static void beyond_setpoint(const float *way, float *left)
+{
+    for (int k = 0; k < BEYOND; k++)
+        left[k] = 0.0f;
+    if (way && isfinite(way[FORWARD] + way[RIGHT] + way[UP] + way[TURN])) {
+        within_reach(way, left);
+        for (int k = 0; k < BEYOND; k++)
+            left[k] = way[k] - left[k];
+    }
+}
+#endif
+
+static void act(const coax_controller *c, const blend *b, const float *way, float *action)
 {
     float first[WIDEST], second[WIDEST];
     float *in = first, *out = second;
 
-    (void)b;
+    (void)way;
     for (int j = 0; j < STATES; j++)
         in[j] = c->state[j];
     for (int j = 0; j < INTEGRALS; j++)
         in[STATES + j] = c->integral[j];
-    for (int j = 0; j < STATES + INTEGRALS; j++)
+#if BEYOND
+    beyond_setpoint(way, &in[STATES + INTEGRALS]);
+#endif
+    for (int j = 0; j < STATES + INTEGRALS + BEYOND; j++)
         in[j] = within(in[j] * PER_SCALE[j], -FEATURE_LIMIT, FEATURE_LIMIT);
     for (int k = 0; k < LAYERS; k++) {
         const layer *l = &LAYER[k];
@@ -25,6 +42,7 @@ static void act(const coax_controller *c, const blend *b, float *action)
         in = out;
         out = swap;
     }
+    feed_back(c, b, action);
     for (int i = 0; i < COAX_COMMANDS; i++)
-        action[i] = in[i];
+        action[i] += in[i];
 }

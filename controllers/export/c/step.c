@@ -19,7 +19,7 @@ void coax_step(coax_controller *c, const float observation[COAX_OBSERVED], const
     }
     choose_points(c, way, &b);
     correct(c, &b, now, reading);
-    act(c, &b, action);
+    act(c, &b, way, action);
     for (int k = 0; k < COAX_COMMANDS; k++) {
         action[k] = isfinite(action[k]) ? within(action[k], -1.0f, 1.0f) : 0.0f;
         command[k] = ACTION_TRIM[k] + ACTION_SCALE[k] * action[k];

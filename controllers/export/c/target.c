@@ -1,6 +1,18 @@
 
 /* --- the flight, seen from the target ------------------------------------------------------------- */
 
+/* A way, or its beginning where it is longer than a setpoint may be away at once. */
+static void within_reach(const float *way, float *first)
+{
+    const float distance = fmaxf(hypotf(way[FORWARD], way[RIGHT]), LEAST_DISTANCE);
+    const float share = fminf(1.0f, REACH_PLACE / distance);
+
+    first[FORWARD] = way[FORWARD] * share;
+    first[RIGHT] = way[RIGHT] * share;
+    first[UP] = within(way[UP], -REACH_HEIGHT, REACH_HEIGHT);
+    first[TURN] = within(way[TURN], -REACH_HEADING, REACH_HEADING);
+}
+
 /* The observation as that of a hover at the target, or on the way to it.
  *
  * asked: the setpoint, x y z psi; without a way or a reading that it takes, it stays the last one.
@@ -13,17 +25,15 @@ static int see_from_target(const float *observation, const float *way, float *as
     const float measured = x + y + z + psi, wanted = way[0] + way[1] + way[2] + way[3];
     int there = 1;
     if (isfinite(measured) && isfinite(wanted)) {
-        const float distance = fmaxf(hypotf(way[FORWARD], way[RIGHT]), LEAST_DISTANCE);
-        const float share = fminf(1.0f, REACH_PLACE / distance);
-        const float up = within(way[UP], -REACH_HEIGHT, REACH_HEIGHT);
-        const float turned = within(way[TURN], -REACH_HEADING, REACH_HEADING);
-        float north = way[FORWARD] * share, east = way[RIGHT] * share;
-        there = share >= 1.0f && up == way[UP] && turned == way[TURN];
-        turn(&north, &east, psi);
-        asked[NORTH] = x + north;
-        asked[EAST] = y + east;
-        asked[DOWN] = -z - up;
-        asked[HEADING] = psi + turned;
+        float first[4];
+        within_reach(way, first);
+        for (int k = 0; k < 4; k++)
+            there = there && first[k] == way[k];
+        turn(&first[FORWARD], &first[RIGHT], psi);
+        asked[NORTH] = x + first[FORWARD];
+        asked[EAST] = y + first[RIGHT];
+        asked[DOWN] = -z - first[UP];
+        asked[HEADING] = psi + first[TURN];
     }
     for (int k = 0; k < COAX_OBSERVED; k++)
         seen[k] = observation[k];
