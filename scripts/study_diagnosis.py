@@ -10,9 +10,10 @@ from typing import Any
 
 import command_line
 import numpy as np
-from study import arm_table, arms, classes, plan, store, table, threshold
+from study import arm_table, arms, classes, plan, refusals, store, table, threshold
 from study.one_flight import fly_and_diagnose
 from study.plan import PlannedFlight
+from study.refusals import fly_and_check
 from tqdm import tqdm
 
 from coax_env import workers
@@ -31,6 +32,9 @@ def main() -> None:
         flights = [f for f in flights if not f.effects]
     make_folder(options.out)
     command = "scripts/study_diagnosis.py " + shlex.join(sys.argv[1:])
+    if options.check_only:
+        check_only(flights, options, command)
+        return
     waiting = store.missing(options.out, flights)
     done = len(flights) - len(waiting)
     try:
@@ -44,6 +48,15 @@ def main() -> None:
     if options.adopt:
         adopt(options.out)
     print((options.out / "table.md").read_text())
+
+
+def check_only(flights: list[PlannedFlight], options: Any, command: str) -> None:
+    """Whether the logs of these flights would be refused: refusals.md, refusals.json."""
+    found = workers.each(fly_and_check, flights, options.jobs, options.backend)
+    rows = [row for _, row in tqdm(found, "study", len(flights), unit="flight")]
+    write_json(options.out / "refusals.json", {"command": command, "flights": rows})
+    write_text(options.out / "refusals.md", refusals.table_text(rows, command))
+    print((options.out / "refusals.md").read_text())
 
 
 def planned(options: Any) -> list[PlannedFlight]:
@@ -90,6 +103,10 @@ def parse() -> Any:
     parser.add_argument(
         "--adopt", action="store_true",
         help="with --calibrate: what was measured becomes the package's calibration.json",
+    )  # fmt: skip
+    parser.add_argument(
+        "--check-only", action="store_true",
+        help="only whether these sound logs, their halves and single runs, would be refused",
     )  # fmt: skip
     parser.add_argument("--no-baselines", action="store_true", help="the package alone")
     command_line.add_workers(parser, "flights", -1)
