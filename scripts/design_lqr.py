@@ -7,7 +7,7 @@ import sys
 import command_line
 
 from coax_env.env import hover
-from coax_env.files import make_folder, write_text
+from coax_env.files import make_folder
 from coax_env.model.sensors import SUITES
 from coax_env.model.vehicle_file import load_vehicle
 from controllers import lqr, margins, schedule
@@ -41,16 +41,17 @@ def main() -> None:
     worst = evaluate_spread(controller, vehicle, options.vehicles, 5, seed=options.seed)
     spread = margins.margins_over_spread(controller, vehicle, options.vehicles, options.seed)
     extreme = margins.worst_over_spread(controller, vehicle, seed=options.seed)
-    page = design_page(
-        controller, vehicle, inputs, disk, score, worst, spread,
-        "scripts/design_lqr.py " + shlex.join(sys.argv[1:]), extreme,
-    )  # fmt: skip
     make_folder(options.out)
     path = controller.save(options.out / "controller.json")
     if scheduled is not None:
         print(f"gain schedule {scheduled.save(options.out / 'schedule.json')}")
-    write_text(options.out / "report.html", page)
-
+    words = "scripts/design_lqr.py " + shlex.join(sys.argv[1:])
+    page = command_line.write_report(
+        options.out / "report.html",
+        lambda: design_page(
+            controller, vehicle, inputs, disk, score, worst, spread, words, extreme
+        ),
+    )
     print_margins(controller, inputs, disk)
     print(
         f"{score['episodes']} flights of {score['seconds']:.0f} s on this vehicle: "
@@ -59,7 +60,7 @@ def main() -> None:
     print(spread_in_words(worst, spread))
     print(extreme_in_words(extreme))
     command_line.print_columns([STEP_HEADER, *step_rows(step_responses(controller))])
-    print(f"controller {path}, report {options.out / 'report.html'}")
+    print(f"controller {path}, {page}")
 
 
 def print_margins(controller: lqr.LQG, inputs: list[margins.InputMargins], disk: float) -> None:

@@ -53,9 +53,13 @@ def main() -> None:
 def check_only(flights: list[PlannedFlight], options: Any, command: str) -> None:
     """Whether the logs of these flights would be refused: refusals.md, refusals.json."""
     found = workers.each(fly_and_check, flights, options.jobs, options.backend)
-    rows = [row for _, row in tqdm(found, "study", len(flights), unit="flight")]
-    write_json(options.out / "refusals.json", {"command": command, "flights": rows})
-    write_text(options.out / "refusals.md", refusals.table_text(rows, command))
+    rows: list[dict[str, Any]] = []
+    try:
+        for _, row in tqdm(found, "study", len(flights), unit="flight"):
+            rows.append(row)
+    finally:
+        write_json(options.out / "refusals.json", {"command": command, "flights": rows})
+        write_text(options.out / "refusals.md", refusals.table_text(rows, command))
     print((options.out / "refusals.md").read_text())
 
 
@@ -165,14 +169,16 @@ def write_results(out: Path, rows: list[dict[str, Any]], command: str) -> None:
             "methods": {m: [f.as_json() for f in table.all_figures(rows, m)] for m in methods},
         },
     )
-    truths, names, shares = table.confusion(rows)
-    write_text(out / "confusion.csv", table.confusion_csv(truths, names, shares))
-    if np.any(shares):
-        drawn = figure(table.confusion_figure(truths, names, shares))
-        write_text(
-            out / "confusion.html",
-            page("What was hidden, what was named", [], [Section("One effect", [drawn])]),
-        )
+    confusion = table.confusion(rows)
+    write_text(out / "confusion.csv", table.confusion_csv(*confusion))
+    if np.any(confusion[2]):
+        print(command_line.write_report(out / "confusion.html", lambda: confusion_page(*confusion)))
+
+
+def confusion_page(truths: list[str], names: list[str], shares: np.ndarray) -> str:
+    """What was hidden against what was named, drawn."""
+    drawn = figure(table.confusion_figure(truths, names, shares))
+    return page("What was hidden, what was named", [], [Section("One effect", [drawn])])
 
 
 if __name__ == "__main__":

@@ -45,7 +45,8 @@ def repeats(values: np.ndarray, hold: bool | None = None) -> np.ndarray:
     if _is_held(inner, np.abs(np.diff(y[starts]))) or _beyond_chance(y):
         found[present[again]] = True
     elif np.mean(inner > 1) <= MOST_REPEATED:
-        for first, times in zip(starts[1:-1], inner, strict=True):
+        # the last value too, and the first: interpolation beyond the ends repeats them
+        for first, times in zip(starts, np.diff([*starts, y.size]), strict=True):
             if times >= FROZEN:
                 found[present[first + 1 : first + times]] = True
     return found
