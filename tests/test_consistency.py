@@ -146,6 +146,26 @@ def test_and_where_positions_are_logged(tmp_path, tmp_path_factory, what):
     said_right(planted(sound, tmp_path / "f", columns), right)
 
 
+def test_a_log_of_another_world_gets_all_its_lines_at_once(tmp_path):
+    """Body x forward, y left, z up; yaw from the east, counted the other way round: as ROS has it."""
+    turned = ("q", "r", "ay", "az", "theta")
+    lines = [f"{c} = {{ sign = -1 }}" for c in turned]
+    flight = planted(BUNDLED, tmp_path / "f", "\n".join([*lines, YAW_FROM_THE_EAST]))
+    found = checked(flight)
+    assert found.advice is not None and not found.advice.left
+    said = "\n".join(found.advice.lines)
+    mended, sound = planted(BUNDLED, tmp_path / "g", said), read_flight(BUNDLED).select(RUNS)
+    assert checked(mended).faults == ()
+    for run, expected in zip(mended.runs, sound.runs, strict=True):
+        for c in turned:
+            np.testing.assert_allclose(run.measured[c], expected.measured[c])
+        off = run.measured["psi"] - expected.measured["psi"]
+        np.testing.assert_allclose(np.cos(off[np.isfinite(off)]), 1.0, atol=1e-6)
+
+
+YAW_FROM_THE_EAST = "psi = { sign = -1, offset = -1.5707963 }"
+
+
 def said_right(flight: Flight, right: str) -> None:
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     with pytest.raises(InputError) as caught:

@@ -127,6 +127,7 @@ FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 """Of five numbers on even rows: 0 where they lie on one cubic."""
 AROUND_A_KNOT = 3
 """Fives that have one knot inside them, and so no cubic."""
+LEAST_ON_CUBICS = 0.2  # share of the fives: a quarter, with a reading every four rows; ours
 ALIKE = 0.8
 """Share of the breaks between cubics that are single knots. A smooth log without noise is on cubics in
 quiet parts too, but breaks for long in others; ours."""
@@ -148,7 +149,7 @@ def _inside_cubics(t: np.ndarray, y: np.ndarray, rounding: float) -> np.ndarray:
     broken = [behind - first for first, behind in stretches(~on_one)]
     kinks = off[~on_one]
     if (
-        np.mean(on_one) >= LEAST_STRAIGHT
+        np.mean(on_one) >= LEAST_ON_CUBICS
         and len(broken) >= FEWEST
         and np.mean(np.array(broken) == AROUND_A_KNOT) >= ALIKE
         and np.median(kinks) > LEAST_KINK * most
