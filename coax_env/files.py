@@ -106,14 +106,22 @@ def staged_folder(path: str | Path) -> Iterator[Path]:
         raise InputError(f"cannot write in {path.parent}: {error.strerror}") from error
     try:
         yield stage
+        _take_over(stage, path)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+
+
+def _take_over(stage: Path, path: Path) -> None:
+    """Give the stage the folder's name, or its files to the folder that is there."""
+    try:
         stage.chmod(0o777 & ~_umask())
         if path.is_dir():
             for file in sorted(stage.iterdir()):
                 os.replace(file, path / file.name)
         else:
             os.rename(stage, path)
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _umask() -> int:

@@ -1,5 +1,6 @@
 """Report what a flight folder contains, what is wrong with it, and what it can determine."""
 
+import inspect
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -7,6 +8,7 @@ from typing import TYPE_CHECKING
 import command_line
 
 from coax_env.files import write_json
+from coax_env.logs import flight as flight_form
 from coax_env.logs.columns import draft_card
 from coax_env.model.vehicle_file import load_vehicle
 
@@ -16,12 +18,22 @@ if TYPE_CHECKING:
 
 def main() -> None:
     parser = command_line.parser("check_flight", __doc__)
-    command_line.add_flight(parser)
+    parser.add_argument("flight", type=Path, nargs="?", help="flight folder")
+    parser.add_argument("--vehicle", help="shipped name or TOML file (default: the card's)")
+    parser.add_argument(
+        "--form", action="store_true",
+        help="print what a flight folder holds: columns, units, signs, a card with every key; and stop",
+    )  # fmt: skip
     parser.add_argument(
         "--draft", action="store_true",
         help="write a first card.toml for a folder of CSVs, guessed from their columns, and stop",
     )  # fmt: skip
     options = parser.parse_args()
+    if options.form:
+        print(inspect.cleandoc(flight_form.__doc__ or ""))
+        return
+    if options.flight is None:
+        parser.error("which flight folder? (--form says what one holds)")
     if options.draft:
         draft(options.flight, options.vehicle or "lama400d")
         return

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import command_line
 
-from coax_env.files import staged_folder, write_json, write_text
+from coax_env.files import write_json
 
 if TYPE_CHECKING:
     from coax_env.comparison.compare import Comparison
@@ -18,10 +18,12 @@ def main() -> None:
     from coax_env import compare
 
     with command_line.progress("comparison") as report_progress:
-        result = compare(options.a, options.b, options.vehicle, progress=report_progress)
-    save(result, options.out, command_line.typed("compare"))
+        result = compare(
+            options.a, options.b, options.vehicle, progress=report_progress, waive=options.waive
+        )
+    page = save(result, options.out, command_line.typed("compare"))
     print("\n".join(summary(result.changes)))
-    print(f"changes {options.out / 'changes.json'}, report {options.out / 'report.html'}")
+    print(f"changes {options.out / 'changes.json'}, {page}")
 
 
 def arguments() -> argparse.Namespace:
@@ -34,21 +36,22 @@ def arguments() -> argparse.Namespace:
         ' and part = "B"',
     )  # fmt: skip
     parser.add_argument("--vehicle", help="shipped name or TOML file (default: the cards')")
+    command_line.add_waive(parser)
     return parser.parse_args()
 
 
-def save(result: "Comparison", out: Path, command: str) -> None:
-    """changes.json and report.html, both or none.
+def save(result: "Comparison", out: Path, command: str) -> str:
+    """changes.json, then report.html; where the report is, or why there is none.
 
     Args:
         result: of the comparison. out: folder of the results. command: what was typed.
     """
     from coax_env import report
 
-    page = report.comparison_page(result, command)
-    with staged_folder(out) as folder:
-        write_json(folder / "changes.json", result.changes)
-        write_text(folder / "report.html", page)
+    write_json(out / "changes.json", result.changes)
+    return command_line.write_report(
+        out / "report.html", lambda: report.comparison_page(result, command)
+    )
 
 
 def summary(changes: Mapping[str, Any]) -> list[str]:
@@ -65,7 +68,7 @@ def summary(changes: Mapping[str, Any]) -> list[str]:
             line += f"; confounded alternatives: {', '.join(c['confusable_with'])}"
         lines.append(line)
     lines += [f"  unexplained: {u['channel']} ({u['form']})" for u in changes["unexplained"]]
-    return lines
+    return [*lines, *(f"note: {remark}" for remark in changes.get("remarks", ()))]
 
 
 if __name__ == "__main__":

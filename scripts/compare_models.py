@@ -33,15 +33,17 @@ def main() -> None:
     write_json(options.out / "models.json", content)
     write_text(options.out / "vehicle.toml", vehicle_toml(result.vehicle_after))
     words = command_line.typed("compare_models")
-    page = model_comparison.models_page(content, controllers, machine, words)
-    write_text(options.out / "report.html", page)
+    page = command_line.write_report(
+        options.out / "report.html",
+        lambda: model_comparison.models_page(content, controllers, machine, words),
+    )
 
     print("hidden:", ", ".join(content["hidden"]))
     print("named: ", ", ".join(content["found"]) or "nothing")
     command_line.print_columns([model_comparison.ROW_HEADER, *model_comparison.rows(content)])
     for kind, factor in content["cost_ratio"].items():
         print(f"{kind}: {factor:.2f} times less cost with the corrected model")
-    print(f"report {options.out / 'report.html'}")
+    print(page)
 
 
 def compare_machines(options: argparse.Namespace) -> None:
@@ -68,10 +70,12 @@ def compare_machines(options: argparse.Namespace) -> None:
             results.append(found)
             write_json(options.out / f"{kind}.json", machines.summary(results))
     words = command_line.typed("compare_models")
-    write_text(options.out / "report.html", machines.machines_page(results, words))
+    page = command_line.write_report(
+        options.out / "report.html", lambda: machines.machines_page(results, words)
+    )
     command_line.print_columns([machines.HEADER, *machines.rows(results)])
     print("\n".join(machines.in_words(machines.summary(results))))
-    print(f"report {options.out / 'report.html'}")
+    print(page)
 
 
 def arguments() -> argparse.Namespace:

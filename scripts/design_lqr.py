@@ -5,7 +5,7 @@ import argparse
 import command_line
 
 from coax_env.env import hover
-from coax_env.files import make_folder, write_text
+from coax_env.files import make_folder
 from coax_env.model.sensors import SUITES
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
@@ -48,16 +48,17 @@ def main() -> None:
     spread = margins.margins_over_spread(controller, vehicle, options.vehicles, options.seed)
     extreme = margins.worst_over_spread(controller, vehicle, seed=options.seed)
     beside = beside_rows(designs, vehicle, options.seed) if len(designs) > 1 else []
-    page = design_page(
-        controller, vehicle, inputs, disk, score, worst, spread,
-        command_line.typed("design_lqr"), extreme, beside,
-    )  # fmt: skip
     make_folder(options.out)
     path = controller.save(options.out / "controller.json")
     if scheduled is not None:
         print(f"gain schedule {scheduled.save(options.out / 'schedule.json')}")
-    write_text(options.out / "report.html", page)
-
+    words = command_line.typed("design_lqr")
+    page = command_line.write_report(
+        options.out / "report.html",
+        lambda: design_page(
+            controller, vehicle, inputs, disk, score, worst, spread, words, extreme, beside
+        ),
+    )
     print_margins(controller, inputs, disk)
     print(
         f"{score['episodes']} flights of {score['seconds']:.0f} s on this vehicle: "
@@ -68,7 +69,7 @@ def main() -> None:
     if beside:
         command_line.print_columns([BESIDE_HEADER, *beside])
     command_line.print_columns([STEP_HEADER, *step_rows(step_responses(controller))])
-    print(f"controller {path}, report {options.out / 'report.html'}")
+    print(f"controller {path}, {page}")
 
 
 def beside_rows(designs: dict[str, margins.Design], vehicle: Vehicle, seed: int) -> list[list[str]]:

@@ -113,14 +113,17 @@ def of_many(flights: Sequence[Path], options: argparse.Namespace) -> None:
 
     ordered = [rows[flight] for flight in flights]
     read = [row for row in ordered if not row["error"]]
-    page = report.many_flights_page(ordered, command_line.typed("diagnose"))
     options.out.mkdir(parents=True, exist_ok=True)
     write_json(options.out / "summary.json", {"flights": ordered})
-    write_text(options.out / "summary.html", page)
+    words = command_line.typed("diagnose")
+    page = command_line.write_report(
+        options.out / "summary.html", lambda: report.many_flights_page(ordered, words)
+    )
     if read:
         table = [list(report.MANY_FLIGHTS_HEADER), *map(report.summary_cells, read)]
         command_line.print_columns(table)
-    print(f"summary {options.out / 'summary.html'}, each flight's results in {options.out}/FLIGHT")
+    print(f"summary {options.out / 'summary.json'}, {page}, each flight's results in"
+          f" {options.out}/FLIGHT")  # fmt: skip
     bad = [row for row in ordered if row["error"]]
     if bad:
         others = f"; so {len(bad) - 1} more, see the summary" if len(bad) > 1 else ""

@@ -10,7 +10,7 @@ from coax_env.env.hover import CONTROL_PERIOD
 from coax_env.env.paths import SHAPES
 from coax_env.env.tasks import TASKS
 from coax_env.errors import InputError
-from coax_env.files import make_folder, write_json, write_text
+from coax_env.files import make_folder, write_json
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 from controllers import comparison
@@ -107,11 +107,13 @@ def compare(options: argparse.Namespace, vehicle: Vehicle) -> None:
         )  # fmt: skip
     make_folder(options.out)
     path = write_json(options.out / "compare.json", content)
-    text = comparison.comparison_page(content, command_line.typed("evaluate"))
-    page = write_text(options.out / "report.html", text)
+    words = command_line.typed("evaluate")
+    page = command_line.write_report(
+        options.out / "report.html", lambda: comparison.comparison_page(content, words)
+    )
     rows = comparison.rows(content["conditions"])
     command_line.print_columns(comparison.without_repeats(comparison.HEADER, rows))
-    print(f"scores {path}, report {page}")
+    print(f"scores {path}, {page}")
 
 
 def words(value: object) -> str:

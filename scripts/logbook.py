@@ -8,7 +8,7 @@ from typing import Any
 import command_line
 
 from coax_env.errors import InputError
-from coax_env.files import read_text, write_json, write_text
+from coax_env.files import read_text, write_json
 
 
 def main() -> None:
@@ -23,15 +23,23 @@ def main() -> None:
             report_progress(f"{len(content['links'])} neighbours compared")
 
         content = logbook(
-            options.folder, options.vehicle, kept, options.jobs, options.backend, done
+            options.folder,
+            options.vehicle,
+            kept,
+            options.jobs,
+            options.backend,
+            done,
+            options.waive,
         )
     write_json(options.out / "logbook.json", content)
     command = command_line.typed("logbook")
-    write_text(options.out / "logbook.html", report.logbook_page(content, command))
+    page = command_line.write_report(
+        options.out / "logbook.html", lambda: report.logbook_page(content, command)
+    )
     print(f"{len(content['flights'])} flights, {len(content['changes'])} changes")
     for change in content["changes"]:
         print(f"  since {change['since']}: {change['effect']}, {change['evidence']:.0f} nats")
-    print(f"logbook {options.out / 'logbook.json'}, page {options.out / 'logbook.html'}")
+    print(f"logbook {options.out / 'logbook.json'}, {page}")
 
 
 def arguments() -> argparse.Namespace:
@@ -40,6 +48,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("folder", type=Path, help="folder of flight folders of one machine")
     parser.add_argument("--vehicle", help="shipped name or TOML file (default: the cards')")
     command_line.add_workers(parser, "comparisons", 1)
+    command_line.add_waive(parser)
     return parser.parse_args()
 
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import command_line
 import numpy as np
-from study import arm_table, arms, classes, plan, store, table, threshold
+from study import arm_table, arms, classes, plan, refusals, store, table, threshold
 from study.one_flight import fly_and_diagnose
 from study.plan import PlannedFlight
+from study.refusals import fly_and_check
 from tqdm import tqdm
 
 from coax_env import workers
@@ -29,6 +30,9 @@ def main() -> None:
         flights = [f for f in flights if not f.effects]
     make_folder(options.out)
     command = command_line.typed("study_diagnosis")
+    if options.check_only:
+        check_only(flights, options, command)
+        return
     waiting = store.missing(options.out, flights)
     done = len(flights) - len(waiting)
     try:
@@ -42,6 +46,19 @@ def main() -> None:
     if options.adopt:
         adopt(options.out)
     print((options.out / "table.md").read_text())
+
+
+def check_only(flights: list[PlannedFlight], options: Any, command: str) -> None:
+    """Whether the logs of these flights would be refused: refusals.md, refusals.json."""
+    found = workers.each(fly_and_check, flights, options.jobs, options.backend)
+    rows: list[dict[str, Any]] = []
+    try:
+        for _, row in tqdm(found, "study", len(flights), unit="flight"):
+            rows.append(row)
+    finally:
+        write_json(options.out / "refusals.json", {"command": command, "flights": rows})
+        write_text(options.out / "refusals.md", refusals.table_text(rows, command))
+    print((options.out / "refusals.md").read_text())
 
 
 def planned(options: Any) -> list[PlannedFlight]:
@@ -88,6 +105,10 @@ def parse() -> Any:
     parser.add_argument(
         "--adopt", action="store_true",
         help="with --calibrate: what was measured becomes the package's calibration.json",
+    )  # fmt: skip
+    parser.add_argument(
+        "--check-only", action="store_true",
+        help="only whether these sound logs, their halves and single runs, would be refused",
     )  # fmt: skip
     parser.add_argument("--no-baselines", action="store_true", help="the package alone")
     command_line.add_workers(parser, "flights", -1)
@@ -146,14 +167,16 @@ def write_results(out: Path, rows: list[dict[str, Any]], command: str) -> None:
             "methods": {m: [f.as_json() for f in table.all_figures(rows, m)] for m in methods},
         },
     )
-    truths, names, shares = table.confusion(rows)
-    write_text(out / "confusion.csv", table.confusion_csv(truths, names, shares))
-    if np.any(shares):
-        drawn = figure(table.confusion_figure(truths, names, shares))
-        write_text(
-            out / "confusion.html",
-            page("What was hidden, what was named", [], [Section("One effect", [drawn])]),
-        )
+    confusion = table.confusion(rows)
+    write_text(out / "confusion.csv", table.confusion_csv(*confusion))
+    if np.any(confusion[2]):
+        print(command_line.write_report(out / "confusion.html", lambda: confusion_page(*confusion)))
+
+
+def confusion_page(truths: list[str], names: list[str], shares: np.ndarray) -> str:
+    """What was hidden against what was named, drawn."""
+    drawn = figure(table.confusion_figure(truths, names, shares))
+    return page("What was hidden, what was named", [], [Section("One effect", [drawn])])
 
 
 if __name__ == "__main__":

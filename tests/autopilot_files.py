@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-Topics = Mapping[str, tuple[list[str], float, np.ndarray]]
-"""Topic -> field names, rate [Hz], rows (n, fields)."""
+Topics = Mapping[str, tuple[list[str], float | np.ndarray, np.ndarray]]
+"""Topic -> field names, rate [Hz] or times (n,) [s], rows (n, fields)."""
 
 
 def ulog(topics: Topics) -> bytes:
@@ -23,8 +23,9 @@ def ulog(topics: Topics) -> bytes:
     for k, name in enumerate(topics):
         content += message(b"A", struct.pack("<BH", 0, k) + name.encode())
     for k, (_, rate, rows) in enumerate(topics.values()):
-        for i, row in enumerate(rows):
-            stamp = struct.pack("<Q", 1_000_000 + round(1e6 * i / rate))
+        times = np.arange(len(rows)) / rate if isinstance(rate, float) else rate
+        for t, row in zip(times, rows, strict=True):
+            stamp = struct.pack("<Q", 1_000_000 + round(1e6 * t))
             content += message(
                 b"D", struct.pack("<H", k) + stamp + struct.pack(f"<{len(row)}f", *row)
             )
@@ -72,3 +73,27 @@ def dataflash(seconds: float = 4.0, rate: float = 100.0) -> str:
             lines += [f"ATT, {stamp}, 1.0, -2.0, 90.0", f"RPM, {stamp}, 1990.0, 2130.0",
                       f"RFND, {stamp}, 0, 1.25"]  # fmt: skip
     return "\n".join(lines) + "\n"
+
+
+def dataflash_binary(messages: Mapping[str, tuple[list[str], np.ndarray, np.ndarray]]) -> bytes:
+    """The binary form of a DataFlash log, in the order of time.
+
+    Args:
+        messages: name -> fields, times (n,) [s], rows (n, fields).
+    """
+    head = b"\xa3\x95"
+
+    def form(kind: int, length: int, name: str, types: str, fields: str) -> bytes:
+        texts = (name.encode(), types.encode(), fields.encode())
+        return head + struct.pack("<BBB4s16s64s", 128, kind, length, *texts)
+
+    content = form(128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
+    rows = []
+    for kind, (name, (fields, times, values)) in enumerate(messages.items(), 129):
+        length = 3 + 8 + 4 * len(fields)
+        content += form(kind, length, name, "Q" + "f" * len(fields), ",".join(["TimeUS", *fields]))
+        for t, row in zip(times, values, strict=True):
+            stamp = round(1e6 * (t + 5.0))
+            body = struct.pack(f"<BQ{len(row)}f", kind, stamp, *row)
+            rows.append((stamp, head + body))
+    return content + b"".join(row for _, row in sorted(rows, key=lambda one: one[0]))

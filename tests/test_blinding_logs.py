@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import Akima1DInterpolator, CubicSpline, PchipInterpolator
 from shared_flights import shared_flight
 
 import coax_env
@@ -271,6 +272,30 @@ def test_a_line_between_readings_is_no_reading(every, rounded):
     new = np.zeros(t.size, bool)
     new[::every] = True
     assert np.mean(found[:-every] == ~new[:-every]) > 0.97
+
+
+@pytest.mark.parametrize("curve", [CubicSpline, PchipInterpolator, Akima1DInterpolator])
+@pytest.mark.parametrize(("every", "rounded"), [(4, None), (10, None), (10, 6)])
+def test_a_cubic_between_readings_is_no_reading(curve, every, rounded):
+    """As SciPy's and MATLAB's splines resample a slow sensor."""
+    rng = np.random.default_rng(11)
+    t = np.arange(2000) * 0.01
+    readings = np.sin(0.7 * t[::every]) + rng.normal(0.0, 0.02, t[::every].size)
+    last = (t[::every].size - 1) * every
+    y = curve(t[::every], readings)(t[: last + 1])
+    y = y if rounded is None else np.round(y, rounded)
+    new = np.zeros(y.size, bool)
+    new[::every] = True
+    assert np.mean(interpolated(t[: last + 1], y) == ~new) > 0.97
+
+
+def test_a_smooth_log_without_noise_is_on_no_cubic():
+    """Rounded, quiet in parts, and as a simulation of a helicopter writes it."""
+    t = np.arange(2000) * 0.01
+    quiet = np.where(t < 8.0, 0.1, 0.1 + 0.02 * np.sin(9.0 * t) * np.exp(-0.3 * (t - 8.0)))
+    for y in (quiet, np.sin(9.0 * t), np.sin(t) * np.sin(5.0 * t), np.sin(0.1 * t**2)):
+        for digits in (3, 5, 7, 12):
+            assert not interpolated(t, np.round(y, digits)).any(), digits
 
 
 def test_a_line_over_a_gap_is_no_reading_and_a_sound_signal_has_none():

@@ -16,6 +16,7 @@ import pytest
 from shared_flights import shared_flight
 
 import coax_env
+from coax_env.comparison.two_flights import read_two
 from coax_env.consistency.agreement import Agreement, agreement, refuse_disagreement
 from coax_env.consistency.checks import names
 from coax_env.consistency.even_rows import STEP, weak
@@ -162,6 +163,26 @@ def test_and_where_positions_are_logged(tmp_path, tmp_path_factory, what):
     columns, right = ERRORS_OF_POSITIONS[what]
     sound = with_positions(tmp_path_factory.getbasetemp() / "positions")
     said_right(planted(sound, tmp_path / "f", columns), right)
+
+
+def test_a_log_of_another_world_gets_all_its_lines_at_once(tmp_path):
+    """Body x forward, y left, z up; yaw from the east, counted the other way round: as ROS has it."""
+    turned = ("q", "r", "ay", "az", "theta")
+    lines = [f"{c} = {{ sign = -1 }}" for c in turned]
+    flight = planted(BUNDLED, tmp_path / "f", "\n".join([*lines, YAW_FROM_THE_EAST]))
+    found = checked(flight)
+    assert found.advice is not None and not found.advice.left
+    said = "\n".join(found.advice.lines)
+    mended, sound = planted(BUNDLED, tmp_path / "g", said), read_flight(BUNDLED).select(RUNS)
+    assert checked(mended).faults == ()
+    for run, expected in zip(mended.runs, sound.runs, strict=True):
+        for c in turned:
+            np.testing.assert_allclose(run.measured[c], expected.measured[c])
+        off = run.measured["psi"] - expected.measured["psi"]
+        np.testing.assert_allclose(np.cos(off[np.isfinite(off)]), 1.0, atol=1e-6)
+
+
+YAW_FROM_THE_EAST = "psi = { sign = -1, offset = -1.5707963 }"
 
 
 def said_right(flight: Flight, right: str) -> None:
@@ -312,16 +333,28 @@ def test_a_run_whose_file_is_unlike_the_others_is_named(change, check):
     assert all("correct the file of that run" in f.hint for f in found.faults)
 
 
-@pytest.mark.parametrize("script", ["diagnose", "identify", "replay"])
+WORDS = {"compare": ("sound", "f"), "logbook": (".",)}
+"""Of scripts that take another thing than the one flight."""
+
+
+@pytest.mark.parametrize("script", ["diagnose", "identify", "replay", "compare", "logbook"])
 def test_the_scripts_refuse_in_one_line(tmp_path, monkeypatch, script):
     """What ran for 290 s before and gave false causes; nothing is written."""
     import importlib
 
     planted(BUNDLED, tmp_path / "f", "theta = { sign = -1 }")
+    planted(BUNDLED, tmp_path / "sound", "")
     module = importlib.import_module(script)
-    monkeypatch.setattr(
-        "sys.argv", [f"{script}.py", str(tmp_path / "f"), "--out", str(tmp_path / "out")]
-    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", [f"{script}.py", *WORDS.get(script, ("f",)), "--out", "out"])
     with pytest.raises(InputError, match=r'theta = \{ name = "theta" \}.*--waive theta-q,vn-theta'):
         module.main()
     assert not (tmp_path / "out").exists()
+
+
+def test_a_waived_check_is_a_remark_of_the_comparison(tmp_path):
+    flight = planted(BUNDLED, tmp_path / "f", "h = { sign = -1 }").select(["lon_3211", "yaw_3211"])
+    with pytest.raises(InputError, match="h-range"):
+        read_two(flight, flight, None)
+    for one in read_two(flight, flight, None, ["h-vd", "h-range"]):
+        assert any("h-range waived" in remark for remark in one.remarks)

@@ -1,5 +1,6 @@
 """Writing files whole, and the exit codes of the scripts."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -66,3 +67,10 @@ run(main)
         assert done.stderr == stderr
     if code == 2:
         assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in SCRIPTS.glob("*.py")))
+def test_every_report_is_written_after_the_results(name: str) -> None:
+    """By command_line.write_report, which says what to install where a page cannot be made."""
+    text = (SCRIPTS / f"{name}.py").read_text()
+    assert not re.search(r"write_text\([^)]*\.html", text), "not by command_line.write_report"

@@ -3,6 +3,7 @@
 The work runs in a forked child, so that a kill falls into the work and not into seconds of imports.
 """
 
+import errno
 import json
 import os
 import random
@@ -12,9 +13,12 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from autopilot_files import ulog
 from test_study import row_of
 
 from coax_env import load_vehicle, read_flight
@@ -198,3 +202,165 @@ def test_a_script_with_a_report(name, tmp_path, monkeypatch):
             else:
                 json.loads(path.read_text())
     assert read_flight(flight).run_names == ("lon_doublet",)
+
+
+# --- other writers of results ---------------------------------------------------------------------
+
+
+def imports(place: Path) -> dict[str, Path]:
+    """A log in each form that import_log writes a flight from."""
+    from scipy.io import savemat
+
+    run = read_flight(short_flight(place / "flight")).runs[0]
+    columns = {
+        "time": run.t, "rpm_u": 9.549 * run.command[:, 0], "rpm_l": 9.549 * run.command[:, 1],
+        "dlon": run.command[:, 2], "dlat": run.command[:, 3], "roll": run.measured["phi"],
+    }  # fmt: skip
+    savemat(place / "log.mat", columns)
+    lines = [
+        ",".join(columns),
+        *(",".join(map(repr, row)) for row in zip(*columns.values(), strict=True)),
+    ]
+    (place / "log.csv").write_text("\n".join(lines))
+    topics = {"rotors": ([*columns][1:5], 100.0, np.stack(list(columns.values())[1:5], 1))}
+    gyro = np.stack([np.nan_to_num(run.measured[c]) for c in "pqr"], 1)
+    topics["sensor_combined"] = ([f"gyro_rad[{k}]" for k in range(3)], 100.0, gyro)
+    (place / "log.ulg").write_bytes(ulog(topics))
+    return {form: place / f"log.{form}" for form in ("mat", "csv", "ulg")}
+
+
+TAKE = [w for c, f in (("rpm_upper_cmd", "rpm_u"), ("rpm_lower_cmd", "rpm_l"), ("delta_lon", "dlon"),
+                       ("delta_lat", "dlat")) for w in ("--take", f"{c}=rotors.{f}")]  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["mat", "csv", "ulg"])
+def test_an_import(form, tmp_path, monkeypatch):
+    """A flight folder with all its files, or none; and one that is replaced is old or new."""
+    if form == "ulg":
+        pytest.importorskip("pyulog")
+    import import_log
+
+    log = imports(tmp_path)[form]
+    words = ["import_log", str(log), "--overwrite", *(TAKE if form == "ulg" else [])]
+    monkeypatch.setattr(sys, "argv", [*words, "--out", str(tmp_path / "whole")])
+    import_log.main()
+    begun = time.monotonic()
+    import_log.main()
+    usual = time.monotonic() - begun
+    whole = {path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()}
+    rng = random.Random(5)
+    for number in range(12):
+        out = tmp_path / "out" / f"f_{number // 2}"
+        monkeypatch.setattr(sys, "argv", [*words, "--out", str(out)])
+        killed(import_log.main, rng.uniform(0.3, 1.1) * usual)
+        assert named(out) in (set(), set(whole))
+        assert all((out / name).read_bytes() == whole[name] for name in named(out))
+
+
+def content_of_a_comparison() -> Any:
+    """What compare gives, as far as it is written."""
+    changes = {"verdict": "same", "changes": [], "unexplained": [], "remarks": ["x" * 300_000]}
+    return SimpleNamespace(changes=changes)
+
+
+def slow_writers(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
+    """Scripts whose work is done at once, and writes much: script -> names of what it writes."""
+    import compare
+    import diagnose
+    import logbook
+
+    import coax_env
+    from coax_env import report
+
+    page = "<html>" + "y" * 300_000 + "</html>"
+    kept = {"vehicle": None, "links": [], "flights": [], "changes": [], "text": "z" * 300_000}
+    row = {"flight": "f", "folder": "f", "error": "", "verdict": "v" * 300_000, "sure": [],
+           "doubtful": [], "removed": None, "seconds": 1.0}  # fmt: skip
+
+    def grown(*words: Any) -> dict[str, Any]:
+        for _ in range(5):
+            words[5](kept)
+        return kept
+
+    monkeypatch.setattr(
+        coax_env, "compare", lambda *a, **k: content_of_a_comparison(), raising=False
+    )
+    monkeypatch.setattr(coax_env, "logbook", grown, raising=False)
+    monkeypatch.setattr(diagnose, "_one_of_many", lambda *a: row)
+    monkeypatch.setattr(diagnose, "flights_in", lambda paths: [Path("a"), Path("b")])
+    for name in ("comparison_page", "logbook_page", "many_flights_page"):
+        monkeypatch.setattr(report, name, lambda *a: page)
+    assert compare and logbook
+    return {
+        "compare": ["changes.json", "report.html"],
+        "logbook": ["logbook.json", "logbook.html"],
+        "diagnose": ["summary.json", "summary.html"],
+    }
+
+
+@pytest.mark.parametrize("name", ["compare", "logbook", "diagnose"])
+def test_results_that_are_written_again_and_again(name, tmp_path, monkeypatch):
+    """First the results, then the page, each whole, whenever it was killed."""
+    import importlib
+
+    result, page = slow_writers(monkeypatch)[name]
+    script = importlib.import_module(name)
+    out = tmp_path / "out"
+    words = [name, "a", *(["--jobs", "1"] if name != "compare" else []), "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", words)
+    script.main()
+    begun = time.monotonic()
+    script.main()
+    usual = time.monotonic() - begun
+    for path in out.iterdir():
+        path.unlink()
+    rng = random.Random(6)
+    for _ in range(25):
+        killed(script.main, rng.uniform(0.0, 1.0) * usual)
+        assert named(out) in (set(), {result}, {result, page})
+        for path in out.glob("[!.]*.json"):
+            json.loads(path.read_text())
+        for path in out.glob("[!.]*.html"):
+            assert path.read_text().endswith("</html>")
+
+
+@pytest.mark.parametrize("name", ["compare", "logbook", "diagnose"])
+@pytest.mark.parametrize("stop", ["full", "interrupted"])
+def test_a_full_disk_and_ctrl_c_leave_what_was_there(name, stop, tmp_path, monkeypatch):
+    """The old results stay as they were; nothing half-written, and one line says why."""
+    import importlib
+
+    from coax_env import files
+    from coax_env.errors import InputError
+
+    slow_writers(monkeypatch)
+    script = importlib.import_module(name)
+    out = tmp_path / "out"
+    words = [name, "a", *(["--jobs", "1"] if name != "compare" else []), "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", words)
+    script.main()
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    fails = (
+        OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) if stop == "full" else KeyboardInterrupt()
+    )
+
+    class Full:
+        def __init__(self, file: Any) -> None:
+            self.file = file
+
+        def __enter__(self) -> "Full":
+            return self
+
+        def __exit__(self, *said: object) -> None:
+            self.file.close()
+
+        def write(self, content: bytes) -> None:
+            self.file.write(content[:1000])
+            raise fails
+
+    fdopen = os.fdopen
+    monkeypatch.setattr(files.os, "fdopen", lambda handle, mode: Full(fdopen(handle, mode)))
+    expected = InputError if stop == "full" else KeyboardInterrupt
+    with pytest.raises(expected, match="No space left" if stop == "full" else None):
+        script.main()
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before

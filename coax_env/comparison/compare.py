@@ -11,7 +11,7 @@ air, ground, battery and pilot is each flight's own (circumstances.py) and never
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -69,6 +69,7 @@ def compare(
     vehicle: Vehicle | str | Path | None = None,
     progress: Progress | bool | None = None,
     settings: Settings = SETTINGS,
+    waive: Collection[str] = (),
 ) -> Comparison:
     """What changed in a machine between two flights.
 
@@ -77,12 +78,13 @@ def compare(
         vehicle: a Vehicle, name or path; default the cards'.
         progress: called with a line of text at every step; True: a bar on stderr.
         settings: thresholds and limits.
+        waive: checks of a log with itself (consistency/) that are passed over, beside the cards'.
 
     Raises:
-        InputError: no flight, no such parts, or flights of two vehicles.
+        InputError: no flight, no such parts, flights of two vehicles, or a log that contradicts itself.
     """
     report = reporter(progress)
-    flights = read_two(a, b, vehicle)
+    flights = read_two(a, b, vehicle, waive)
     problem = joint_problem(flights, settings, report)
     report("estimating gusts and noise of each flight")
     fit = joint_start(problem, flights)
@@ -114,6 +116,7 @@ def compare(
             "circumstances": _circumstances(state, quadratic),
             "shared": list(state.fit.active),
             "bounds": _bounds(state, quadratic),
+            "remarks": [f"{f.name}: {remark}" for f in flights for remark in f.remarks],
         },
         flights,
         white,

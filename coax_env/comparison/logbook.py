@@ -8,7 +8,7 @@ costs one comparison with the one before it, and nothing old is fitted again.
 
 import hashlib
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,12 +21,15 @@ from coax_env.comparison.compare import compare
 from coax_env.comparison.information import Information, information_of
 from coax_env.comparison.shared import parts_of
 from coax_env.comparison.two_flights import ROTOR_SPEED
+from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
+from coax_env.estimation.flown import flown_parts
 from coax_env.files import read_toml
 from coax_env.logs.card import CARD
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model import effects
 from coax_env.model.parameters import BASE
+from coax_env.model.vehicle_file import load_vehicle
 
 Content = dict[str, Any]
 """What logbook.json holds."""
@@ -51,6 +54,7 @@ def logbook(
     jobs: int = 1,
     backend: str = "loky",
     done: Callable[[Content], None] | None = None,
+    waive: Collection[str] = (),
 ) -> Content:
     """The logbook of all flights in a folder.
 
@@ -61,9 +65,11 @@ def logbook(
         kept: an earlier logbook; flights that it has are not fitted again.
         jobs, backend: of `workers.each`.
         done: called with the logbook so far after every comparison.
+        waive: checks of a log with itself (consistency/) that are passed over, beside the cards'.
 
     Raises:
-        InputError: fewer than two flights, two of one name, or of two vehicles.
+        InputError: fewer than two flights, two of one name, of two vehicles, or a log that contradicts
+            itself: none is compared then.
     """
     entries = _entries(Path(folder))
     kept = kept or {}
@@ -76,8 +82,10 @@ def logbook(
     pairs = list(itertools.pairwise(entries))
     links = {(a.mark, b.mark): known[a.mark, b.mark] for a, b in pairs if (a.mark, b.mark) in known}
     missing = [(a, b) for a, b in pairs if (a.mark, b.mark) not in links]
+    for entry in dict.fromkeys(entry for pair in missing for entry in pair):
+        _refuse(entry, vehicle, waive)
     report = done or (lambda content: None)
-    for (a, b), link in workers.each(partial(_link, vehicle), missing, jobs, backend):
+    for (a, b), link in workers.each(partial(_link, vehicle, waive), missing, jobs, backend):
         links[a.mark, b.mark] = link
         report(_content(entries, links, vehicle))
     return _content(entries, links, vehicle)
@@ -109,10 +117,17 @@ def mark_of(flight: Flight) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def _link(vehicle: str | None, pair: tuple[Entry, Entry]) -> Content:
+def _refuse(entry: Entry, vehicle: str | None, waive: Collection[str]) -> None:
+    """Refuse a flight whose log contradicts itself, before hours of comparisons and not after."""
+    flight = read_flight(entry.folder)
+    machine = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
+    refuse_disagreement(flown_parts(flight, machine), machine, waive)
+
+
+def _link(vehicle: str | None, waive: Collection[str], pair: tuple[Entry, Entry]) -> Content:
     """Two neighbours compared, and what each of them says."""
     a, b = pair
-    result = compare(a.folder, b.folder, vehicle)
+    result = compare(a.folder, b.folder, vehicle, waive=waive)
     says = [
         information_of(result.state, part, flight).as_json()
         for part, flight in zip(parts_of(result.state.problem), result.flights, strict=True)

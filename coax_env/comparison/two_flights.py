@@ -1,11 +1,12 @@
 """Two flights of one machine, ready to be compared: read, cut to what was flown, without vibration."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.diagnosis import vibration
 from coax_env.diagnosis.diagnose import stated
 from coax_env.errors import InputError
@@ -48,6 +49,7 @@ class OneFlight:
         lines: of that vibration.
         vehicle: in the flight's air, without vibration.
         noise: to start from.
+        remarks: on checks of the log with itself that were passed over.
     """
 
     name: str
@@ -55,6 +57,7 @@ class OneFlight:
     lines: tuple[vibration.Line, ...]
     vehicle: Vehicle
     noise: Noise
+    remarks: tuple[str, ...] = ()
 
     def engine(self, held: Mapping[str, float]) -> Engine:
         """Over its records. held: what effects take as stated."""
@@ -63,7 +66,10 @@ class OneFlight:
 
 
 def read_two(
-    a: Flight | str | Path, b: Flight | str | Path | None, vehicle: Vehicle | str | Path | None
+    a: Flight | str | Path,
+    b: Flight | str | Path | None,
+    vehicle: Vehicle | str | Path | None,
+    waive: Collection[str] = (),
 ) -> tuple[OneFlight, OneFlight]:
     """Both flights, or both parts of one.
 
@@ -71,9 +77,10 @@ def read_two(
         a: a Flight or its folder. b: the other one; None: of `a`, the runs whose card says part "A" and
             those that say "B".
         vehicle: a Vehicle, name or path; None: the cards'.
+        waive: checks of a log with itself (consistency/) that are passed over, beside the cards'.
 
     Raises:
-        InputError: no such parts, or flights of two vehicles.
+        InputError: no such parts, flights of two vehicles, or a log that contradicts itself.
     """
     first = a if isinstance(a, Flight) else read_flight(a)
     if b is None:
@@ -86,7 +93,7 @@ def read_two(
             " --vehicle which machine it was"
         )
     machine = load_vehicle(vehicle or first.vehicle)
-    return one_flight(A, first, machine), one_flight(B, second, machine)
+    return one_flight(A, first, machine, waive), one_flight(B, second, machine, waive)
 
 
 def parts_of(flight: Flight) -> tuple[Flight, Flight]:
@@ -108,19 +115,23 @@ def parts_of(flight: Flight) -> tuple[Flight, Flight]:
     return found[0], found[1]
 
 
-def one_flight(name: str, flight: Flight, machine: Vehicle) -> OneFlight:
+def one_flight(
+    name: str, flight: Flight, machine: Vehicle, waive: Collection[str] = ()
+) -> OneFlight:
     """A flight ready to be compared.
 
     Args:
         name: of the part.
         flight: as read.
         machine: in any air.
+        waive: as of `read_two`.
     """
     vehicle = machine.in_air(flight.air)
     flown = flown_parts(flight, vehicle)
+    remarks = refuse_disagreement(flown, vehicle, waive)
     lines, calm, still = vibration.calmed(flown, vehicle)
     still = vibration.without(still)
-    return OneFlight(name, calm, lines, still, starting_noise(calm, still))
+    return OneFlight(name, calm, lines, still, starting_noise(calm, still), remarks)
 
 
 def nominal_voltage(flights: tuple[OneFlight, OneFlight]) -> dict[str, float]:

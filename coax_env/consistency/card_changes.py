@@ -98,6 +98,7 @@ def advice(flight: Flight, checker: Checker, found: Found) -> Advice:
         found: what the checks say of it.
     """
     columns = {c: flight.columns.get(c, Column.own(c)) for c in checker.channels if c in LOG_UNITS}
+    original = dict(columns)
     changed: dict[str, Column] = {}
     done: list[Change] = []
     others: list[tuple[str, ...]] = []
@@ -113,9 +114,40 @@ def advice(flight: Flight, checker: Checker, found: Found) -> Advice:
         new = best.line(columns)
         changed |= {c: new[c] for c in best.channels}
         columns, found = {**columns, **changed}, after
+    if done and not found.faults:
+        done, found = _turned(original, checker, done)
+        columns = _all_lines(done, original)
+        changed = {c: columns[c] for one in done for c in one.channels}
     lines = tuple(columns[c].entry(c) for c in changed)
     alternatives = tuple(o for o in others if o) if len(done) == 1 else ()
     return Advice(lines, alternatives, found.faults)
+
+
+def _turned(
+    columns: dict[str, Column], checker: Checker, done: list[Change]
+) -> tuple[list[Change], Found]:
+    """The changes, with another heading where north and east would still be taken for each other.
+
+    A heading that is counted from another axis swaps them, and no single other change shows that.
+    """
+    found = checker.after(partial(_all_applied, done), _channels_of(done), swaps=True)
+    others = [one for one in done if one.channels != {"psi"}]
+    if found.faults and "psi" in columns:
+        results = []
+        for heading in _headings():
+            both = [*others, heading]
+            after = checker.after(partial(_all_applied, both), _channels_of(both), swaps=True)
+            results.append((after.badness, both, after))
+        _, both, after = min(results, key=lambda one: one[0])
+        if not after.faults:
+            return both, after
+    return done, found
+
+
+def _all_lines(changes: Sequence[Change], columns: dict[str, Column]) -> dict[str, Column]:
+    for change in changes:
+        columns = change.line(columns)
+    return columns
 
 
 def _tried(
@@ -201,10 +233,15 @@ def _seldom_changes(columns: Columns) -> list[Change]:
     """Columns taken for each other, other headings, and factors that are no unit."""
     found = [_swap(names) for names in SWAPPED if set(names) <= columns.keys()]
     if "psi" in columns:
-        for sign, turn in ((1, np.pi), (1, np.pi / 2), (1, -np.pi / 2), (-1, np.pi / 2)):
-            found.append(_heading(sign, turn))
+        found += _headings()
     found += [_scale(c, ratio) for c in sorted(columns) for ratio in SCALES]
     return found
+
+
+def _headings() -> list[Change]:
+    """From another axis, or counted the other way round."""
+    turns = ((1, np.pi), (1, np.pi / 2), (1, -np.pi / 2), (-1, np.pi / 2), (-1, -np.pi / 2))
+    return [_heading(sign, turn) for sign, turn in turns]
 
 
 def _plain(column: Column, channel: str) -> str:

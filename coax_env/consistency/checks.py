@@ -161,18 +161,26 @@ class Checker:
     def found(self) -> Found:
         """What the checks say of the log as it is."""
         each = tuple(c for known in self._known for c in known)
-        return self._without_waived([*self._faults(self.rows, each), *self._swapped()], each)
+        swaps = self._swapped(self.rows, self._known)
+        return self._without_waived([*self._faults(self.rows, each), *swaps], each)
 
-    def after(self, change: Callable[[Signals], Signals], changed: frozenset[str]) -> Found:
+    def after(
+        self, change: Callable[[Signals], Signals], changed: frozenset[str], swaps: bool = False
+    ) -> Found:
         """What they say when a change has been made to the signals.
 
         Args:
             change: of signals.
             changed: channels that it changes.
+            swaps: whether pairs that would agree once exchanged are asked too: that takes longest.
         """
         rows = replace(self.rows, signals=change(self.rows.signals))
-        each = tuple(c for few in self._anew(rows, changed) for c in few)
-        return self._without_waived(self._faults(rows, each), each)
+        known = self._anew(rows, changed)
+        each = tuple(c for few in known for c in few)
+        faults = self._faults(rows, each)
+        if swaps:
+            faults += self._swapped(rows, known)
+        return self._without_waived(faults, each)
 
     def _without_waived(self, faults: Sequence[Fault], each: tuple[Coefficient, ...]) -> Found:
         return Found(
@@ -214,19 +222,19 @@ class Checker:
                 found.setdefault(fault.check, replace(fault, words=words, hint=HINT_FOR_A_RUN))
         return [fault for check, fault in found.items() if check not in self.waived]
 
-    def _swapped(self) -> list[Fault]:
+    def _swapped(self, rows: EvenRows, known: Sequence[Sequence[Coefficient]]) -> list[Fault]:
         """Pairs of columns that agree with the rest once they are exchanged, and not before."""
         found = []
         for a, b in PAIRS:
             if not {a, b} <= self.channels:
                 continue
             both = frozenset((a, b))
-            rows = replace(self.rows, signals=swapped(self.rows.signals, (a, b)))
+            other = replace(rows, signals=swapped(rows.signals, (a, b)))
             touched = [k for k, one in enumerate(self._relations) if both & one.channels]
-            anew = self._anew(rows, both)
+            anew = self._anew(other, both)
             before, after = (
                 sum(_agreement(c) for k in touched for c in some[k] if both & {c.left, c.part})
-                for some in (self._known, anew)
+                for some in (known, anew)
             )
             if after - before > SWAP_GAIN and before < SWAP_LEFT * after:
                 words = f"{a} and {b} agree with the other channels only once they are exchanged"

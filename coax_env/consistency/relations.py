@@ -287,8 +287,9 @@ def relations(channels: frozenset[str], edges: tuple[int, ...] = (0,)) -> list[R
 
 # --- their coefficients ---------------------------------------------------------------------------
 
-FEWEST_WINDOWS = 12
-"""Of a regression; ours."""
+LEAST_FREEDOM = 5.0
+"""Degrees of freedom of a regression: independent windows less what is fitted to them. With fewer, what
+was left over says nothing of the noise; ours."""
 
 
 def coefficients(relation: Relation, rows: EvenRows, machine: Machine) -> list[Coefficient]:
@@ -300,18 +301,19 @@ def coefficients(relation: Relation, rows: EvenRows, machine: Machine) -> list[C
     names = list(parts)
     best: dict[str, Coefficient] = {}
     for length in relation.windows:
-        y, X = _projected(relation, rows, parts, length)
-        if y.size < FEWEST_WINDOWS + X.shape[1] or y.std() == 0.0:
+        y, X, runs = _projected(relation, rows, parts, length)
+        # each run's mean is fitted too
+        freedom = INDEPENDENT * (y.size - runs) - X.shape[1]
+        if freedom < LEAST_FREEDOM or y.std() == 0.0:
             continue
-        count = INDEPENDENT * y.size
-        solution, std = _least_squares(X, y, count)
+        solution, std = _least_squares(X, y, freedom)
         for k in named:
             if not 0.0 < std[k] < np.inf:
                 continue
             t = solution[k] / std[k]
             one = Coefficient(
                 f"{relation.left}-{names[k]}", relation.left, names[k],
-                float(solution[k]), float(std[k]), float(t / np.sqrt(t**2 + count)),
+                float(solution[k]), float(std[k]), float(t / np.sqrt(t**2 + freedom)),
                 length, relation.exact,
             )  # fmt: skip
             if names[k] not in best or one.strength > best[names[k]].strength:
@@ -323,8 +325,11 @@ INDEPENDENT = 0.5
 """Share of the windows that counts: they overlap by half."""
 
 
-def _least_squares(X: np.ndarray, y: np.ndarray, count: float) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (m,) of X (k, m) in y (k,), and their std; infinite of a column that is 0."""
+def _least_squares(X: np.ndarray, y: np.ndarray, freedom: float) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (m,) of X (k, m) in y (k,), and their std; infinite of a column that is 0.
+
+    freedom: degrees, of independent windows.
+    """
     spread = X.std(axis=0)
     used = np.flatnonzero(spread > 0.0)
     A = X[:, used] / spread[used]
@@ -332,30 +337,31 @@ def _least_squares(X: np.ndarray, y: np.ndarray, count: float) -> tuple[np.ndarr
     solution = inverse @ (A.T @ y)
     left = y - A @ solution
     # what agrees to the last digit is a log of a simulation without noise
-    variance = max(float(left @ left) / y.size, 1e-12 * float(y @ y) / y.size)
+    variance = max(float(left @ left), 1e-12 * float(y @ y)) / freedom
     found, std = np.zeros(X.shape[1]), np.full(X.shape[1], np.inf)
     found[used] = solution / spread[used]
-    std[used] = np.sqrt(variance * np.diag(inverse) * y.size / count) / spread[used]
+    std[used] = np.sqrt(variance * np.diag(inverse)) / spread[used]
     return found, std
 
 
 def _projected(
     relation: Relation, rows: EvenRows, parts: Parts, length: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Windows in which all is known, without each run's own mean: (k,) of the left side, (k, parts)."""
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Windows in which all is known, without each run's own mean: (k,) of the left side, (k, parts);
+    and how many runs they are of."""
     starts, run = window_starts(rows.edges, length)
     sound = np.ones(starts.size, bool)
     for channel in relation.channels & rows.known.keys():
         sound &= all_known(rows.known[channel], starts, length)
     starts, run = starts[sound], run[sound]
     if not starts.size:
-        return np.empty(0), np.empty((0, len(parts)))
+        return np.empty(0), np.empty((0, len(parts))), 0
     y = weak(rows.signals[relation.left], starts, length, relation.order)
     X = np.stack([weak(values, starts, length, 0) for values in parts.values()], axis=1)
     own = np.zeros((len(rows.edges) - 1, X.shape[1] + 1))
     np.add.at(own, run, np.column_stack([y, X]))
     own /= np.maximum(np.bincount(run, minlength=len(own)), 1)[:, None]
-    return y - own[run, 0], X - own[run, 1:]
+    return y - own[run, 0], X - own[run, 1:], np.unique(run).size
 
 
 def rev_per_min(speeds: np.ndarray) -> tuple[float, float]:

@@ -1,9 +1,8 @@
-"""A flight: a folder with a test card (``card.toml``) and one CSV log per run, read and written.
+"""A flight: a folder with a test card (``card.toml``) and one CSV log per run.
 
-A CSV has a row of names, then a row per time stamp; comma, semicolon or tab between cells, an
-empty cell where
-there is no new reading (an empty command holds the last one). Only ``t``, both rotor speeds -
-commanded or measured - and both swash commands are needed; of the rest any subset:
+A CSV has a row of names, then a row per time stamp; comma, semicolon or tab between cells, an empty
+cell where there is no new reading (an empty command holds the last one). Only ``t``, both rotor speeds
+- commanded or measured - and both swash commands are needed; of the rest any subset:
 
     ============================ ======= =============================================================
     column                       unit    what it is
@@ -23,13 +22,44 @@ commanded or measured - and both swash commands are needed; of the rest any subs
     v                            m/s     speed, unsigned
     ============================ ======= =============================================================
 
-The card says the vehicle, the runs, and how the columns differ from that; README.md beside this
-file has one with every key.
+The card says the vehicle, the runs, and how the columns differ from that. One with every key; only
+``[vehicle]`` and the runs' files are needed::
 
-Bad input raises :class:`InputError`, one line naming file, line or channel. What a real log brings
-along - outliers, gaps, dropouts, repeated time stamps, impossible commands, held and interpolated
-samples - is
-repaired (repairs.py), counted and reported in :attr:`Flight.notes`.
+    [vehicle]
+    name = "lama400d"                 # shipped, or the path of a vehicle file
+
+    [air]                             # optional, in place of the vehicle file's
+    density = 1.14
+    gravity = 9.804
+
+    [noise]                           # optional: std of a sensor, in the channel's unit; else estimated
+    p = 0.03
+
+    [columns]                         # channel = where it is, and what makes its numbers ours
+    t = { name = "time_ms", unit = "ms" }
+    rpm_upper_cmd = { name = "esc1", calibration = [[1100, 0], [1500, 1450], [1900, 2900]] }
+    rpm_lower_cmd = { name = "esc2", calibration = [[1100, 0], [1500, 1450], [1900, 2900]] }
+    delta_lon = { name = "servo1", calibration = [[1000, -0.25], [2000, 0.25]] }
+    delta_lat = { name = "servo2", calibration = [[1000, -0.25], [2000, 0.25]], sign = -1 }
+    q = { name = "gyro_y", unit = "deg/s", sign = -1 }   # a body with y to the left
+    az = { name = "acc_z", unit = "g", sign = -1 }       # and z up
+    h = { name = "range_mm", unit = "mm", offset = -35 } # sign * scale * (raw + offset), then the unit
+    battery_v = { name = "adc", scale = 0.0123 }
+    psi = { name = "yaw", hold = true }                  # a repeat is no reading; false: each is one
+    lat = "gps_lat"                                      # in place of pn and pe, in deg
+    lon = "gps_lon"
+
+    [checks]
+    waive = ["q-delta_lon"]           # a check of the log with itself to pass over
+
+    [[run]]
+    name = "hover"
+    file = "hover.csv"
+    maneuver = "hover"                # optional, as is note = "..."; part = "A" or "B" for a comparison
+
+Bad input is refused in one line (InputError) naming file, line or channel. What a real log brings along
+- outliers, gaps, dropouts, repeated time stamps, impossible commands, held and interpolated samples -
+is repaired, counted and reported (Flight.notes).
 """
 
 import hashlib
@@ -66,7 +96,7 @@ class Run:
     Attributes:
         t: (n,) time, strictly increasing [s].
         command: (n, 4) omega_u, omega_l [rad/s], delta_lon, delta_lat [rad], without holes.
-        measured: channel -> (n,) readings in the contract's units, NaN where there is no new one.
+        measured: channel -> (n,) readings in the units above, NaN where there is no new one.
         part_of: the card's run of which it is a part (estimation/flown.py); empty where it is whole.
         began: time at which that one began [s]; None: with the first row.
         battery: (n,) voltage, the last sample held [V]; None where none was logged.
@@ -139,7 +169,7 @@ class Flight:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Channels measured in at least one run, in the contract's order."""
+        """Channels measured in at least one run, in the table's order."""
         return tuple(c for c in CHANNELS if any(c in run.measured for run in self.runs))
 
     def run(self, name: str) -> Run:

@@ -45,7 +45,8 @@ def repeats(values: np.ndarray, hold: bool | None = None) -> np.ndarray:
     if _is_held(inner, np.abs(np.diff(y[starts]))) or _beyond_chance(y):
         found[present[again]] = True
     elif np.mean(inner > 1) <= MOST_REPEATED:
-        for first, times in zip(starts[1:-1], inner, strict=True):
+        # the last value too, and the first: interpolation beyond the ends repeats them
+        for first, times in zip(starts, np.diff([*starts, y.size]), strict=True):
             if times >= FROZEN:
                 found[present[first + 1 : first + times]] = True
     return found
@@ -79,7 +80,7 @@ def _beyond_chance(y: np.ndarray) -> bool:
     return many and beside <= (1.0 - NEARLY_ALL_LEAP) * moved.size
 
 
-# --- straight lines between readings --------------------------------------------------------------
+# --- lines and cubics between readings --------------------------------------------------------------
 
 LEAST_STRAIGHT = 0.3
 """Share of the rows that lie on the line between their neighbours, from which on a channel was
@@ -90,9 +91,9 @@ MOST_DIGITS = 9  # behind the point, in which a rounding is looked for
 
 
 def interpolated(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Where a channel's cells lie on a straight line between readings, and are none, (n,) bool.
+    """Where a channel's cells lie on a line or a cubic between readings, and are none, (n,) bool.
 
-    Resampling that puts no row at a reading, or a curve in place of the line, is not found.
+    Resampling that puts no row at a reading is found in part (a line) or not at all (a cubic).
 
     Args:
         t: (n,) time [s]. values: (n,) readings, angles without jumps of a turn, NaN where there is
@@ -113,11 +114,49 @@ def interpolated(t: np.ndarray, values: np.ndarray) -> np.ndarray:
         return found
     if np.mean(straight) >= LEAST_STRAIGHT:
         found[present[1:-1][straight]] = True
+    elif (curved := _inside_cubics(at, y, rounding)).any():
+        found[present[curved]] = True
     elif np.mean(straight) <= MOST_REPEATED:  # a line over a gap
         for first, behind in stretches(straight):
             if behind - first >= FROZEN:
                 found[present[1 + first : 1 + behind]] = True
     return found
+
+
+FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
+"""Of five numbers on even rows: 0 where they lie on one cubic."""
+AROUND_A_KNOT = 3
+"""Fives that have one knot inside them, and so no cubic."""
+LEAST_ON_CUBICS = 0.2  # share of the fives: a quarter, with a reading every four rows; ours
+ALIKE = 0.8
+"""Share of the breaks between cubics that are single knots. A smooth log without noise is on cubics in
+quiet parts too, but breaks for long in others; ours."""
+EVEN = 1e-3  # most by which steps of even rows differ, over their length; ours
+
+
+def _inside_cubics(t: np.ndarray, y: np.ndarray, rounding: float) -> np.ndarray:
+    """Where numbers lie inside one cubic between readings four rows apart or more, (n,) bool.
+
+    Args:
+        t: (n,) time [s]. y: (n,) numbers. rounding: unit of their last decimal.
+    """
+    off = np.abs(np.convolve(y, FOURTH, "valid"))
+    most = 0.51 * rounding * float(np.abs(FOURTH).sum())  # each is rounded by half a unit
+    step = np.diff(t)
+    even = np.abs(step - np.median(step)) < EVEN * np.median(step)
+    on_one = (off <= most) & (np.convolve(even, np.ones(4), "valid") > 3.5)
+    inside = np.zeros(y.size, bool)
+    broken = [behind - first for first, behind in stretches(~on_one)]
+    kinks = off[~on_one]
+    if (
+        np.mean(on_one) >= LEAST_ON_CUBICS
+        and len(broken) >= FEWEST
+        and np.mean(np.array(broken) == AROUND_A_KNOT) >= ALIKE
+        and np.median(kinks) > LEAST_KINK * most
+    ):
+        for row in np.flatnonzero(on_one):
+            inside[row + 1 : row + 4] = True
+    return inside
 
 
 def _rounding(y: np.ndarray) -> float:
