@@ -179,7 +179,11 @@ def fly_machines(
 
 
 def result_path(out: Path, seed: int, truth: bool = False) -> Path:
-    """Where a machine's result lies."""
+    """Where a machine's result lies.
+
+    Args:
+        out: folder of all results. seed: the machine's. truth: whether its model was the truth.
+    """
     return out / ("truth" if truth else "machines") / f"{seed:06d}.json"
 
 

@@ -215,6 +215,10 @@ def from_file(
 ) -> Any:
     """``my.py:NAME`` or a zip of Stable-Baselines3, as a controller. Both run what is in the file.
 
+    Args:
+        source: the words. vehicle: that it is to fly. sensors: suite, None: the default.
+        nominal: of the actions.
+
     Raises:
         InputError: no such file or name, an error while it is run, or not a controller.
     """

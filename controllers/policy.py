@@ -138,7 +138,11 @@ class Suites:
 
 
 def linear_actions(tracker: Tracker, gain: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """LQG's actions (count, 4) to what is `seen` (count, n + i or more), not yet clipped."""
+    """LQG's actions (count, 4) to what is `seen` (count, n + i or more), not yet clipped.
+
+    Args:
+        tracker: design and estimate. gain: (4, n + i). known: what is `seen`.
+    """
     feedforward = -tracker.offset / tracker.design.action_scale
     return feedforward - known[:, : gain.shape[1]] @ gain.T
 

@@ -185,3 +185,33 @@ def test_the_readmes_tree_is_the_real_one():
         f"not in README: {sorted(real - written['coax_env'])},"
         f" not there: {sorted(written['coax_env'] - real)}"
     )
+
+
+# --- docstrings -------------------------------------------------------------------------------------
+
+
+def public_functions(path: Path) -> list[ast.FunctionDef]:
+    """A file's functions and methods whose name says that others may call them."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name[0] != "_"]
+    bodies = [tree.body, *(node.body for node in classes)]
+    found = [node for body in bodies for node in body if isinstance(node, ast.FunctionDef)]
+    return [node for node in found if node.name[0] != "_"]
+
+
+def test_public_functions_say_what_their_arguments_are():
+    """From three on; not effects, whose arguments are all the same, nor what a base class describes."""
+    silent = []
+    for name, path in modules().items():
+        for node in public_functions(path):
+            arguments = [a.arg for a in (*node.args.args, *node.args.kwonlyargs)]
+            text = ast.get_docstring(node) or ""
+            marks = " ".join(ast.unparse(mark) for mark in node.decorator_list)
+            if (
+                len({*arguments} - {"self", "cls"}) >= 3
+                and not re.search(r"Args:|arguments as", text)
+                and not re.search(r"effect\(|overload", marks)
+                and not text.startswith("As ")
+            ):
+                silent.append(f"{name}.{node.name}")
+    assert not silent

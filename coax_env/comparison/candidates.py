@@ -103,7 +103,12 @@ def scored(
 def best_first(
     problem: Problem, quadratic: Quadratic, candidates: Numbers, but: Collection[str] = ()
 ) -> list[Score]:
-    """Scores of all that may have changed, the best first."""
+    """Scores of all that may have changed, the best first.
+
+    Args:
+        problem, quadratic: of both flights, linearised. candidates: numbers of each effect.
+        but: effects that are left out.
+    """
     found = [
         scored(problem, quadratic, effect, group)
         for effect, group in candidates.items()

@@ -177,7 +177,11 @@ def dropped(state: Changed, refused: set[str] | None = None) -> Changed:
 
 
 def worth_of(state: Changed, quadratic: Quadratic, effect: str) -> Score:
-    """What an active change is worth by the quadratic, coloured innovations allowed for."""
+    """What an active change is worth by the quadratic, coloured innovations allowed for.
+
+    Args:
+        state: of the search. quadratic: linearised there. effect: an active change.
+    """
     return scored(state.problem, quadratic, effect, state.candidates[effect], inflated=True)
 
 

@@ -293,7 +293,11 @@ was left over says nothing of the noise; ours."""
 
 
 def coefficients(relation: Relation, rows: EvenRows, machine: Machine) -> list[Coefficient]:
-    """One for each named part, at the window at which it is seen best."""
+    """One for each named part, at the window at which it is seen best.
+
+    Args:
+        relation: between signals. rows: the log on even rows. machine: what it is asked of.
+    """
     if not {relation.left, *relation.uses} <= rows.signals.keys():
         return []
     parts = relation.parts(rows.signals, machine)

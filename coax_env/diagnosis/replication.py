@@ -302,7 +302,12 @@ def information(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -
 def same_way(
     problem: Problem, fit: Fit, quadratic: Quadratic, active: Collection[str], effect: str
 ) -> bool:
-    """Whether an effect's values on a part point where they do on the whole."""
+    """Whether an effect's values on a part point where they do on the whole.
+
+    Args:
+        problem, fit, quadratic: of the whole. active: effects in the part's model.
+        effect: whose values are asked.
+    """
     _, move = quadratic.best(problem.free_names(active))
     moved, off = quadratic.moved(move), problem.off_values(effect)
     usual = {f.name: f.std for f in problem.own[effect]}

@@ -52,7 +52,11 @@ def _sense(i, x, p, heli, world, readings, values, work, out):
 
 @compiled()
 def own_numbers(own, places, p):
-    """Put a helicopter's own parameters (k,) at their places (k,) in a parameter vector."""
+    """Put a helicopter's own parameters (k,) at their places (k,) in a parameter vector.
+
+    Args:
+        own: numbers, (k,). places: in `p`, (k,). p: parameter vector, changed in place.
+    """
     for k in range(len(places)):
         p[places[k]] = own[k]
 

@@ -60,7 +60,12 @@ _N_SINGLES = 4
 
 @compiled()
 def next_group(i, last, active, which):
-    """The next SIMD_WIDTH active rows from row `i` on, into `which`; how many, and the row after."""
+    """The next SIMD_WIDTH active rows from row `i` on, into `which`; how many, and the row after.
+
+    Args:
+        i: first row to look at. last: row after the last one. active: (n,) bool.
+        which: (SIMD_WIDTH,) row of each lane, written; lanes left over repeat the first.
+    """
     n = 0
     while i < last and n < SIMD_WIDTH:
         if active[i]:
@@ -204,7 +209,9 @@ def step_rows(kind, first, last, active, actions, x, flown, heli, world, mission
 
 
 def sense_rows(kind, first, last, active, x, heli, world, observations):
-    """New readings of the active rows first..last-1 of one kind, at the states `x` (n, 29)."""
+    """New readings of the active rows first..last-1 of one kind, at the states `x` (n, 29);
+    arguments as `sense`.
+    """
     rows, streams, own, past = heli.rows, heli.streams, heli.own, heli.past
     bias, held, sensors, flags = heli.bias, heli.held, world.sensors[kind], world.flags
     which, order = np.empty(SIMD_WIDTH, np.int64), np.empty(last - first, np.int64)

@@ -273,7 +273,11 @@ def way_to_target(held, places, height_sign, target, out):
 
 @compiled()
 def row_of_path(row, rows, again):
-    """Where a path is after so many control periods: past its last row from `again` on."""
+    """Where a path is after so many control periods: past its last row from `again` on.
+
+    Args:
+        row: control periods since the start. rows: of the path. again: row that follows the last.
+    """
     return row if row < rows else again + (row - again) % (rows - again)
 
 

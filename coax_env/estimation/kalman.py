@@ -212,7 +212,12 @@ class Lanes(NamedTuple):
 
 @compiled(makes_arrays=True)
 def lanes_of(nx, nu, p, work_size, readings):
-    """Lanes for so many states, inputs and readings, each with the parameters `p`."""
+    """Lanes for so many states, inputs and readings, each with the parameters `p`.
+
+    Args:
+        nx, nu, readings: how many states, inputs, readings. p: parameter vector.
+        work_size: of the model's scratch.
+    """
     lanes = Lanes(
         aligned(nx, SIMD_WIDTH), aligned(nu, SIMD_WIDTH), aligned(p.size, SIMD_WIDTH),
         aligned(work_size, SIMD_WIDTH), aligned(nx + readings, SIMD_WIDTH),

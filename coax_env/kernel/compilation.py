@@ -106,8 +106,11 @@ def compiled(
 ) -> Callable[[Callable], Any]:
     """``numba.njit`` that caches under CACHE_DIR and releases the GIL.
 
-    makes_arrays: the function makes arrays or returns them, see BORROWING. folder: of the cache, or
-    CACHE_DIR.
+    Args:
+        signature: numba's; None: compiled when first called with such arguments.
+        makes_arrays: the function makes arrays or returns them, see BORROWING.
+        folder: of the cache, or CACHE_DIR.
+        options: of ``numba.njit``.
     """
     settings = {
         "cache": True, "nogil": True, "no_cfunc_wrapper": True,

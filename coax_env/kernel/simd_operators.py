@@ -205,7 +205,11 @@ def _any_lane_one(flag):
 
 @intrinsic
 def lane(typingctx, register, k):
-    """The number in the k-th lane of a register."""
+    """The number in the k-th lane of a register.
+
+    Args:
+        typingctx: numba's. register: SIMD_WIDTH numbers. k: the lane.
+    """
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.extract_element(args[0], builder.trunc(args[1], I32))
@@ -215,7 +219,11 @@ def lane(typingctx, register, k):
 
 @intrinsic
 def with_lane(typingctx, register, k, number):
-    """A register with another number in its k-th lane."""
+    """A register with another number in its k-th lane.
+
+    Args:
+        typingctx: numba's. register: SIMD_WIDTH numbers. k: the lane. number: what it becomes.
+    """
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.insert_element(args[0], args[2], builder.trunc(args[1], I32))

@@ -111,7 +111,11 @@ def callout(text: str, kind: str = "note") -> Markup:
 
 
 def banner(heading: str, lines: Sequence[str], kind: str = "note") -> Markup:
-    """A framed list under a heading; kind as of `callout`."""
+    """A framed list under a heading; kind as of `callout`.
+
+    Args:
+        heading: in bold. lines: plain text, one bullet each. kind: of the frame.
+    """
     return _block("banner", heading, lines, kind)
 
 

@@ -40,7 +40,11 @@ def structure(name: str, fields: Fields) -> str:
 
 
 def structures(kind: str, name: str, rows: Sequence[Fields]) -> str:
-    """A constant array of such structs."""
+    """A constant array of such structs.
+
+    Args:
+        kind: name of the struct. name: of the array. rows: a struct's fields each.
+    """
     body = ",\n".join(
         "{\n" + ",\n".join(f".{key} = {braces(array)}" for key, array in row.items()) + "}"
         for row in rows
