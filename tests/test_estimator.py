@@ -229,6 +229,14 @@ def test_velocity_is_turned_into_the_heading(psi, onboard):
     assert math.cos(read["psi"] - psi) == pytest.approx(1.0)
 
 
+def test_a_heading_that_is_missing_is_the_one_expected():
+    """Also of a compass that is off: its reading in trim is not zero."""
+    biased = design_estimator(LAMA.with_effect("attitude_bias", z=0.2))
+    assert biased.reading_trim[biased.readings.index("psi")] == pytest.approx(0.2)
+    seen = [Tracker(biased).see(observation_of(biased, psi=psi))[0] for psi in (math.nan, 0.0)]
+    np.testing.assert_allclose(seen[0], seen[1], atol=1e-9)
+
+
 def test_integrals_add_up_what_is_read_and_stop(onboard):
     tracker = Tracker(onboard)
     integrated = list(estimator.integrated_readings(onboard))

@@ -157,3 +157,4 @@ def test_there_is_a_picture_per_step():
     assert len(frames) == 5 and not np.array_equal(frames[0], frames[-1])
     assert env.metadata["render_fps"] == 100  # one picture per control period
     env.close()
+    assert gymnasium.make("CoaxHeli-v0", control_rate=25).metadata["render_fps"] == 25

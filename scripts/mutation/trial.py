@@ -40,6 +40,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/env/simd_loops.py": ("tests/test_simd.py", *_ENV),
     "coax_env/env/paths.py": ("tests/test_trajectory.py", *_ENV),
     "coax_env/env/turbulence.py": ("tests/test_turbulence.py", *_ENV),
+    "coax_env/env/gym_env.py": (*_ENV, "tests/test_rendering.py", "tests/test_action_levels.py"),
     "coax_env/env/*": _ENV,
     "coax_env/simulation/multisine.py": ("tests/test_flight_plan.py",),
     "coax_env/simulation/pilot.py": ("tests/test_pilot.py", "tests/test_simulation.py"),
