@@ -213,8 +213,10 @@ def test_matlab_structs_and_matrices(tmp_path):
         "delta_lon",
         "delta_lat",
     }
-    lines = [f'{x} = {{ name = "gyro_{k}" }}' for k, x in enumerate("pqr", 1)]
-    same(drafted(tmp_path / "f", *lines), "p q r phi theta psi h")
+    assert {g.line() for g in guessed} >= {
+        f'{x} = {{ name = "gyro_{k}", unit = "rad/s" }}' for k, x in enumerate("pqr", 1)
+    }
+    same(drafted(tmp_path / "f"), "p q r phi theta psi h")
     (tmp_path / "bad.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
     with pytest.raises(InputError, match="not a MATLAB file"):
         import_table(tmp_path / "bad.mat", "lama400d", tmp_path / "g")

@@ -1,4 +1,4 @@
-"""Units a flight log may come in, and the factor to the contract's own.
+"""Units a flight log may come in, and the factor to the canonical one.
 
 A channel has a dimension; a unit is looked up within it, so that rad/s may mean a gyro or a rotor.
 """
