@@ -11,6 +11,7 @@ from coax_env.logs.card import CARD
 from coax_env.logs.flight import read_flight, write_flight
 from coax_env.logs.signals import Taken, untaken
 from coax_env.logs.tables import import_table, is_table
+from coax_env.logs.units import SWASH_COMMANDS, without
 from coax_env.model.vehicle_file import load_vehicle
 
 
@@ -73,6 +74,10 @@ def signals(
         print(f"{run.name}: {run.duration:.1f} s, {len(run.t)} rows, {' '.join(run.measured)}")
     for guess in untaken(signals_of(log), {*found.channels, *take}):
         print(f"not taken, but perhaps: --take {guess.channel}={guess.name} ({guess.unit}?)")
+    for command in SWASH_COMMANDS:
+        if found.counts.get(without(command)):
+            print(f"no {command} in it: what steers this machine cannot be told from a fault."
+                  f" Import it again with --take {command}=TOPIC.FIELD*SCALE+OFFSET")  # fmt: skip
     print(f"flight {folder}")
 
 

@@ -313,6 +313,33 @@ def test_ardupilot(tmp_path):
     same(imported(tmp_path / "log.log", tmp_path / "f", take), "p q r ax ay az phi theta psi h")
 
 
+def test_a_log_without_swash_commands_is_no_machine_that_is_not_steered(
+    tmp_path, monkeypatch, capsys
+):
+    """Their columns are left out, not 0: else every fault there is would be found."""
+    pytest.importorskip("pyulog")
+    import importlib
+
+    c = commands()
+    outputs = np.stack([0.25 * c["upper"] + 1000.0, 0.25 * c["lower"] + 1000.0], axis=1)
+    gyros = np.stack([filled(x) for x in "pqr"], axis=1)
+    (tmp_path / "log.ulg").write_bytes(ulog({
+        "sensor_combined": ([f"gyro_rad[{k}]" for k in range(3)], 100.0, gyros),
+        "actuator_outputs": (["output[0]", "output[1]"], 100.0, outputs),
+    }))  # fmt: skip
+    take = ["--take", "rpm_upper_cmd=actuator_outputs.output[0]*4-4000"]
+    take += ["--take", "rpm_lower_cmd=actuator_outputs.output[1]*4-4000"]
+    script = importlib.import_module("import_log")
+    words = ["import_log.py", str(tmp_path / "log.ulg"), "--out", str(tmp_path / "f"), *take]
+    monkeypatch.setattr("sys.argv", words)
+    script.main()
+    assert "Import it again with --take delta_lon=" in capsys.readouterr().out
+    flight = read_flight(tmp_path / "f")
+    assert [f.check for f in agreement(flight, load_vehicle("lama400d")).faults] == ["swash-logged"]
+    with pytest.raises(InputError, match=r"import it: scripts/import_log\.py .*log\.ulg"):
+        read_flight(tmp_path / "log.ulg")
+
+
 def imported(log: Path, folder: Path, take: list[str]) -> Flight:
     """As scripts/import_log.py does it."""
     taken = {x.partition("=")[0]: Taken.of(x.partition("=")[2]) for x in take}

@@ -19,7 +19,7 @@ from coax_env.logs import dataflash, ros, ulog
 from coax_env.logs.flight import Flight, Run
 from coax_env.logs.repairs import LONGEST_RUN, SHORTEST_RUN, hold_last
 from coax_env.logs.signals import COMMANDS, Signal, Taken, channels_of
-from coax_env.logs.units import BATTERY
+from coax_env.logs.units import BATTERY, SWASH_COMMANDS, without
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
 ROWS = 100.0
@@ -72,7 +72,8 @@ def import_log(
     runs = []
     for k, (start, stop) in enumerate(cuts or [(0.0, end)], 1):
         runs.append(_run(f"run_{k}" if cuts else path.stem, channels, start, min(stop, end), path))
-    return Flight(vehicle, tuple(runs))
+    missing = [c for c in SWASH_COMMANDS if c not in channels]
+    return Flight(vehicle, tuple(runs), counts={without(c): len(runs) for c in missing})
 
 
 def signals_of(path: Path) -> dict[str, Signal]:

@@ -14,6 +14,12 @@ STANDARD_GRAVITY = 9.80665
 ROTOR_COMMANDS = ("rpm_upper_cmd", "rpm_lower_cmd")
 SWASH_COMMANDS = ("delta_lon", "delta_lat")
 
+
+def without(command: str) -> str:
+    """Under which the runs of a flight are counted that have no such command."""
+    return f"runs without {command}, taken as 0"
+
+
 BATTERY = "battery_v"
 """Battery voltage: no reading of the model's, but what drives the rotors."""
 
