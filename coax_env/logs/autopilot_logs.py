@@ -8,7 +8,7 @@ Data flow::
 """
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -45,6 +45,7 @@ def import_log(
     vehicle: str,
     take: Mapping[str, Taken] | None = None,
     cuts: Sequence[tuple[float, float]] = (),
+    leave: Collection[str] = (),
 ) -> Flight:
     """A flight from a log of signals.
 
@@ -56,6 +57,7 @@ def import_log(
         take: channel -> where it comes from, for what the autopilot cannot know or is to be read
             otherwise.
         cuts: begin and end of each run, seconds of the log; none: the whole log.
+        leave: channels that are not taken: an estimator's output is no reading.
 
     Raises:
         InputError: no such log, no rotor speeds in it, or a signal or channel that does not exist.
@@ -64,6 +66,12 @@ def import_log(
     signals = signals_of(path)
     _, table = _reader(path)
     channels = channels_of(signals, table, take or {}, path)
+    for name in leave:
+        if name not in CHANNELS or name not in channels:
+            raise InputError(
+                f"{path}: no channel {name!r} to leave; there are {', '.join(channels)}"
+            )
+        del channels[name]
     begin = min(t[0] for t, _ in channels.values())
     channels = {name: (t - begin, values) for name, (t, values) in channels.items()}
     end = max(t[-1] for t, _ in channels.values())
@@ -111,8 +119,7 @@ def _run(name: str, channels: Mapping[str, Signal], start: float, stop: float, p
             f"{path}: a run from {start:g} to {stop:g} s is shorter than {SHORTEST_RUN:g} s"
         )
     clock = channels.get("p") or channels.get("ax") or channels["phi"]
-    rate = (len(clock[0]) - 1) / max(clock[0][-1] - clock[0][0], 1e-9)
-    step = 1.0 / min(ROWS, rate)
+    step = max(1.0 / ROWS, float(np.median(np.diff(clock[0]))))  # whatever its gaps
     t = start + step * np.arange(int((stop - start) / step) + 1)
     measured = {}
     for channel in CHANNELS:
