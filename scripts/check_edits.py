@@ -18,7 +18,7 @@ STANDARD = {
     "phase": 0.15, "delay": 0.03, "offset_lon": 0.03, "gain": 1.25, "rotor_scale": 1.04,
     "theta": 0.03,
 }  # fmt: skip
-"""The edits of trust.md, in this module's words: sizes that matter in flight and are no fault."""
+"""What a log is made to say: sizes that matter in flight and are no fault."""
 INTERVAL = 1.96  # std of a 95 % interval
 
 

@@ -11,6 +11,7 @@ from coax_env.logs.card import CARD
 from coax_env.logs.flight import read_flight, write_flight
 from coax_env.logs.signals import Taken, untaken
 from coax_env.logs.tables import import_table, is_table
+from coax_env.logs.units import SWASH_COMMANDS, without
 from coax_env.model.vehicle_file import load_vehicle
 
 
@@ -27,6 +28,10 @@ def main() -> None:
         "may be given several times",
     )  # fmt: skip
     parser.add_argument(
+        "--leave", default="", metavar="CHANNEL,CHANNEL",
+        help="channels not to take, such as what an estimator made of other sensors",
+    )  # fmt: skip
+    parser.add_argument(
         "--cut", default="", metavar="FROM-TO,FROM-TO",
         help="runs, in seconds of the log (default: the whole log is one)",
     )  # fmt: skip
@@ -40,9 +45,9 @@ def main() -> None:
         )
     load_vehicle(options.vehicle)
     if is_table(options.log):
-        if options.take or options.cut:
+        if options.take or options.cut or options.leave:
             raise InputError(
-                f"{options.log}: --take and --cut are not for tables: edit the drafted card"
+                f"{options.log}: --take, --cut and --leave are not for tables: edit the drafted card"
             )
         table(options.log, options.vehicle, options.out)
     else:
@@ -50,7 +55,8 @@ def main() -> None:
         for text in options.take:
             channel, _, source = text.partition("=")
             take[channel.strip()] = Taken.of(source)
-        signals(options.log, options.vehicle, take, cuts(options.cut), options.out)
+        leave = [name for name in options.leave.split(",") if name]
+        signals(options.log, options.vehicle, take, cuts(options.cut), leave, options.out)
     print(command_line.as_called(f"next: scripts/check_flight.py {options.out}"))
 
 
@@ -63,16 +69,25 @@ def table(log: Path, vehicle: str, out: Path) -> None:
 
 
 def signals(
-    log: Path, vehicle: str, take: dict[str, Taken], parts: list[tuple[float, float]], out: Path
+    log: Path,
+    vehicle: str,
+    take: dict[str, Taken],
+    parts: list[tuple[float, float]],
+    leave: list[str],
+    out: Path,
 ) -> None:
     """A log of signals with clocks of their own."""
-    flight = import_log(log, vehicle, take, parts)
+    flight = import_log(log, vehicle, take, parts, leave)
     folder = write_flight(flight, out)
     found = read_flight(folder)
     for run in found.runs:
         print(f"{run.name}: {run.duration:.1f} s, {len(run.t)} rows, {' '.join(run.measured)}")
-    for guess in untaken(signals_of(log), {*found.channels, *take}):
+    for guess in untaken(signals_of(log), {*found.channels, *take, *leave}):
         print(f"not taken, but perhaps: --take {guess.channel}={guess.name} ({guess.unit}?)")
+    for command in SWASH_COMMANDS:
+        if found.counts.get(without(command)):
+            print(f"no {command} in it: what steers this machine cannot be told from a fault."
+                  f" Import it again with --take {command}=TOPIC.FIELD*SCALE+OFFSET")  # fmt: skip
     print(f"flight {folder}")
 
 

@@ -51,7 +51,7 @@ def main() -> None:
 def check_only(flights: list[PlannedFlight], options: Any, command: str) -> None:
     """Whether the logs of these flights would be refused: refusals.md, refusals.json."""
     found = workers.each(fly_and_check, flights, options.jobs, options.backend)
-    rows: list[dict[str, Any]] = []
+    rows = [refusals.check_log(folder) for folder in options.logs]
     try:
         for _, row in tqdm(found, "study", len(flights), unit="flight"):
             rows.append(row)
@@ -109,6 +109,10 @@ def parse() -> Any:
     parser.add_argument(
         "--check-only", action="store_true",
         help="only whether these sound logs, their halves and single runs, would be refused",
+    )  # fmt: skip
+    parser.add_argument(
+        "--logs", type=Path, nargs="+", default=[], metavar="FLIGHT",
+        help="with --check-only: sound logs that are there, beside those that are flown",
     )  # fmt: skip
     parser.add_argument("--no-baselines", action="store_true", help="the package alone")
     command_line.add_workers(parser, "flights", -1)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from autopilot_files import ulog
+from autopilot_files import dataflash_binary, ulog
 
 import coax_env
 from coax_env.consistency.agreement import agreement
@@ -213,8 +213,10 @@ def test_matlab_structs_and_matrices(tmp_path):
         "delta_lon",
         "delta_lat",
     }
-    lines = [f'{x} = {{ name = "gyro_{k}" }}' for k, x in enumerate("pqr", 1)]
-    same(drafted(tmp_path / "f", *lines), "p q r phi theta psi h")
+    assert {g.line() for g in guessed} >= {
+        f'{x} = {{ name = "gyro_{k}", unit = "rad/s" }}' for k, x in enumerate("pqr", 1)
+    }
+    same(drafted(tmp_path / "f"), "p q r phi theta psi h")
     (tmp_path / "bad.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
     with pytest.raises(InputError, match="not a MATLAB file"):
         import_table(tmp_path / "bad.mat", "lama400d", tmp_path / "g")
@@ -304,11 +306,64 @@ def test_ardupilot(tmp_path):
             cells = ", ".join(f"{column[k]:.8g}" for column in columns)
             lines.append(f"{name}, {round(1e6 * (t + 5.0))}, {cells}")
     (tmp_path / "log.log").write_text("\n".join(lines) + "\n")
+    t = original().t
+    (tmp_path / "log.bin").write_bytes(dataflash_binary({
+        name: (formats[name].split(","), t, np.stack(columns, axis=1))
+        for name, columns in table.items()
+    }))  # fmt: skip
     take = [
         "rpm_upper_cmd=RCOU.C1", "rpm_lower_cmd=RCOU.C2",
         "delta_lon=RCOU.C3*0.0005-0.75", "delta_lat=RCOU.C4*0.0005-0.75",
     ]  # fmt: skip
-    same(imported(tmp_path / "log.log", tmp_path / "f", take), "p q r ax ay az phi theta psi h")
+    channels = "p q r ax ay az phi theta psi h"
+    same(imported(tmp_path / "log.log", tmp_path / "f", take), channels)
+    same(imported(tmp_path / "log.bin", tmp_path / "g", take), channels)
+
+
+def test_rows_come_as_the_sensor_does_whatever_its_breaks_and_what_is_left_is_left(tmp_path):
+    """An IMU at 100 Hz with ten seconds' break has rows at 100 Hz."""
+    pytest.importorskip("pyulog")
+    t = np.concatenate([np.arange(0.0, 8.0, 0.01), np.arange(18.0, 26.0, 0.01)])
+    columns = np.stack([np.sin(t), np.cos(t), 0.1 * t, 2000.0 + t, 2100.0 + t], axis=1)
+    fields = [*(f"gyro_rad[{k}]" for k in range(3)), "a", "b"]
+    place = (["x", "y", "z"], t[::10], columns[::10, :3])
+    log = ulog({"sensor_combined": (fields, t, columns), "vehicle_local_position": place})
+    (tmp_path / "log.ulg").write_bytes(log)
+    take = {
+        f"rpm_{k}_cmd": Taken(f"sensor_combined.{c}") for k, c in (("upper", "a"), ("lower", "b"))
+    }
+    run = import_log(tmp_path / "log.ulg", "lama400d", take, leave=["pn", "h"]).runs[0]
+    assert np.median(np.diff(run.t)) == pytest.approx(0.01)
+    assert {"p", "q", "r", "pe"} == set(run.measured)
+    with pytest.raises(InputError, match="no channel 'phi' to leave"):
+        import_log(tmp_path / "log.ulg", "lama400d", take, leave=["phi"])
+
+
+def test_a_log_without_swash_commands_is_no_machine_that_is_not_steered(
+    tmp_path, monkeypatch, capsys
+):
+    """Their columns are left out, not 0: else every fault there is would be found."""
+    pytest.importorskip("pyulog")
+    import importlib
+
+    c = commands()
+    outputs = np.stack([0.25 * c["upper"] + 1000.0, 0.25 * c["lower"] + 1000.0], axis=1)
+    gyros = np.stack([filled(x) for x in "pqr"], axis=1)
+    (tmp_path / "log.ulg").write_bytes(ulog({
+        "sensor_combined": ([f"gyro_rad[{k}]" for k in range(3)], 100.0, gyros),
+        "actuator_outputs": (["output[0]", "output[1]"], 100.0, outputs),
+    }))  # fmt: skip
+    take = ["--take", "rpm_upper_cmd=actuator_outputs.output[0]*4-4000"]
+    take += ["--take", "rpm_lower_cmd=actuator_outputs.output[1]*4-4000"]
+    script = importlib.import_module("import_log")
+    words = ["import_log.py", str(tmp_path / "log.ulg"), "--out", str(tmp_path / "f"), *take]
+    monkeypatch.setattr("sys.argv", words)
+    script.main()
+    assert "Import it again with --take delta_lon=" in capsys.readouterr().out
+    flight = read_flight(tmp_path / "f")
+    assert [f.check for f in agreement(flight, load_vehicle("lama400d")).faults] == ["swash-logged"]
+    with pytest.raises(InputError, match=r"import it: scripts/import_log\.py .*log\.ulg"):
+        read_flight(tmp_path / "log.ulg")
 
 
 def imported(log: Path, folder: Path, take: list[str]) -> Flight:

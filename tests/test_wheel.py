@@ -185,3 +185,17 @@ def the_readmes_lines_run(coax: Callable[..., Done]) -> None:
     """From a log to a better hover, as README has it."""
     lines, printed = ten_lines()
     assert folded(coax(text=lines).stdout) == printed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("python", os.environ.get("COAX_PYTHONS", "").split())
+def test_it_works_under_another_python(wheel, python):
+    """``COAX_PYTHONS="/path/to/python3.12 /path/to/python3.13"``: each takes what it needs from the
+    package index. wheel_elsewhere.py says how to get a Python that the machine lacks."""
+    env = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    script = Path(__file__).with_name("wheel_elsewhere.py")
+    done = subprocess.run(
+        [python, script, wheel], env=env, capture_output=True, text=True, timeout=3000, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "the wheel flies, checks and diagnoses" in done.stdout

@@ -50,7 +50,7 @@ class Comparison:
     """Result of `compare`.
 
     Attributes:
-        changes: what changes.json holds (contract).
+        changes: what changes.json holds.
         flights: both, as they were flown.
         white: flight -> channel -> whiteness of what the model leaves.
         state: the model of both.

@@ -23,7 +23,7 @@ from coax_env.consistency.even_rows import even_rows
 from coax_env.consistency.machine import machine_of
 from coax_env.errors import InputError
 from coax_env.logs.flight import Flight
-from coax_env.logs.units import SWASH_COMMANDS
+from coax_env.logs.units import SWASH_COMMANDS, without
 from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
 
@@ -129,7 +129,7 @@ def _air(flight: Flight) -> list[Fault]:
 
 def _swash_logged(flight: Flight) -> list[Fault]:
     """Swash commands that are not there: a machine steered unseen has every fault there is."""
-    missing = [c for c in SWASH_COMMANDS if flight.counts.get(f"runs without {c}, taken as 0")]
+    missing = [c for c in SWASH_COMMANDS if flight.counts.get(without(c))]
     if not missing:
         return []
     unread = f" (columns not read: {', '.join(flight.unread)})" if flight.unread else ""

@@ -68,7 +68,7 @@ class Diagnosis:
     """Result of `diagnose`.
 
     Attributes:
-        findings: what findings.json holds (contract).
+        findings: what findings.json holds.
         vehicle_before: as given.
         vehicle_after: the corrected model, refitted on all runs.
         replay_before, replay_refitted, replay_after: held-out runs flown again with the vehicle as

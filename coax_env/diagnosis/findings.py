@@ -146,7 +146,7 @@ def unexplained(white: Mapping[str, Whiteness], described: Collection[str]) -> l
 
 
 def verdict(causes: Collection[Any], unexplained: Collection[Any]) -> str:
-    """The verdict of the contract."""
+    """The verdict in a word: consistent, explained, partly explained, unexplained."""
     if causes:
         return "partly explained" if unexplained else "explained"
     return "unexplained" if unexplained else "consistent"
@@ -165,7 +165,7 @@ def innovations(passes: Sequence[RunPass]) -> dict[str, dict[str, np.ndarray]]:
 
 
 def noise_levels(noise: Noise) -> dict[str, dict[str, Any]]:
-    """Every level of the noise, process and readings (contract).
+    """Every level of the noise, process and readings.
 
     A level that stands at a bound says so: noise that is not there stands at the least that no model
     is without.

@@ -13,12 +13,12 @@ from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.state_space import Noise, Record, part
 
-FAIR_SHARE = 0.25  # of the information on each effect that should be held out (contract: a quarter)
+FAIR_SHARE = 0.25  # of the information on each effect that should be held out: a quarter
 MOST_LOST = 0.6  # share of it beyond which the rest no longer determines the effect; ours
 LEAST_SEEN = 0.1  # share below which its gain cannot be measured on the held-out runs; ours
 UNFAIR = 10.0  # what one of those costs, in squared shares; ours
 UNDETERMINED = 1000.0
-"""And what is lost beyond MOST_LOST: every effect stays excited (contract); ours."""
+"""And what is lost beyond MOST_LOST: every effect stays excited; ours."""
 MOST_TIME = 1.0 / 3.0  # of the flown time that is held out at most; ours
 LEAST_FAIRER = 1e-9  # squared shares by which an exchange must be fairer: beyond rounding
 

@@ -87,7 +87,7 @@ def scores(
 def is_large(problem: Problem, effect: str, values: Mapping[str, float]) -> bool:
     """Whether an effect at these values matters in prediction.
 
-    One that replaces a base parameter must move it by more than twice its prior std (contract).
+    One that replaces a base parameter must move it by more than twice its prior std.
 
     Args:
         problem: whose vehicle file the base parameter stands in.

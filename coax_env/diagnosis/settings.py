@@ -95,7 +95,7 @@ class Settings:
     piece_seconds: float = 5.0
     """s of the pieces that a few runs are cut into; each loses a second to its filter's start; ours."""
     noise_factor: float = 2.0
-    """Times which, and part of which, every noise level must leave a name standing (contract)."""
+    """Times which, and part of which, every noise level must leave a name standing."""
     noise_share: float = 0.35
     """Share of the information on each cause that the runs flown again with other noise have; ours."""
     noise_clear: float = 14.0
@@ -109,9 +109,9 @@ class Settings:
 
     # --- hold-out, gain and report -----------------------------------------------------------------
     horizon: float = 1.0
-    """s flown open loop for the gain (contract)."""
+    """s flown open loop for the gain."""
     fewest_runs: int = 4
-    """With fewer runs, the last third of each is held out (contract)."""
+    """With fewer runs, the last third of each is held out."""
     white_noise_reported: float = 5.0
     """Times its floor above which a level of white process noise is reported; ours."""
     moved_by_unseen: float = 5.0

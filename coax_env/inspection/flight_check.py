@@ -105,7 +105,8 @@ def check_flight(
     if learned.not_believed > NOT_BELIEVED and not suspicions:
         suspicions.append(
             f"{100 * learned.not_believed:.0f} % of the readings are too far from what {label} would"
-            " read to be believed: is it this vehicle, and are signs and units those of the contract?"
+            " read to be believed: is it this vehicle, and are signs and units those of"
+            " the form (check_flight --form)?"
         )
     where = str(flight.path or "FLIGHT")
     return FlightCheck(

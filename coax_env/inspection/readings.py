@@ -12,6 +12,8 @@ from coax_env.logs.repairs import GAP
 from coax_env.model.layout import CHANNEL_UNITS
 
 FROZEN = 1.0  # [s] for which a channel may read one and the same value
+QUIETEST = dict.fromkeys(("pn", "pe", "h"), 5e-5) | dict.fromkeys(("vn", "ve", "vd"), 2e-4)
+"""Noise [m, m/s] below which no sensor of a place or a velocity is: motion capture has 1e-4 m; ours."""
 SATURATED = 0.005
 """Share of the readings that may stand at one extreme value."""
 
@@ -101,8 +103,14 @@ def _saturated(y: np.ndarray) -> int:
 
 
 def sensor_faults(channels: Sequence[ChannelCheck]) -> list[str]:
-    """Sensors that stood still or at their limit, in words."""
+    """Sensors that stood still or at their limit, or are none, in words."""
     found = [
+        f"{c.channel} has hardly any noise ({c.std:.1g} {c.unit}): what an estimator made of other"
+        f" sensors, and no reading? leave it out (import_log --leave {c.channel}, or rename its column)"
+        for c in channels
+        if 0.0 < c.std < QUIETEST.get(c.channel, 0.0)
+    ]
+    found += [
         f"{c.channel} reads one and the same value for {c.frozen:.1f} s: a frozen sensor? leave its"
         " cells empty there"
         for c in channels

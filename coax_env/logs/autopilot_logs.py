@@ -8,7 +8,7 @@ Data flow::
 """
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from coax_env.logs import dataflash, ros, ulog
 from coax_env.logs.flight import Flight, Run
 from coax_env.logs.repairs import LONGEST_RUN, SHORTEST_RUN, hold_last
 from coax_env.logs.signals import COMMANDS, Signal, Taken, channels_of
-from coax_env.logs.units import BATTERY
+from coax_env.logs.units import BATTERY, SWASH_COMMANDS, without
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
 ROWS = 100.0
@@ -45,6 +45,7 @@ def import_log(
     vehicle: str,
     take: Mapping[str, Taken] | None = None,
     cuts: Sequence[tuple[float, float]] = (),
+    leave: Collection[str] = (),
 ) -> Flight:
     """A flight from a log of signals.
 
@@ -56,6 +57,7 @@ def import_log(
         take: channel -> where it comes from, for what the autopilot cannot know or is to be read
             otherwise.
         cuts: begin and end of each run, seconds of the log; none: the whole log.
+        leave: channels that are not taken: an estimator's output is no reading.
 
     Raises:
         InputError: no such log, no rotor speeds in it, or a signal or channel that does not exist.
@@ -64,6 +66,12 @@ def import_log(
     signals = signals_of(path)
     _, table = _reader(path)
     channels = channels_of(signals, table, take or {}, path)
+    for name in leave:
+        if name not in CHANNELS or name not in channels:
+            raise InputError(
+                f"{path}: no channel {name!r} to leave; there are {', '.join(channels)}"
+            )
+        del channels[name]
     begin = min(t[0] for t, _ in channels.values())
     channels = {name: (t - begin, values) for name, (t, values) in channels.items()}
     end = max(t[-1] for t, _ in channels.values())
@@ -72,7 +80,8 @@ def import_log(
     runs = []
     for k, (start, stop) in enumerate(cuts or [(0.0, end)], 1):
         runs.append(_run(f"run_{k}" if cuts else path.stem, channels, start, min(stop, end), path))
-    return Flight(vehicle, tuple(runs))
+    missing = [c for c in SWASH_COMMANDS if c not in channels]
+    return Flight(vehicle, tuple(runs), counts={without(c): len(runs) for c in missing})
 
 
 def signals_of(path: Path) -> dict[str, Signal]:
@@ -110,8 +119,7 @@ def _run(name: str, channels: Mapping[str, Signal], start: float, stop: float, p
             f"{path}: a run from {start:g} to {stop:g} s is shorter than {SHORTEST_RUN:g} s"
         )
     clock = channels.get("p") or channels.get("ax") or channels["phi"]
-    rate = (len(clock[0]) - 1) / max(clock[0][-1] - clock[0][0], 1e-9)
-    step = 1.0 / min(ROWS, rate)
+    step = max(1.0 / ROWS, float(np.median(np.diff(clock[0]))))  # whatever its gaps
     t = start + step * np.arange(int((stop - start) / step) + 1)
     measured = {}
     for channel in CHANNELS:

@@ -9,6 +9,9 @@ import numpy as np
 from coax_env.errors import InputError, require
 from coax_env.logs.signals import Signal
 
+HEAD = b"\xa3\x95"
+"""With which every message of a binary log begins."""
+
 CHANNEL_SIGNALS: dict[str, tuple[str, ...]] = {
     "p": ("IMU.GyrX",), "q": ("IMU.GyrY",), "r": ("IMU.GyrZ",),
     "ax": ("IMU.AccX",), "ay": ("IMU.AccY",), "az": ("IMU.AccZ",),
@@ -26,10 +29,10 @@ def ardupilot_signals(path: Path) -> dict[str, Signal]:
     """Every numeric field of a DataFlash log as ``MSG.field``; other instances as ``MSG.field[1]``."""
     DFReader = require("pymavlink.DFReader", "logs")
     try:
-        if DFReader.DFReader_is_text_log(str(path)):
-            log: Any = DFReader.DFReader_text(str(path))
-        else:
-            log = DFReader.DFReader_binary(str(path))
+        # pymavlink's own question reads a binary log as UTF-8, and fails
+        binary = path.read_bytes()[: len(HEAD)] == HEAD
+        reader = DFReader.DFReader_binary if binary else DFReader.DFReader_text
+        log: Any = reader(str(path))
         with closing(log):
             columns = _messages(log)
     except InputError:

@@ -66,7 +66,7 @@ import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -80,9 +80,11 @@ from coax_env.logs.card_columns import Column, Quaternion
 from coax_env.logs.csv_log import CsvLog, read_csv
 from coax_env.logs.frames import place
 from coax_env.logs.repairs import repaired
-from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS
+from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS, without
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
+IMPORTED = (".ulg", ".bin", ".log", ".bag", ".db3", ".mcap", ".mat", ".parquet", ".pq")
+"""How files end that scripts/import_log.py makes a flight folder of."""
 FLIGHTS = Path(__file__).parent / "flights"
 """Where shipped flights lie, each a folder."""
 
@@ -277,7 +279,7 @@ def _check_columns(folder: Path, card: Card, renamed: Iterable[str], unread: Ite
 def _check_folder(folder: Path) -> None:
     """Refuse what is no flight folder, and say how to make one."""
     if os.path.isfile(folder):
-        if folder.suffix.lower() in (".ulg", ".bin", ".log"):
+        if folder.suffix.lower() in IMPORTED:
             step = f"import it: scripts/import_log.py {folder}"
         else:
             step = "put it in a folder of its own, then scripts/check_flight.py FOLDER --draft"
@@ -285,6 +287,8 @@ def _check_folder(folder: Path) -> None:
     if not os.path.isdir(folder):
         raise InputError(f"no flight folder at {folder}: found nothing there")
     if not (folder / CARD).exists():
+        if (folder / "metadata.yaml").exists():
+            raise InputError(f"{folder} is a ROS 2 bag: import it: scripts/import_log.py {folder}")
         raise InputError(
             f"cannot read {folder / CARD}: No such file or directory; a flight folder needs one:"
             f" scripts/check_flight.py {folder} --draft writes a first one for the CSVs in it"
@@ -301,9 +305,16 @@ def _hash(path: Path) -> str:
 def write_flight(flight: Flight, path: str | Path) -> Path:
     """Write a flight folder that :func:`read_flight` reads back: all files or none.
 
-    Readings keep nine significant digits. ``notes``, ``counts`` and ``hashes`` are not written.
+    Readings keep nine significant digits. ``notes``, ``counts`` and ``hashes`` are not written; a swash
+    command that no run has (by its count) gets no column.
     """
     path = Path(path)
+    missing = [
+        name
+        for k, name in enumerate(SWASH_COMMANDS, 2)
+        if flight.counts.get(without(name), 0) >= len(flight.runs)
+        and not any(run.command[:, k].any() for run in flight.runs)
+    ]
     card = tomlkit.document()
     if flight.synthetic:
         card["synthetic"] = True
@@ -317,17 +328,21 @@ def write_flight(flight: Flight, path: str | Path) -> Path:
             entry = {"name": run.name, "file": file, "maneuver": run.maneuver}
             said = {"note": run.note, "part": run.part}
             entries.append(tomlkit.item(entry | {key: text for key, text in said.items() if text}))
-            write_text(stage / file, _csv_text(run))
+            write_text(stage / file, _csv_text(run, missing))
         card["run"] = entries
         write_text(stage / CARD, tomlkit.dumps(card))
     return path
 
 
-def _csv_text(run: Run) -> str:
+def _csv_text(run: Run, missing: Collection[str]) -> str:
+    """A run as a CSV; missing: commands of which nothing is known."""
     columns = [[repr(float(t)) for t in np.round(run.t, 9)]]
-    header = ["t", *ROTOR_COMMANDS, *SWASH_COMMANDS]
+    header = ["t"]
     to_log = (RPM_PER_RAD_S, RPM_PER_RAD_S, 1.0, 1.0)
-    columns += [[f"{x:.12g}" for x in run.command[:, i] * to_log[i]] for i in range(4)]
+    for i, name in enumerate((*ROTOR_COMMANDS, *SWASH_COMMANDS)):
+        if name not in missing:
+            header.append(name)
+            columns.append([f"{x:.12g}" for x in run.command[:, i] * to_log[i]])
     if run.battery is not None:
         header.append(BATTERY)
         columns.append([f"{x:.9g}" for x in run.battery.tolist()])

@@ -15,7 +15,7 @@ from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
 from coax_env.logs.held import interpolated, repeats
 from coax_env.logs.outliers import find_leaps, find_outliers
 from coax_env.logs.packets import broken_packets
-from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS
+from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS, without
 from coax_env.model.layout import ANGLES, CHANNELS, RPM_PER_RAD_S
 
 SHORTEST_RUN = 2.0
@@ -278,7 +278,7 @@ def _commands(
     for name in SWASH_COMMANDS:
         tilt = data.get(name)
         if tilt is None or np.isnan(tilt).all():
-            counts[f"runs without {name}, taken as 0"] += 1
+            counts[without(name)] += 1
             tilt = np.zeros(len(data["t"]))
         columns.append(hold_last(tilt))
     return np.column_stack(columns), driving

@@ -30,6 +30,10 @@ CHANNEL_SIGNALS: dict[str, tuple[str, ...]] = {
 """Channel -> the signal that `ros_signals` makes of messages of a known type, in our frames and
 units."""
 
+POSES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry")
+KNOWN = ("Imu", "Range", "BatteryState", *POSES)
+"""Types of messages that are read, those of sensors first: an odometry is an estimator's."""
+
 Message = tuple[str, str, float, Mapping[str, Any]]
 """Topic, type, time [s], and the content by field."""
 
@@ -152,21 +156,21 @@ def _time(content: Mapping[str, Any], stamp: int) -> float:
 
 
 def _known(signals: Mapping[str, Signal], kinds: Mapping[str, str]) -> dict[str, Signal]:
-    """Channels of the first topic of each known type."""
+    """Channels of the first topic of each known type; a sensor's own before an estimator's."""
     found: dict[str, Signal] = {}
-    for topic, kind in sorted(kinds.items()):
-        name = topic.strip("/")
-        last = kind.rpartition("/")[2]
+    types = {topic: kind.rpartition("/")[2] for topic, kind in kinds.items()}
+    for topic in sorted(
+        (t for t in types if types[t] in KNOWN), key=lambda t: (KNOWN.index(types[t]), t)
+    ):
+        name, last = topic.strip("/"), types[topic]
         if last == "Imu":
             new = _imu(signals, name)
-        elif last in ("Odometry", "PoseStamped", "PoseWithCovarianceStamped"):
+        elif last in POSES:
             new = _pose(signals, name, "pose." if last == "PoseStamped" else "pose.pose.")
         elif last == "Range":
             new = {"h": signals.get(f"{name}.range")}
-        elif last == "BatteryState":
-            new = {"battery_v": signals.get(f"{name}.voltage")}
         else:
-            continue
+            new = {"battery_v": signals.get(f"{name}.voltage")}
         for channel, signal in new.items():
             if signal is not None:
                 found.setdefault(f"ros.{channel}", signal)

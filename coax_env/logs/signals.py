@@ -33,7 +33,7 @@ _TAKE = re.compile(
 
 @dataclass(frozen=True)
 class Taken:
-    """A channel from a signal: value = scale * signal + offset, in the contract's unit."""
+    """A channel from a signal: value = scale * signal + offset, in the channel's unit."""
 
     signal: str
     scale: float = 1.0

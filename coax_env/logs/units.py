@@ -1,4 +1,4 @@
-"""Units a flight log may come in, and the factor to the contract's own.
+"""Units a flight log may come in, and the factor to the canonical one.
 
 A channel has a dimension; a unit is looked up within it, so that rad/s may mean a gyro or a rotor.
 """
@@ -13,6 +13,12 @@ STANDARD_GRAVITY = 9.80665
 
 ROTOR_COMMANDS = ("rpm_upper_cmd", "rpm_lower_cmd")
 SWASH_COMMANDS = ("delta_lon", "delta_lat")
+
+
+def without(command: str) -> str:
+    """Under which the runs of a flight are counted that have no such command."""
+    return f"runs without {command}, taken as 0"
+
 
 BATTERY = "battery_v"
 """Battery voltage: no reading of the model's, but what drives the rotors."""

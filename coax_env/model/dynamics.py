@@ -487,7 +487,7 @@ def step(x, u, dt, p, work, out):
 
 @bare_and_with_effects()
 def _read(x, now, slope, p, f, out):
-    """Readings of every channel, contract units, (18,), from what `f` holds. Eq. (45)."""
+    """Readings of every channel, in its unit, (18,), from what `f` holds. Eq. (45)."""
     z = f[F.READING :]
     z[Z.RPM_UPPER] = now[S.OMEGA_U] * (30.0 / math.pi)
     z[Z.RPM_LOWER] = now[S.OMEGA_L] * (30.0 / math.pi)
@@ -565,7 +565,7 @@ def measure(x, u, p, work, out):
 
     Args:
         x, u, p, work: as in `step`.
-        out: readings (18,), see channels.py, contract units.
+        out: readings (18,), see channels.py, each in its unit.
     """
     if _switched_on(p) + p[effects.PROPERTY] + p[effects.SENSOR] != 0.0:
         _measure_with_effects(x, u, p, work, out)

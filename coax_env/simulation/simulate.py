@@ -68,7 +68,7 @@ class Track:
         return self.state[:, [n for n, _ in STATES].index(name)]
 
     def reading(self, channel: str) -> np.ndarray:
-        """True readings of a channel, contract unit, shape (n,)."""
+        """True readings of a channel in its unit, shape (n,)."""
         return self.readings[:, CHANNELS.index(channel)]
 
 

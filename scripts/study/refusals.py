@@ -35,6 +35,12 @@ def fly_and_check(planned: PlannedFlight) -> dict[str, Any]:
         return row | {"error": f"{type(error).__name__}: {error} ({where.name}:{where.lineno})"}
 
 
+def check_log(folder: Path) -> dict[str, Any]:
+    """The same row of a sound log that is there, of a real machine, say."""
+    plan = {"arm": folder.name, "kind": "as it is", "number": 0}
+    return {"plan": plan, "hidden": []} | checked(read_flight(folder))
+
+
 def checked(flight: Flight) -> dict[str, Any]:
     """Logs by their kind, and the refused ones: kind, run, check and what was found."""
     logs: Counter[str] = Counter()
@@ -86,7 +92,8 @@ def table_text(rows: Sequence[dict[str, Any]], command: str) -> str:
     lines = [
         "# Sound logs that are refused: none should be",
         "",
-        f"`{command}`: {len(sound)} flights (synthetic), {len(rows) - len(sound)} failed.",
+        f"`{command}`: {len(sound)} flights, {len(rows) - len(sound)} failed. What the study flies is"
+        " synthetic.",
         "",
         f"| arm | {' | '.join(PARTS)} |",
         "|---" * (1 + len(PARTS)) + "|",
