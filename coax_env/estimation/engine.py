@@ -301,7 +301,7 @@ class Engine:
                 blocks = np.zeros((edges.size - 1, len(free)))
                 if np.isfinite(run.log_likelihood):
                     work = self._signatures(i, run, at, p, moves, by_channel)
-                    probed = self._probed_signatures(i, run, p, moves, by_channel)
+                    probed = self._probed_signatures(i, run, moves, by_channel)
                     e = run.innovations[np.isfinite(run.innovations)]
                     for first in range(0, edges.size - 1, BLOCKS_AT_ONCE):
                         own = edges[first : first + BLOCKS_AT_ONCE + 1]
@@ -401,44 +401,22 @@ class Engine:
         return self.model.inputs(run.record, vector)
 
     def _probed_signatures(
-        self, i: int, run: RunPass, p: np.ndarray, moves: _Moves, by_channel: np.ndarray
+        self, i: int, run: RunPass, moves: _Moves, by_channel: np.ndarray
     ) -> np.ndarray:
-        """The same where a finite step is needed, by mean passes: (readings, probed)."""
-        channel = np.nonzero(np.isfinite(run.innovations))[1]
+        """The same where a finite step is needed, by a mean pass each: (readings, probed)."""
+        there = np.isfinite(run.innovations)
+        channel, e = np.nonzero(there)[1], run.innovations[there]
         columns = np.flatnonzero(moves.probed)
-        found = np.zeros((channel.size, columns.size))
-        at_once = frozen_gains.COMPARED
-        for first in range(0, columns.size, at_once):
-            some = slice(first, first + at_once)
-            vectors = [moves.vectors[k] for k in columns[some]]
-            change = self._changes(i, run, p, vectors)
-            tame = np.abs(change).max(axis=0, initial=0.0) < DIVERGED
-            found[:, some] = np.where(tame, change, 0.0) / moves.steps[columns[some]]
+        found = np.zeros((e.size, columns.size))
+        probed = np.zeros(there.shape)
         for column, k in enumerate(columns):
-            by_channel[k] = np.bincount(channel, found[:, column] ** 2, by_channel.shape[1])
+            if self._frozen(i, run, moves.vectors[k], probed):
+                change = probed[there] - e
+                if np.abs(change).max(initial=0.0) < DIVERGED:
+                    change /= moves.steps[k]
+                    found[:, column] = change
+                    by_channel[k] = np.bincount(channel, change**2, by_channel.shape[1])
         return found
-
-    def _changes(
-        self, i: int, run: RunPass, p: np.ndarray, vectors: Sequence[np.ndarray]
-    ) -> np.ndarray:
-        """Innovations with other parameters less those with `p`, gains frozen, (readings, vectors)."""
-        if not self.compiled.has_lanes:
-            there = np.isfinite(run.innovations)
-            probed = np.zeros((len(vectors), *there.shape))
-            for e, vector in zip(probed, vectors, strict=True):
-                if not self._frozen(i, run, vector, e):
-                    e[:] = np.inf
-            return (probed - run.innovations)[:, there].T
-        lanes = [p, *vectors, *[p] * (frozen_gains.COMPARED - len(vectors))]
-        inputs = np.stack([self._inputs(run, p, lane) for lane in lanes], axis=-1)
-        e = np.zeros((run.per_sigma.size, len(lanes)))
-        frozen_gains.mean_pass_of_lanes(
-            self.compiled, kalman.RunData(self.intervals[i], run.inputs, run.record.z), inputs,
-            self.starts[i][0], np.ascontiguousarray(np.transpose(lanes)),
-            kalman.Gains(run.gains, run.per_sigma, run.H), self._refresh[i], e,
-        )  # fmt: skip
-        with np.errstate(invalid="ignore"):  # a mean that diverges
-            return e[:, 1 : 1 + len(vectors)] - e[:, :1]
 
     def descend(
         self,

@@ -90,65 +90,6 @@ def mean_pass(model, run, x0, p, gains, refresh, e):
     return True
 
 
-COMPARED = SIMD_WIDTH - 1
-"""Vehicles that `mean_pass_of_lanes` flies beside the one that they are compared with."""
-
-
-@compiled(
-    types.void(MODEL, RUN_DATA, float64[:, :, ::1], _A, _M, GAINS, int64, _M),
-    makes_arrays=True, **REORDER,
-)  # fmt: skip
-def mean_pass_of_lanes(model, run, u, x0, p, gains, refresh, e):
-    """`mean_pass` of SIMD_WIDTH vehicles side by side, one of which is to be compared with the others.
-
-    Steps are Heun's, of second order, with the actuators' drift as it is, exact.
-
-    Args:
-        model: a CompiledModel with lanes. run: RunData, its inputs not used. x0: (nx,) first state.
-        u: (n, nu, SIMD_WIDTH) inputs, p: (np, SIMD_WIDTH) parameters, of each vehicle.
-        gains, refresh: of the filter pass. e: (readings, SIMD_WIDTH) whitened innovations, out.
-    """
-    n, m = run.z.shape
-    nx = x0.size
-    states, predicted = aligned(nx, SIMD_WIDTH), aligned(nx, SIMD_WIDTH)
-    drift, later = aligned(nx + m, SIMD_WIDTH), aligned(nx + m, SIMD_WIDTH)
-    left, work = aligned(1, SIMD_WIDTH), aligned(model.work_size, SIMD_WIDTH)
-    x, before, residual = simd_blocks(states), simd_blocks(predicted), simd_blocks(left)
-    d, d_later, whitened = simd_blocks(drift), simd_blocks(later), simd_blocks(e)
-    H = with_places(aligned(m, padded(nx)), nx)
-    in_every_lane(x0, states)
-    reading = np.uint64(0)
-    for k in range(n):
-        if k % refresh == 0:
-            unpack(gains.H, k // refresh, H)
-        model.measure_of_lanes(states, u[k], p, work, drift)
-        for j in range(np.uint64(nx)):
-            before[j] = x[j]
-        for i in range(m):
-            if math.isnan(run.z[k, i]):
-                continue
-            for lane in range(SIMD_WIDTH):
-                left[0, lane] = run.z[k, i] - drift[i, lane]
-                if model.wraps[i]:
-                    left[0, lane] = wrap_angle(left[0, lane])
-            v = residual[np.uint64(0)]
-            for c in range(H.counts[i]):
-                a = np.uint64(H.places[i, c])
-                v -= H.values[i, a] * (x[a] - before[a])
-            whitened[reading] = v * gains.per_sigma[reading]
-            for j in range(np.uint64(nx)):
-                x[j] += float64(gains.K[reading, j]) * v
-            reading += np.uint64(1)
-        if k == n - 1:
-            break
-        model.drift_of_lanes(states, u[k], run.dt[k], p, work, drift)
-        for j in range(np.uint64(nx)):
-            before[j] = x[j] + d[j]
-        model.drift_of_lanes(predicted, u[k], run.dt[k], p, work, later)
-        for j in range(np.uint64(nx)):
-            x[j] += d[j] if model.exact[j] else 0.5 * (d[j] + d_later[j])
-
-
 class Moves(NamedTuple):
     """The parameters whose signatures are wanted, k of them, each moved by itself.
 
@@ -185,6 +126,8 @@ class _Signatures(NamedTuple):
     dv: Any  # derivatives of the row's innovations (m, width)
     base: Any  # drift and readings (nx + m,) of no move
     here: Any  # and of one
+    h_base: Any  # readings (m,) of no move
+    h_here: Any
     work: Any  # the model's scratch
     lanes: Any  # kalman.Lanes
     groups: (
@@ -202,34 +145,34 @@ PORTION = types.NamedUniTuple(int64, 3, Portion)
 def _effects_in_lanes(row, model, dt, trace, moves, w):
     """`_effects_of_moves`, SIMD_WIDTH at once; after the last parameter comes none moved."""
     count, blocks = moves.steps.size, np.uint64(w.per_step.size // SIMD_WIDTH)
-    u, lanes = moves.u[0, row], w.lanes
+    state, u, lanes = trace.states[row], moves.u[0, row], w.lanes
     out, dv, added = simd_blocks(lanes.out), simd_blocks(w.dv), simd_blocks(w.b)
     per_step = simd_blocks(w.per_step)
-    m, nx = np.uint64(w.dv.shape[0]), np.uint64(w.b.shape[0])
+    m, nx = np.uint64(w.dv.shape[0]), np.uint64(state.size)
     in_every_lane(u, lanes.u)
-    in_every_lane(trace.path.predicted[row], lanes.x)
-    for g in range(w.groups.shape[0]):
-        first = g * SIMD_WIDTH
-        last = min(first + SIMD_WIDTH, count)
-        same = True
-        for k in range(first, last):
-            same &= moves.u_of[k] == 0
-        if not same:
+    for drifts in range(2):
+        in_every_lane(state if drifts else trace.path.predicted[row], lanes.x)
+        for g in range(w.still if drifts else 0, w.groups.shape[0]):
+            first = g * SIMD_WIDTH
+            last = min(first + SIMD_WIDTH, count)
+            same = True
             for k in range(first, last):
-                for i in range(u.size):
-                    lanes.u[i, k - first] = moves.u[moves.u_of[k], row, i]
-        at, readings = np.uint64(g), np.uint64(0)
-        if g < w.still:
-            model.measure_of_lanes(lanes.x, lanes.u, w.groups[g], lanes.work, lanes.out)
-        else:
-            model.drift_of_lanes(lanes.x, lanes.u, dt, w.groups[g], lanes.work, lanes.out)
-            readings = nx
-            for i in range(nx):
-                added[i * blocks + at] = out[i]
-        for i in range(m):
-            dv[i * blocks + at] = out[readings + i]
-        if not same:
-            in_every_lane(u, lanes.u)
+                same &= moves.u_of[k] == 0
+            if not same:
+                for k in range(first, last):
+                    for i in range(u.size):
+                        lanes.u[i, k - first] = moves.u[moves.u_of[k], row, i]
+            at = np.uint64(g)
+            if drifts:
+                model.drift_of_lanes(lanes.x, lanes.u, dt, w.groups[g], lanes.work, lanes.out)
+                for i in range(nx):
+                    added[i * blocks + at] = out[i]
+            else:
+                model.measure_of_lanes(lanes.x, lanes.u, w.groups[g], lanes.work, lanes.out)
+                for i in range(m):
+                    dv[i * blocks + at] = out[i]
+            if not same:
+                in_every_lane(u, lanes.u)
     for i in range(m):
         base = w.dv[i, count]
         for b in range(blocks):
@@ -261,16 +204,19 @@ def _groups_of(moves, p):
 
 @compiled(**REORDER)
 def _effects_of_moves(row, model, dt, trace, p, moves, w):
-    """dv = -dh/dp and b at the predicted state, of one row."""
-    predicted, nx = trace.path.predicted[row], trace.states.shape[1]
-    model.drift_and_readings(predicted, moves.u[0, row], dt, p, w.work, w.base)
+    """dv = -dh/dp at the predicted state and b at the filtered one, of one row."""
+    predicted, state, u = trace.path.predicted[row], trace.states[row], moves.u[0, row]
+    m, nx = w.h_base.size, state.size
+    model.measure(predicted, u, p, w.work, w.h_base)
+    model.drift_and_readings(state, u, dt, p, w.work, w.base)
     for k in range(moves.steps.size):
         per_step = 1.0 / moves.steps[k]
         u = moves.u[moves.u_of[k], row]
-        model.drift_and_readings(predicted, u, dt, moves.p[k], w.work, w.here)
-        for i in range(w.dv.shape[0]):
-            w.dv[i, k] = (w.base[nx + i] - w.here[nx + i]) * per_step
+        model.measure(predicted, u, moves.p[k], w.work, w.h_here)
+        for i in range(m):
+            w.dv[i, k] = (w.h_base[i] - w.h_here[i]) * per_step
         if not moves.reading_only[k]:
+            model.drift_and_readings(state, u, dt, moves.p[k], w.work, w.here)
             for i in range(nx):
                 w.b[i, k] = (w.here[i] - w.base[i]) * per_step
 
@@ -323,9 +269,11 @@ def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channe
 
         dv = -(dh/dp + H s),   s += K dv  for one reading after the other,   s <- F (s + b/2) + b/2
 
-    where one look at the rates at the predicted state gives dh/dp and b, as it gives the filter's own
-    Jacobians (the sensitivity equations). A state that the drift takes exactly becomes F s + b. At the
-    filtered state dh/dp would follow the innovation that it is compared with.
+    where `measure` at the predicted state gives dh/dp and the drift at the filtered one b (the
+    sensitivity equations). A state that the drift takes exactly becomes F s + b.
+
+    One state alone would not do for both: b at the predicted state lacks what the row's readings
+    correct, and dh/dp at the filtered one would follow the innovation that it is compared with.
 
     Args:
         model: a CompiledModel. dt: (n,) seconds from each row to the next.
@@ -344,7 +292,7 @@ def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channe
     w = _Signatures(
         s=s, b=aligned(nx, width), half=aligned(nx, width),
         before=aligned(nx, width), dv=aligned(m, width),
-        base=np.zeros(nx + m), here=np.zeros(nx + m),
+        base=np.zeros(nx + m), here=np.zeros(nx + m), h_base=np.zeros(m), h_here=np.zeros(m),
         work=np.zeros(model.work_size),
         lanes=lanes_of(nx, moves.u.shape[2], p, scratch, m),
         groups=groups, per_step=aligned(1, width)[0], still=still,
