@@ -42,6 +42,9 @@ def test_a_hedge_leaves_what_the_file_says_of_a_lag():
     values = lqr.hedged(known, lqr.HEDGE).values()
     assert (values["motor_lag.upper"], values["motor_lag.lower"]) == (0.03, 0.01)
     assert values["servo_lag.time"] == lqr.HEDGE["servo_lag.time"]
+    late = lqr.hedged(LAMA.with_effect("command_delay", time=0.03), lqr.HEDGE)
+    assert late.values()["motor_lag.upper"] == pytest.approx(lqr.HEDGE["motor_lag.upper"] - 0.03)
+    assert "servo_lag" not in late.effects
     assert lqr.hedged(LAMA, {}) is LAMA or lqr.hedged(LAMA, {}).values() == LAMA.values()
 
 
