@@ -15,7 +15,7 @@ import numpy as np
 
 from coax_env.env import hover
 from coax_env.env.actions import Nominal
-from coax_env.env.period import DT
+from coax_env.env.period import DELAYS, DT
 from coax_env.errors import InputError
 from coax_env.model.vehicle import Parameter, Vehicle
 from coax_env.model.vehicle_file import load_vehicle
@@ -84,17 +84,21 @@ def hedged(vehicle: Vehicle, lags: Mapping[str, float]) -> Vehicle:
     """A vehicle to design on: with lags of its actuators where its file names none.
 
     A loop closed on them rolls off before the lags that a machine may have: they are the low-pass in
-    its inputs. What the file itself says of a lag stays as it is.
+    its inputs. What the file itself says of a lag stays as it is, and a delay that it names is part of
+    the hedge: the design takes it for a lag.
 
     Args:
         vehicle: what is known.
         lags: parameter -> time [s], such as HEDGE.
     """
-    known = vehicle.effects
-    lacking = {name: lag for name, lag in lags.items() if name.split(".")[0] not in known}
-    return vehicle.with_parameters(
-        {name: Parameter(lag, 0.0, "s", "a hedge, not measured") for name, lag in lacking.items()}
-    )
+    known = vehicle.values()
+    late, swash_later = (known.get(name, 0.0) for name in DELAYS)
+    own = {}
+    for name, lag in lags.items():
+        left = lag - late - (swash_later if name.startswith("servo") else 0.0)
+        if left > 0.0 and name.split(".")[0] not in vehicle.effects:
+            own[name] = Parameter(left, 0.0, "s", "a hedge, not measured")
+    return vehicle.with_parameters(own)
 
 
 def quadratic_cost(

@@ -20,6 +20,7 @@ from coax_env.env import hover
 from coax_env.env.actions import Nominal, action_map
 from coax_env.env.period import DT
 from coax_env.errors import InputError
+from coax_env.model import state as S
 from coax_env.model.dynamics import hover_trim
 from coax_env.model.sensors import suite
 from coax_env.model.vehicle import Vehicle
@@ -148,11 +149,14 @@ def design(vehicle: str | Vehicle, nominal: Nominal = None, sensors: str = "onbo
     """The cascade about a vehicle's trim; nothing else of the vehicle is used.
 
     Args:
-        vehicle: whose hover trim is fed forward.
+        vehicle: whose hover trim, commands and tilt, is fed forward.
         nominal: vehicle whose trim centres the action, as in the env (default: the bare one).
         sensors: suite that it is given; must measure rates, attitude, height and velocity.
     """
     vehicle = load_vehicle(vehicle)
     trim, scale = action_map(vehicle, nominal)
-    feedforward = (hover_trim(vehicle, hover.HEIGHT)[1] - trim) / scale
+    state, command = hover_trim(vehicle, hover.HEIGHT)
+    feedforward = (command - trim) / scale
+    # the tilt that it hovers with, which its loops would else take for an error
+    feedforward[2:] += Gains().tilt * state[[S.THETA, S.PHI]]
     return PID(vehicle.name, sensors, trim, scale, feedforward=feedforward)

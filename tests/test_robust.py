@@ -42,6 +42,9 @@ def test_a_hedge_leaves_what_the_file_says_of_a_lag():
     values = lqr.hedged(known, lqr.HEDGE).values()
     assert (values["motor_lag.upper"], values["motor_lag.lower"]) == (0.03, 0.01)
     assert values["servo_lag.time"] == lqr.HEDGE["servo_lag.time"]
+    late = lqr.hedged(LAMA.with_effect("command_delay", time=0.03), lqr.HEDGE)
+    assert late.values()["motor_lag.upper"] == pytest.approx(lqr.HEDGE["motor_lag.upper"] - 0.03)
+    assert "servo_lag" not in late.effects
     assert lqr.hedged(LAMA, {}) is LAMA or lqr.hedged(LAMA, {}).values() == LAMA.values()
 
 
@@ -174,3 +177,23 @@ def test_a_plan_is_no_dearer_than_clipped_lqg_and_keeps_the_bounds(mpc, lqg):
         costs.append(cost + x @ lqg.cost_to_go @ x)
     assert mpc.solved > 5
     assert costs[0] <= 1.001 * costs[1]
+
+
+# --- PID --------------------------------------------------------------------------------------------
+
+
+def test_a_cascade_at_its_trim_asks_for_its_trim():
+    """Where the centre of gravity is off it hovers tilted; the loops must not steer against that."""
+    from coax_env.model.sensors import suite
+    from coax_env.model.trim import trim
+    from controllers import pid
+
+    heavy_nose = LAMA.with_effect("cg_offset", x=0.004, y=-0.003)
+    controller = pid.design(heavy_nose, LAMA)
+    state, command = trim(heavy_nose)
+    at_rest = {"phi": state[10], "theta": state[11], "h": 1.5}
+    seen = [at_rest.get(sensor.name, 0.0) for sensor in suite("onboard")]
+    seen += [1.0] * (18 - len(seen))
+    asked = controller.action_trim + controller.action_scale * controller.act(np.array(seen))
+    assert np.abs(state[10:12]).min() > 0.003
+    np.testing.assert_allclose(asked, command, rtol=1e-4, atol=1e-4)

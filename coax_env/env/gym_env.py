@@ -170,7 +170,8 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     - ``control_rate``: 100 Hz, or that over a whole number: 50, 25, 20, 10 ... An action is then held
       for so many periods of 0.01 s, rewards are their sum, flags tell of any new reading among
       them; readings, physics and turbulence stay at 100 Hz, and the 2000 steps of the time limit last
-      longer.
+      longer. No more than 100 Hz: rates, delays and dropout of the sensors, the batch's rows and the
+      filters' gains are counted in periods of 0.01 s, the paper's log.
 
     Actions that mean rates and thrust, or a velocity: `controllers.action_levels`.
 
