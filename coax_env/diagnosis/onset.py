@@ -24,7 +24,6 @@ from coax_env.diagnosis.confounding import alternatives
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, without_drifts
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
-from coax_env.diagnosis.scores import score
 from coax_env.diagnosis.search import search
 from coax_env.estimation.beginnings import Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
@@ -42,6 +41,8 @@ NEVER_BEGINS = frozenset(
 """What belongs to air, ground and battery, and laws of motion and flow that no damage changes."""
 SPACING = 0.1
 """s between the moments that are scored at once; ours."""
+MOST_MOMENTS = 600
+"""On long flights they are farther apart than that; ours, a bound on time."""
 MARGIN = 1.5
 """s from the first row of all, and to the last, in which nothing begins: the filter settles in one, and
 what lasts a second cannot be told from a gust; ours."""
@@ -178,10 +179,11 @@ def _own(problem: Problem, effect: str) -> list[str]:
 
 def rows_of(records: Sequence[Record]) -> list[np.ndarray]:
     """Rows of each record at which something may begin: its first one, and every SPACING later on."""
+    spacing = max(SPACING, sum(float(r.t[-1] - r.t[0]) for r in records) / MOST_MOMENTS)
     found = []
     for i, record in enumerate(records):
         t = record.t
-        times = np.arange(t[0] + SETTLED, t[-1], SPACING)
+        times = np.arange(t[0] + SETTLED, t[-1], spacing)
         if i > 0:
             times = np.append(t[0], times)
         else:
@@ -332,7 +334,8 @@ def _worth(
     Minus infinity where a gust could have made it, or where it is too small to matter.
     """
     effect = found.effect
-    same = fitted(state.problem, replace(state.fit, noise=trial.noise), steps=2)
+    same = replace(state.fit, noise=trial.noise)
+    same = fitted(state.problem, noise_fitted(state.problem, same), steps=2)
     if state.fit.objective < same.objective:
         same = state.fit
     extra = _extra(problem, effect)
@@ -341,7 +344,11 @@ def _worth(
     price = quadratic.occam(extra, others) + math.log(_seconds(problem) / found.width)
     nats = (same.objective - trial.objective) / inflation - price
     if effect not in state.fit.active:  # one that was always there is preferred
-        nats -= max(score(state.problem, state.quadratic, state.fit.active, effect).nats, 0.0)
+        own = {n: trial.values[n] for n in extra}
+        always = replace(state.fit.at(own), active=trial.active, noise=trial.noise)
+        always = fitted(state.problem, noise_fitted(state.problem, always), steps=2)
+        gained = (always.objective - trial.objective) / inflation
+        nats = min(nats, gained - math.log(_seconds(problem) / found.width))
     lasting = _lasting(
         state.problem, replace(same, noise=trial.noise), problem, trial, found.moment
     )
