@@ -281,6 +281,9 @@ def cause_line(cause: Mapping[str, Any]) -> str:
         for name, p in cause["parameters"].items()
     )
     line = f"  {cause['effect']}: {values}; {cause['evidence']:.0f} nats"
+    if cause.get("since"):
+        moment = cause["since"]
+        line += f"; since {moment['t']:.2f} +- {moment['std']:.2g} s of {moment['run']}"
     if cause["confusable_with"]:
         line += f"; confounded alternatives: {', '.join(cause['confusable_with'])}"
     if cause["doubts"]:

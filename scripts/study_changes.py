@@ -1,11 +1,13 @@
-"""How often is a comparison right? Pairs of flights with known changes, or none, flown and counted."""
+"""How often is a comparison right, how often an onset? Flights with known changes, or none, counted."""
 
 import argparse
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import command_line
-from study import pairs
+from study import onsets, pairs
 from tqdm import tqdm
 
 from coax_env import workers
@@ -22,17 +24,42 @@ def main() -> None:
         for n in range(count)
     ]
     wanted.sort(key=lambda pair: pair.number)
-    paths = {pair.name: options.out / f"{pair.name}.json" for pair in wanted}
-    waiting = [pair for pair in wanted if not paths[pair.name].exists()]
+    in_flight = [
+        onsets.planned(kind, n, options.seed)
+        for n in range(options.onsets)
+        for kind in onsets.KINDS
+    ]
+    if wanted:
+        study(wanted, pairs.fly_and_compare, pairs.text_of, options, options.out / "table.md")
+    if in_flight:
+        table = options.out / "onsets.md"
+        study(in_flight, onsets.fly_and_diagnose, onsets.text_of, options, table)
+
+
+def study(
+    wanted: Sequence[Any],
+    work: Callable[[Any], dict[str, Any]],
+    text_of: Callable[[Sequence[Any]], str],
+    options: argparse.Namespace,
+    table: Path,
+) -> None:
+    """Do what has not been done yet, each to a file of its own, and count all.
+
+    Args:
+        wanted: what is planned, each with its `name`. work: makes a row of one.
+        text_of: the figures of all rows. options: of the command line. table: where these go.
+    """
+    paths = {one.name: options.out / f"{one.name}.json" for one in wanted}
+    waiting = [one for one in wanted if not paths[one.name].exists()]
     try:
-        done = workers.each(pairs.fly_and_compare, waiting, options.jobs, options.backend)
-        for pair, row in tqdm(done, "study", len(wanted), initial=len(wanted) - len(waiting)):
-            write_json(paths[pair.name], row)
+        done = workers.each(work, waiting, options.jobs, options.backend)
+        for one, row in tqdm(done, "study", len(wanted), initial=len(wanted) - len(waiting)):
+            write_json(paths[one.name], row)
     finally:
         rows = [json.loads(p.read_text(encoding="utf-8")) for p in paths.values() if p.exists()]
         if rows:
-            write_text(options.out / "table.md", pairs.text_of(rows))
-    print((options.out / "table.md").read_text(encoding="utf-8"))
+            write_text(table, text_of(rows))
+    print(table.read_text(encoding="utf-8"))
 
 
 def arguments() -> argparse.Namespace:
@@ -41,9 +68,14 @@ def arguments() -> argparse.Namespace:
     parser.set_defaults(out=Path("runs/study_changes"))
     parser.add_argument("--same", type=int, default=100, help="pairs of one and the same machine")
     parser.add_argument("--changed", type=int, default=100, help="pairs with one change")
+    parser.add_argument(
+        "--onsets", type=int, default=0, metavar="N",
+        help="flights in which something begins, and as many constant and clean ones",
+    )  # fmt: skip
     command_line.add_workers(parser, "pairs", -1)
     options = parser.parse_args()
-    if min(options.same, options.changed) < 0 or options.same + options.changed == 0:
+    counts = (options.same, options.changed, options.onsets)
+    if min(counts) < 0 or sum(counts) == 0:
         raise InputError("a study needs at least one pair")
     return options
 

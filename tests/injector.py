@@ -23,6 +23,7 @@ Its usual sizes belong in ``scripts/study/plan.py``.
 """
 
 import argparse
+import copy
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -591,8 +592,25 @@ def _wrap(angle):
 
 
 @njit(cache=True)
-def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden, craft, rotors):
+def _fly(
+    clock,
+    dt,
+    step,
+    targets,
+    trusts,
+    extra,
+    tremor,
+    pushes,
+    pilot,
+    early,
+    craft,
+    rotors,
+    at_last,
+    begins,
+):
     """Fly the rows of a clock; returns the commands and true readings of all of them.
+
+    Hidden is ``early``, and ``at_last`` from ``begins`` [s] on.
 
     Readings: 0-1 rotor speeds, 2-4 rates, 5-7 accelerometers, 8-10 attitude, 11-13 position,
     14-16 velocity, 17 cosine of the tilt. ``clock``: (rows,) s, the log begins at 0. ``dt``: (rows,)
@@ -615,8 +633,9 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, pushes, pilot, hidden,
     saw = np.empty((rows, 12))
     behind = int(round(pilot.delay / step))
     wanted = np.zeros(4)
-    inertia = craft.inertia_z * (1.0 + hidden.yaw_inertia)
     for k in range(rows):
+        hidden = early if clock[k] < begins - 1e-9 else at_last
+        inertia = craft.inertia_z * (1.0 + hidden.yaw_inertia)
         R = _rotation(s)
         attitude = _euler(R)
         saw[k, 0:6] = s[0:6]
@@ -813,6 +832,8 @@ def fly(
     known_as: Craft | None = None,
     card_noise: float | None = 1.0,
     longest: float = math.inf,
+    later: Mapping[str, Mapping[str, float] | float] | None = None,
+    since: tuple[str, float] = ("", 0.0),
 ) -> Path:
     """Write a flight with these effects hidden, and what they were in ``truth.json``.
 
@@ -826,19 +847,29 @@ def fly(
         pilot: a key of ``PILOTS``.
         card_noise: factor by which the card's noise is wrong; None: the card has none.
         longest: s at which a run ends.
+        later, since: effects that are there from a moment (run, s) on, to the end of the last run; of
+            readings and of what acts at once, not of a pose that is late.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     air = gusts if isinstance(gusts, Air) else GUSTY if gusts else STILL
     values = chosen_values(effects)
     hidden = Hidden(**{EFFECTS[e][p][0]: value for (e, p), value in values.items()})
+    values |= chosen_values(later or {})
+    at_last = Hidden(**{EFFECTS[e][p][0]: value for (e, p), value in values.items()})
     kit = SENSORS[sensors]
     names = list(MANEUVERS) if runs is None else list(runs)
     for i, name in enumerate(names):
         rng = np.random.default_rng([seed, list(MANEUVERS).index(name)])
         length = min(MANEUVERS[name], longest)
-        columns = _fly_run(name, length, hidden, air, kit, craft, PILOTS[pilot], rng)
-        columns = _read(columns, kit, hidden, rng)
+        if name == since[0]:
+            begins, stages = since[1], (hidden, at_last)
+        else:
+            gone_by = bool(since[0]) and i > names.index(since[0])
+            begins, stages = math.inf, (at_last if gone_by else hidden,) * 2
+        columns = _fly_run(name, length, stages[0], air, kit, craft, PILOTS[pilot], rng,
+                           stages[1], begins)  # fmt: skip
+        columns = _read_from(columns, kit, stages, begins, rng)
         columns = thin(
             columns, kit, rng, lost_echoes=lost_echoes, radio_gaps=radio_gaps, first=i == 0
         )
@@ -853,7 +884,8 @@ def fly(
     (folder / "card.toml").write_text(card)
     full = {f"{effect}.{parameter}": value for (effect, parameter), value in values.items()}
     truth = {
-        "hidden": list(effects),
+        "hidden": [*effects, *(later or {})],
+        "since": list(since) if later else None,
         "values": full,
         "comparable": {name: value for name, value in full.items() if name not in OTHER_FORM},
         "gusts": air.gusts != "none",
@@ -903,8 +935,13 @@ def _fly_run(
     craft: Craft,
     pilot: Pilot,
     rng: np.random.Generator,
+    at_last: Hidden | None = None,
+    begins: float = math.inf,
 ) -> dict[str, np.ndarray]:
-    """True readings of a run, `length` s of it, on the sensors' clock."""
+    """True readings of a run, `length` s of it, on the sensors' clock.
+
+    at_last: what is hidden from `begins` [s] on.
+    """
     times = clock(sensors, SETTLE, length, rng)
     dt = np.full(len(times) - 1, sensors.step) if sensors.unrest == 0.0 else np.diff(times)
     rows = len(dt)
@@ -924,7 +961,7 @@ def _fly_run(
     pushes = np.ascontiguousarray(pushes)
     commands, readings = _fly(
         times[:-1], dt, sensors.step, target[at], trust[at], extra[at], tremor, pushes,
-        _suited(pilot, craft), hidden, craft, rotors_of(craft),
+        _suited(pilot, craft), hidden, craft, rotors_of(craft), at_last or hidden, begins,
     )  # fmt: skip
     first = int(np.searchsorted(times, -1e-12))
     logged = readings[first:]
@@ -1015,6 +1052,22 @@ def _read(
     blunt(columns, sensors, rng)
     columns["psi"] = (columns["psi"] + np.pi) % (2.0 * np.pi) - np.pi
     return {c: x for c, x in columns.items() if c in COMMANDED or c in sensors.noise}
+
+
+def _read_from(
+    columns: dict[str, np.ndarray],
+    sensors: Sensors,
+    stages: tuple[Hidden, Hidden],
+    begins: float,
+    rng: np.random.Generator,
+) -> dict[str, np.ndarray]:
+    """`_read` with the first of two stages until `begins` [s], then with the second."""
+    if begins == math.inf:
+        return _read(columns, sensors, stages[0], rng)
+    same_noise = copy.deepcopy(rng)
+    early = _read({c: x.copy() for c, x in columns.items()}, sensors, stages[0], same_noise)
+    late = _read(columns, sensors, stages[1], rng)
+    return {c: np.where(late["t"] < begins - 1e-9, early[c], x) for c, x in late.items()}
 
 
 def _misplace(columns: dict[str, np.ndarray], hidden: Hidden) -> None:

@@ -1,19 +1,14 @@
 """Which changes do two flights show? Forward by the quadratic, accepted by a refit, and backward."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from coax_env.comparison.candidates import Numbers, Score, best_first, scored
-from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted
+from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, short_memories
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import scores
 from coax_env.estimation.engine import objective
-from coax_env.estimation.helicopter_noise import MEMORIES
-from coax_env.estimation.parted_engine import AT
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.state_space import Noise
-from coax_env.model.effect_registry import GUST_MEMORY
 
 MOST_CHANGES = 5
 """Ours; a bound on time."""
@@ -21,22 +16,6 @@ TRIED = 3
 """Changes that are fitted at once, the best by the quadratic first; ours."""
 WORTH_A_FIT = 2.0
 """nats by the quadratic from which a change is fitted; ours."""
-
-
-def short_memories(noise: Noise) -> Noise:
-    """Gusts with no longer memories than usual, shaken as much per second.
-
-    Gusts that were fitted without a change have taken up a part of it, as a push that lasts: a mass
-    that is 6 % less was worth 3 nats then.
-    """
-    levels = {}
-    for name, memory in noise.process.items():
-        plain_name, at, part = name.partition(AT)
-        if plain_name in MEMORIES and memory > GUST_MEMORY:
-            gusts = plain_name.removeprefix("memory_") + at + part
-            levels[name] = GUST_MEMORY
-            levels[gusts] = noise.process[gusts] * math.sqrt(GUST_MEMORY / memory)
-    return noise.with_levels(levels)
 
 
 @dataclass(frozen=True)

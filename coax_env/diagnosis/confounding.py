@@ -49,6 +49,7 @@ def alternatives(
     quadratic: Quadratic,
     evidence: Mapping[str, Evidence],
     white: Mapping[str, Whiteness],
+    of: Sequence[str] | None = None,
 ) -> dict[str, dict[str, Fit]]:
     """The confounded alternatives of every cause.
 
@@ -57,6 +58,7 @@ def alternatives(
         quadratic: linearised at the fit.
         evidence: of each cause.
         white: whiteness of the innovations, by channel.
+        of: the causes; default all.
     """
 
     def of_one(effect: str) -> dict[str, Fit]:
@@ -64,7 +66,7 @@ def alternatives(
         factor = max([evidence[effect].inflation, *inflations])
         return _of_one(problem, fit, quadratic, effect, factor, evidence[effect].lost)
 
-    return problem.for_each(of_one, fit.active)
+    return problem.for_each(of_one, fit.active if of is None else of)
 
 
 def _of_one(

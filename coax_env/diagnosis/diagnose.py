@@ -3,7 +3,7 @@
 Data flow::
 
     flight -> runs to fit, runs held out (hold_out.py)
-    runs to fit -> problem and first fit -> search -> generic terms -> input innovations
+    runs to fit -> problem and first fit -> search -> onsets -> generic terms -> input innovations
         -> evidence -> confounded alternatives -> findings
     held-out runs -> replay with the vehicle as given, refitted, corrected -> gain with its interval
     all runs -> refit of the same structure -> corrected vehicle file
@@ -35,6 +35,7 @@ from coax_env.diagnosis.input_innovations import (
     with_input_innovations,
 )
 from coax_env.diagnosis.model_check import model_check
+from coax_env.diagnosis.onset import beside_onsets, moments_of, with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import one_step_against_a_second, remarks, vibration_removed
 from coax_env.diagnosis.searched import searched
@@ -155,7 +156,8 @@ def diagnose(
     first = searched(problem, noise)
     problem, bare, refitted = first.problem, first.bare, first.refitted
     passes_before = problem.engine.filter(bare.values, bare.noise)
-    problem, fit, quadratic, terms = unlisted.explain(problem, first.fit, first.quadratic)
+    state = with_onsets(problem, first.fit, first.quadratic, refitted, flight.run_names)
+    problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
     report("weighing the causes against their confounded alternatives")
     problem, fit = with_command_gains(beside_large_axes(problem, fit), fit)
     fit, quadratic, evidence = prune(problem, fit)
@@ -164,10 +166,12 @@ def diagnose(
         "before": whiteness(passes_before, CHANNELS),
         "after": whiteness(passes_after, CHANNELS),
     }
+    onsets = moments_of(problem, fit, evidence, state.onsets)
     found = confounding.alternatives(problem, fit, quadratic, evidence, white["after"])
+    found |= beside_onsets(problem, fit, evidence, white["after"], onsets)
     report("asking left-out runs, halves and other noise whether the names hold")
     trust = trusts(problem, fit, quadratic, evidence, found, white["after"])
-    causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines)
+    causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)
     unexplained = described + findings.unexplained(white["after"], speaking_for)

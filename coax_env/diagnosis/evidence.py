@@ -7,7 +7,6 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.model import effects
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ def weigh(problem: Problem, fit: Fit, quadratic: Quadratic) -> dict[str, Evidenc
     chosen = problem.settings
 
     def one(effect: str) -> Evidence:
-        held = effects.CATALOGUE[effect].replaces
+        held = tuple(problem.file_values(effect))
         factor = inflation(problem, quadratic, fit.active, effect)
         rest = noise_fitted(problem, without(problem, fit, quadratic, effect))
         rest = fitted(problem, rest, steps=1, held=held)

@@ -8,12 +8,15 @@ import numpy as np
 
 from coax_env.diagnosis.confounding import Alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
+from coax_env.diagnosis.onset import Onset
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.trust import Trust, of_line
 from coax_env.diagnosis.vibration import Line
+from coax_env.estimation.changing_model import BEFORE
 from coax_env.estimation.engine import RunPass
 from coax_env.estimation.fitted_vehicle import median_step, with_timing
 from coax_env.estimation.helicopter_noise import level_unit
+from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.whiteness import Whiteness
@@ -30,8 +33,12 @@ def causes(
     found: Alternatives,
     trust: Mapping[str, Trust],
     lines: Sequence[Line],
+    onsets: Mapping[str, Onset] | None = None,
 ) -> list[dict[str, Any]]:
     """The causes: those that are sure before those that are doubtful, each strongest first.
+
+    One that began or changed in flight has its `since`; its numbers are those after that moment, and
+    where it was there before, those before it too, as `before`.
 
     Args:
         problem, fit: with the causes.
@@ -40,24 +47,32 @@ def causes(
         found: the confounded alternatives of each cause.
         trust: what speaks for and against each name.
         lines: of a vibration that the vehicle file does not have.
+        onsets: of causes that began or changed.
     """
+    onsets = onsets or {}
     free = problem.free_names(fit.active)
     std = dict(zip(free, np.sqrt(np.diag(quadratic.covariance(free))), strict=True))
     dt = median_step(problem.engine.records)
     entries: list[dict[str, Any]] = []
+
+    def number(f: FreeParameter, inflation: float) -> dict[str, float]:
+        spread = stated_std(fit, f, std[f.name], inflation, dt)
+        return {"value": float(fit.values[f.name]), "std": spread}
+
     for effect in fit.active:
-        own = zip(problem.own[effect], effects.CATALOGUE[effect].fitted, strict=True)
+        known = {f.name: f for f in problem.own[effect]}
+        last = [f for f in known.values() if AT not in f.name]
+        factor = evidence[effect].inflation
         entries.append(
             {
                 "effect": effect,
                 "parameters": {
                     f.name: {
-                        "value": float(fit.values[f.name]),
-                        "std": stated_std(fit, f, std[f.name], evidence[effect].inflation, dt),
+                        **number(f, factor),
                         "unit": p.unit,
                         "determined": trust[effect].determined[f.name],
                     }
-                    for f, p in own
+                    for f, p in zip(last, effects.CATALOGUE[effect].fitted, strict=True)
                 },
                 "evidence": evidence[effect].nats,
                 "confusable_with": [*found[effect], *effects.found_by_the_name_of(effect)],
@@ -65,6 +80,10 @@ def causes(
                 **trust[effect].entries(),
             }
         )
+        if effect in onsets:
+            earlier = {f.name: known.get(of_part(f.name, BEFORE)) for f in last}
+            entries[-1]["since"] = onsets[effect].entry()
+            entries[-1]["before"] = {n: number(f, factor) for n, f in earlier.items() if f}
     if lines:
         entries.append(_vibration(lines))
     return sorted(mixtures_as_one(entries), key=lambda c: (c["trust"] != "sure", -c["evidence"]))

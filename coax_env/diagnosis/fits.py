@@ -8,11 +8,12 @@ import numpy as np
 
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import NoiseScore, RunPass, objective
-from coax_env.estimation.helicopter_noise import LATENT_START, fitted_levels
+from coax_env.estimation.helicopter_noise import LATENT_START, MEMORIES, TRIM_LEVELS, fitted_levels
 from coax_env.estimation.noise_levels import fit_noise, level_slopes
-from coax_env.estimation.parted_engine import PartedEngine, joint_noise, of_part
+from coax_env.estimation.parted_engine import AT, PartedEngine, joint_noise, of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
+from coax_env.model.effect_registry import GUST_MEMORY
 
 
 def start(problem: Problem, noise: Noise, held: Collection[str] = ()) -> Fit:
@@ -200,6 +201,32 @@ def with_latent_noise(problem: Problem, fit: Fit) -> Fit | None:
         return None
     problem.report(f"{', '.join(asked)} beside the gusts: {gained:.1f} nats")
     return replace(fit, noise=noise, levels=levels)
+
+
+def short_memories(noise: Noise) -> Noise:
+    """Gusts with no longer memories than usual, shaken as much per second.
+
+    Gusts that were fitted without a change have taken up a part of it, as a push that lasts: a mass
+    that is 6 % less was worth 3 nats then.
+    """
+    levels = {}
+    for name, memory in noise.process.items():
+        plain_name, at, part = name.partition(AT)
+        if plain_name in MEMORIES and memory > GUST_MEMORY:
+            gusts = plain_name.removeprefix("memory_") + at + part
+            levels[name] = GUST_MEMORY
+            levels[gusts] = noise.process[gusts] * math.sqrt(GUST_MEMORY / memory)
+    return noise.with_levels(levels)
+
+
+def without_drifts(fit: Fit) -> Fit:
+    """With noise that cannot take up what changes: no trims that drift, and gusts of short memory.
+
+    Values stay.
+    """
+    drifts = [n for n in fit.levels if n in TRIM_LEVELS]
+    noise = short_memories(fit.noise.with_levels({n: fit.noise.floor[n] for n in drifts}))
+    return replace(fit, noise=noise, levels=tuple(n for n in fit.levels if n not in drifts))
 
 
 def _score(problem: Problem, fit: Fit, score: NoiseScore, name: str) -> float:

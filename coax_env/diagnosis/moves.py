@@ -116,13 +116,14 @@ def trials(
     weak = untried(
         c.effect
         for c in candidates
-        if least < c.evidence <= chosen.evidence and not effects.CATALOGUE[c.effect].replaces
+        if least < c.evidence <= chosen.evidence and not problem.file_values(c.effect)
     )[: chosen.most_trials]
     begin: dict[str, Mapping[str, float]] = {effect: {} for effect in weak}
     dampings = untried(
         e
         for e in problem.candidates
-        if effects.CATALOGUE[e].damps and e not in {*fit.active, *banned, *weak}
+        if effects.CATALOGUE[e].damps
+        and e not in {*fit.active, *banned, *weak, *problem.model.moments}
     )
     gains = problem.for_each(lambda e: damping_gain(problem, fit, quadratic, e), dampings)
     begin |= {e: at for e, (nats, at) in gains.items() if nats > least}
@@ -206,7 +207,7 @@ def _is_worthless(
 
     The quadratic reaches from where the effect stands back to nothing, which is far for a lag.
     """
-    held = effects.CATALOGUE[effect].replaces
+    held = tuple(problem.file_values(effect))
     rest = fitted(problem, without(problem, fit, quadratic, effect), held=held)
     occam = quadratic.occam(problem.acting_names(effect), problem.free_names(rest.active))
     return (rest.objective - fit.objective) / inflation - occam < problem.settings.evidence

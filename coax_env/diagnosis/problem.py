@@ -14,6 +14,7 @@ from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import GUST_LEVELS
+from coax_env.estimation.parted_engine import AT
 from coax_env.estimation.rotor_jitter import REACTION
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.model import effects
@@ -123,7 +124,7 @@ class Problem:
 
     def base_names(self, active: Collection[str]) -> list[str]:
         """Parameters that are free whatever is active, but for those that an active effect replaces."""
-        replaced = {b for e in active for b in effects.CATALOGUE[e].replaces}
+        replaced = {b for e in active for b in self.file_values(e)}
         return [f.name for f in (*self.base, *self.added) if f.name not in replaced]
 
     def free_names(self, active: Collection[str]) -> list[str]:
@@ -136,9 +137,9 @@ class Problem:
         return [f for f in self.parameters if f.name in names]
 
     def free_of_vehicle(self, active: Collection[str]) -> list[FreeParameter]:
-        """Those of them that a vehicle file can hold."""
+        """Those of them that a vehicle file can hold: numbers of the machine as it is at last."""
         of_filter = {*P.COMMAND_GAINS, REACTION.name}
-        return [f for f in self.free(active) if f.name not in of_filter]
+        return [f for f in self.free(active) if f.name not in of_filter and AT not in f.name]
 
     def acting_names(self, effect: str) -> list[str]:
         """An effect's parameters that act as soon as it does (no shapes)."""
@@ -146,8 +147,17 @@ class Problem:
         return [f.name for f in self.own[effect] if f.name.split(".")[1] not in shapes]
 
     def file_values(self, effect: str) -> dict[str, float]:
-        """Values that the base parameters replaced by an effect go back to."""
+        """Values that the base parameters replaced by an effect go back to.
+
+        None where it begins in flight: the base parameter is then what was there before.
+        """
+        if effect in self.model.moments and not self.changes(effect):
+            return {}
         return {b: self.model.bare_values[b] for b in effects.CATALOGUE[effect].replaces}
+
+    def changes(self, effect: str) -> bool:
+        """Whether an effect has other numbers before its moment (changing_model.py)."""
+        return any(AT in f.name for f in self.own.get(effect, ()))
 
     def off_values(self, effect: str) -> dict[str, float]:
         """Values at which an effect is not there."""

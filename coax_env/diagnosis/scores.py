@@ -17,7 +17,9 @@ import numpy as np
 
 from coax_env.diagnosis.fits import at_optimum
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
+from coax_env.estimation.changing_model import BEFORE
 from coax_env.estimation.engine import objective
+from coax_env.estimation.parted_engine import of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.model import effects
 
@@ -96,11 +98,12 @@ def is_large(problem: Problem, effect: str, values: Mapping[str, float]) -> bool
     """
     entry = effects.CATALOGUE[effect]
     sizes = [
-        abs(values[full] - p.off) / p.smallest
+        abs(values[name] - p.off) / p.smallest
         for full, p in zip(entry.names(), problem.model.sized(effect), strict=True)
-        if p.smallest > 0.0
+        for name in (full, of_part(full, BEFORE))
+        if p.smallest > 0.0 and name in values
     ]
-    for base in entry.replaces:
+    for base in problem.file_values(effect):
         old = problem.model.vehicle.parameters[base]
         relative = abs(values[entry.names()[0]])
         relative /= 1.0 if entry.parameters[0].unit == "1" else old.value

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from coax_env.estimation import frozen_gains, kalman, noise_score
+from coax_env.estimation.beginnings import Answers, Beginning
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.sparse import add_gram, aligned, padded
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
@@ -300,7 +301,7 @@ class Engine:
                 edges, before = _block_edges(run)
                 blocks = np.zeros((edges.size - 1, len(free)))
                 if np.isfinite(run.log_likelihood):
-                    work = self._signatures(i, run, at, p, moves, by_channel)
+                    work = self._signatures(i, run, at, p, moves, by_channel)[0]
                     probed = self._probed_signatures(i, run, moves, by_channel)
                     e = run.innovations[np.isfinite(run.innovations)]
                     for first in range(0, edges.size - 1, BLOCKS_AT_ONCE):
@@ -352,16 +353,19 @@ class Engine:
         p: np.ndarray,
         moves: _Moves,
         by_channel: np.ndarray,
-    ) -> Callable[[frozen_gains.Portion, np.ndarray], None]:
+    ) -> tuple[
+        Callable[[frozen_gains.Portion, np.ndarray], None], Callable[[np.ndarray], np.ndarray]
+    ]:
         """Derivatives of a run's whitened innovations where a small step does.
 
         Returns:
             what puts those of a portion of the run, one after the other, into columns of J, and adds
-            their squares, by channel, to rows of `by_channel`.
+            their squares, by channel, to rows of `by_channel`; and what puts the state's derivatives
+            behind that portion into columns of (nx, k).
         """
         columns = np.flatnonzero(~moves.probed)
         if not columns.size:
-            return lambda portion, J: None
+            return lambda portion, J: None, lambda out: out
         columns = columns[np.argsort(~moves.reading_only[columns], kind="stable")]
         vectors = [moves.vectors[k] for k in columns]
         sets, which = [run.inputs], np.zeros(columns.size, np.int64)
@@ -391,7 +395,81 @@ class Engine:
                 by_channel,
             )
 
-        return of_portion
+        def of_state(out: np.ndarray) -> np.ndarray:
+            out[:, columns] = s[:, : columns.size]
+            return out
+
+        return of_portion, of_state
+
+    def beginnings(
+        self,
+        values: Mapping[str, float],
+        noise: Noise,
+        free: Sequence[FreeParameter],
+        rows: Sequence[np.ndarray],
+        work: Callable[[Beginning], Any],
+    ) -> list[list[Any]]:
+        """What free parameters would do if they moved from some row of a run on; see beginnings.py.
+
+        Of a parameter that needs a finite step (`probe`) its past is not taken out of the state.
+
+        Args:
+            values: of all parameters, by name.
+            noise: levels of process and reading noise.
+            free: the parameters.
+            rows: of each record, rising.
+            work: is given each row's Beginning, the last row of a record first.
+
+        Returns:
+            what `work` returned, record by record and row by row.
+        """
+        p = self.model.vector(values, noise)
+        moves = self._moves(values, noise, free)
+
+        def one(i: int) -> list[Any]:
+            with self._borrowed_buffers() as buffers:
+                run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
+                if not np.isfinite(run.log_likelihood):
+                    return []
+                return self._beginnings_of_run(i, run, at, p, moves, rows[i], work)[::-1]
+
+        return self._each(one)
+
+    def _beginnings_of_run(
+        self,
+        i: int,
+        run: RunPass,
+        at: PassJacobians,
+        p: np.ndarray,
+        moves: _Moves,
+        rows: np.ndarray,
+        work: Callable[[Beginning], Any],
+    ) -> list[Any]:
+        k, nx = len(moves.vectors), self.compiled.exact.size
+        there = np.isfinite(run.innovations)
+        before = np.append(0, np.cumsum(there.sum(1)))
+        by_channel = np.zeros((k, there.shape[1]))
+        signatures, derivatives = self._signatures(i, run, at, p, moves, by_channel)
+        edges = np.unique([0, *rows, there.shape[0]])
+        J, states, portions = np.zeros((int(before[-1]), k)), [], []
+        J[:, moves.probed] = self._probed_signatures(i, run, moves, by_channel)
+        for first, last in pairwise(edges):
+            portions.append(frozen_gains.Portion(int(first), int(last), int(before[first])))
+            states.append(derivatives(np.zeros((nx, k))).astype(np.float32))
+            signatures(portions[-1], J[before[first] : before[last]])
+        wild = ~np.isfinite(J).all(0)
+        J[:, wild] = 0.0
+        e = run.innovations[there]
+        answers, slope, own = Answers(nx, k), np.zeros(k), np.zeros((k, k))
+        found = []
+        for portion, s in zip(portions[::-1], states[::-1], strict=True):
+            here = slice(portion.reading, before[portion.last])
+            answers.back(_trace(run, at), self._refresh[i], portion, J[here])
+            slope, own = slope + e[here] @ J[here], own + J[here].T @ J[here]
+            if portion.first in rows:
+                s[:, wild] = 0.0
+                found.append(work(Beginning(i, portion.first, *answers.since(s, slope, own))))
+        return found
 
     def _inputs(self, run: RunPass, p: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """A run's inputs with the parameters `vector`, known those with `p`."""

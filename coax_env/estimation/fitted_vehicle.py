@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from coax_env.estimation.parted_engine import AT
 from coax_env.estimation.state_space import FreeParameter, Record
 from coax_env.logs.flight import Flight
 from coax_env.model import effects
@@ -35,7 +36,7 @@ def with_timing(parameter: FreeParameter, std: float, dt: float) -> float:
         std: of the fit.
         dt: seconds per row.
     """
-    group, _, own = parameter.name.rpartition(".")
+    group, _, own = parameter.name.partition(AT)[0].rpartition(".")
     known = effects.GROUPS[group].parameters if group else ()
     if any(p.name == own and p.timing for p in known):
         return float(np.hypot(std, dt / np.sqrt(12.0)))

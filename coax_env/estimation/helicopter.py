@@ -6,8 +6,9 @@ step is split to second order).
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -84,7 +85,6 @@ def _take_in_innovations(u: Any, p: Any, x: Any) -> None:
     x[S.GUST_Z] += p[P.COMMAND_GAIN_FORCE_Z] * lift
 
 
-@pointer(STEP)
 def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """`dynamics.step` after the input innovations are taken in, in the engine's form."""
     for i in range(N_FULL):
@@ -93,17 +93,36 @@ def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     dynamics.step(out, u, dt, p, work, out)
 
 
-@pointer(MEASURE)
 def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     """`dynamics.measure`, in the form in which the engine takes a model."""
     dynamics.measure(x, u, p, work, out)
 
 
-@pointer(STEP)
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """`dynamics.drift_and_readings` and the input innovations, in the engine's form."""
     dynamics.drift_and_readings(x, u, dt, p, work, out)
     _take_in_innovations(u, p, out)
+
+
+class Motion(NamedTuple):
+    """A model's `step`, `measure` and `drift_and_readings`, not compiled."""
+
+    step: Any
+    measure: Any
+    drift_and_readings: Any
+
+    def pointers(self) -> tuple[Any, Any, Any]:
+        """The three, as the engine takes them."""
+        step, measure, drift = self
+        return pointer(STEP)(step), pointer(MEASURE)(measure), pointer(STEP)(drift)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When something begins: at `t` [s] of a run, and it lasts through all later ones."""
+
+    run: str
+    t: float
 
 
 _drift_of_registers: Any = None  # what stands for them is compiled when it is first needed
@@ -122,21 +141,33 @@ def _measure_of_lanes(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     _measure_of_registers(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
 
 
-@cache
-def _side_by_side() -> Any:
-    """Pointers to the two; None where a user's effect does not compile for registers."""
+def lanes_of_registers(drift_of_lanes: Any, measure_of_lanes: Any, kind: str) -> Any:
+    """Pointers to two functions that call `_drift_of_registers` and `_measure_of_registers`.
+
+    Args:
+        drift_of_lanes, measure_of_lanes: not compiled. kind: what tells them from others.
+
+    Returns:
+        both; None where a user's effect does not compile for registers.
+    """
     drift, measure = dynamics.drift_and_measure_of_registers()
     names = {"_drift_of_registers": drift, "_measure_of_registers": measure}
     try:
         return tuple(
-            pointer(kind)(under_names(function, names, "all_effects"))
-            for kind, function in (
-                (LANES_STEP.signature, _drift_of_lanes),
-                (LANES_MEASURE.signature, _measure_of_lanes),
+            pointer(signature.signature)(under_names(function, names, kind))
+            for signature, function in (
+                (LANES_STEP, drift_of_lanes),
+                (LANES_MEASURE, measure_of_lanes),
             )
         )
     except numba.core.errors.NumbaError:
         return None
+
+
+@cache
+def _side_by_side() -> Any:
+    """Pointers to the helicopter's own two."""
+    return lanes_of_registers(_drift_of_lanes, _measure_of_lanes, "all_effects")
 
 
 def _small_changes() -> np.ndarray:
@@ -154,18 +185,28 @@ class HeliModel:
 
     channels = CHANNELS
     wraps = np.array([c in ANGLES for c in CHANNELS])
-    step = _step
-    measure = _measure
-    drift_and_readings = _drift_and_readings
+    motion = Motion(_step, _measure, _drift_and_readings)
+    step, measure, drift_and_readings = motion.pointers()
+    moments: Mapping[str, Moment] = {}  # when effects begin or change; see changing_model.py
     exact = np.arange(N_FULL) >= N_STATES
     work_size = dynamics.WORK_SIZE
     noise_places = helicopter_noise.NOISE_PLACES
     state_scale = _small_changes()
 
     @property
+    def base(self) -> "HeliModel":
+        """Itself; of a model that changes in flight the one that it is at any time."""
+        return self
+
+    @property
     def side_by_side(self) -> Any:
-        """`drift_and_readings` and `measure` of SIMD_WIDTH at once, or None."""
-        return _side_by_side()
+        """`drift_and_readings` and `measure` of SIMD_WIDTH at once, or None.
+
+        They are the helicopter's own: a model that moves in another way has none of them, unless it
+        says which.
+        """
+        own = self.drift_and_readings is HeliModel.drift_and_readings
+        return _side_by_side() if own else None
 
     def __init__(self, vehicle: Vehicle, held: Mapping[str, float] | None = None) -> None:
         """Of a vehicle; ``held``: values that effects which it does not have would take as stated."""

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from coax_env.estimation import helicopter_noise
-from coax_env.estimation.helicopter import MEASURE, STEP, HeliModel, _take_in_innovations
+from coax_env.estimation.helicopter import HeliModel, Motion, _take_in_innovations
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
-from coax_env.kernel.compilation import compiled, pointer
+from coax_env.kernel.compilation import compiled
 from coax_env.model import dynamics, effects
 from coax_env.model import inputs as U
 from coax_env.model import parameters as P
@@ -78,7 +78,6 @@ def _shaken(x, u, p, work):
     return taken
 
 
-@pointer(STEP)
 def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """The helicopter's step; jitter fades."""
     for i in range(N_JITTERY):
@@ -95,14 +94,12 @@ def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
         out[i] = left * x[i]
 
 
-@pointer(MEASURE)
 def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     """The helicopter's readings."""
     _shaken(x, u, p, work)
     dynamics.measure(work[_STATE:_INPUT], work[_INPUT:_OUT], p, work, out)
 
 
-@pointer(STEP)
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """The helicopter's; jitter fades exactly."""
     _shaken(x, u, p, work)
@@ -121,17 +118,12 @@ def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) 
 class JitteryModel(HeliModel):
     """A vehicle whose rotor speeds jitter, through the engine's protocol."""
 
-    step = _step
-    measure = _measure
-    drift_and_readings = _drift_and_readings
+    motion = Motion(_step, _measure, _drift_and_readings)
+    step, measure, drift_and_readings = motion.pointers()
     exact = np.append(HeliModel.exact, [True, True])
     work_size = _WORK_SIZE
     state_scale = np.append(HeliModel.state_scale, [1e-2, 1e-2])
     noise_places = np.insert(HeliModel.noise_places, N_FULL, [[N_FULL] * 2, [N_FULL + 1] * 2], 0)
-
-    @property
-    def side_by_side(self) -> None:
-        """None: the two states more are not in the helicopter's derivatives of registers."""
 
     @classmethod
     def like(cls, model: HeliModel) -> "JitteryModel":

@@ -103,6 +103,8 @@ def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicl
     lines = [f"**{capital(doubt)}.**" for doubt in doubts] or [
         "Within the catalogue and this class of noise no other effect fits these flights equally well."
     ]
+    if cause.get("since"):
+        lines.append(capital(f"{since(cause)}."))
     if cause["channels"]:
         lines.append(f"Seen in {and_list([channel_name(c) for c in cause['channels']])}.")
     evidence = cause["evidence"]
@@ -116,6 +118,18 @@ def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicl
         badge=Markup(f"{inline(f'{sigmas(evidence):.0f} sigma')}, {nats}"),
         kind="warning" if doubts else "",
     )
+
+
+def since(cause: Mapping[str, Any]) -> str:
+    """When a cause began or changed, and what it was before, in words."""
+    moment = cause["since"]
+    words = f"since {moment['t']:.2f} ± {number(moment['std'], 2)} s of run {moment['run']}"
+    earlier = [
+        f"{plain(name)} {number(p['value'])} ± {number(p['std'], 2)}"
+        for name, p in cause["before"].items()
+    ]
+    was = f"before it was {and_list(earlier)}" if earlier else "before it was not there"
+    return f"{words}; {was}. The numbers, and the corrected vehicle, are as after that moment"
 
 
 def _plain_list(names: list[str]) -> str:

@@ -1,0 +1,531 @@
+"""Does a cause begin, or change, while the machine flies? Its moment, with interval and worth.
+
+A change at every moment is scored at once, at the gains of the filter without it (a generalised
+likelihood ratio; Willsky and Jones 1976; Basseville and Nikiforov 1993, ch. 7; beginnings.py).
+What stands out is fitted, noise levels too, at the moment that the likelihood itself prefers, and must
+pay: for its numbers by their Occam factor, and for its moment, which could have been any, by the share
+of the flown time that the data leave for it. A cause that was always there is preferred to one that
+pays less than the evidence of a name; so is none. A gust that is over within a second is no change.
+
+Changes last to the end of the last run: the machine is what it is then. Where one is found, causes are
+searched for again beside it: without it, others may have stood in its place.
+"""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import logsumexp
+
+from coax_env.diagnosis.confounding import alternatives
+from coax_env.diagnosis.evidence import Evidence
+from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, without_drifts
+from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
+from coax_env.diagnosis.search import search
+from coax_env.estimation.beginnings import Beginning
+from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
+from coax_env.estimation.engine import Engine
+from coax_env.estimation.helicopter import Moment
+from coax_env.estimation.parted_engine import of_part
+from coax_env.estimation.quadratic import Quadratic, bounded_solve
+from coax_env.estimation.state_space import Record
+from coax_env.estimation.whiteness import Whiteness
+
+NEVER_BEGINS = frozenset(
+    {"wind", "battery_sag", "ground_effect", "battery_voltage", "trim_drift", "wake_interference",
+     "gyroscopic_coupling", "spin_up_reaction", "dynamic_inflow", "sonar_tilt", "thrust_exponent"}
+)  # fmt: skip
+"""What belongs to air, ground and battery, and laws of motion and flow that no damage changes."""
+SPACING = 0.1
+"""s between the moments that are scored at once; ours."""
+MOST_MOMENTS = 600
+"""On long flights they are farther apart than that; ours, a bound on time."""
+MARGIN = 1.5
+"""s from the first row of all, and to the last, in which nothing begins: the filter settles in one, and
+what lasts a second cannot be told from a gust; ours."""
+SETTLED = 1.0
+"""s of a run after which a change in it can be told from its start; ours."""
+MOST_ONSETS = 2
+"""Changes that are looked for, one after the other; ours, a bound on time."""
+NEAR = 1.0
+"""s to both sides of a moment in which the likelihood is asked for a better one; ours."""
+FADED = 10.0
+"""nats under the best moment's from which on another has no share in the interval; ours."""
+SMOOTH = 0.5
+"""nats by which two moments may differ for a line between them to do; ours."""
+OVER = (0.5, 1.5)
+"""s before and after a moment in which a gust may have made the evidence; ours."""
+
+
+@dataclass(frozen=True)
+class Onset:
+    """When a cause began, or changed.
+
+    Attributes:
+        effect: the cause.
+        moment: the best by likelihood; it is the model's.
+        t, std: mean and std of its posterior in that run [s].
+        width: s that this posterior is wide.
+        nats: what it is worth to have the change, its price paid.
+    """
+
+    effect: str
+    moment: Moment
+    t: float
+    std: float
+    width: float
+    nats: float
+
+    def entry(self) -> dict[str, str | float]:
+        """findings.json's `since`."""
+        return {"run": self.moment.run, "t": self.t, "std": self.std}
+
+
+@dataclass(frozen=True)
+class Changing:
+    """A problem in which some causes begin or change, the fit, the quadratic at it, and the onsets."""
+
+    problem: Problem
+    fit: Fit
+    quadratic: Quadratic
+    onsets: Mapping[str, Onset]
+
+
+def with_onsets(
+    problem: Problem, fit: Fit, quadratic: Quadratic, bare: Fit, runs: Sequence[str]
+) -> Changing:
+    """The model with what begins or changes in flight, where that pays; as it is where nothing does.
+
+    Args:
+        problem, fit: after the search.
+        quadratic: linearised at the fit.
+        bare: the fit without any cause, from which a search begins again.
+        runs: names of all runs in the order in which they were flown.
+    """
+    state = Changing(problem, fit, quadratic, {})
+    for _ in range(MOST_ONSETS):
+        problem.report("asking whether something began in flight")
+        found = _next(state, runs)
+        if found is None:
+            break
+        trial, onset = found
+        problem.report(f"{onset.effect} since {onset.t:.2f} s of {onset.moment.run}:"
+                       f" {onset.nats:.1f} nats")  # fmt: skip
+        after = _searched_again(trial, bare, {**state.onsets, onset.effect: onset})
+        if not set(after.onsets) >= {*state.onsets, onset.effect}:
+            break  # it was another cause's work
+        state = after
+    return state
+
+
+# --- every moment at once ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What a change of one effect is worth, by the quadratic. nats: over all moments. moment: the best.
+
+    move: name -> what changes there.
+    """
+
+    effect: str
+    nats: float
+    moment: Moment
+    move: Mapping[str, float]
+
+
+def scored(state: Changing) -> list[Scored]:
+    """Effects that may have begun or changed, by what that is worth over all moments, best first.
+
+    Args:
+        state: a fit, and the quadratic at it.
+    """
+    problem, fit = state.problem, state.fit
+    names = {e: _own(problem, e) for e in may_begin(problem, fit, state.onsets)}
+    table = _Table.of(state, names)
+    records = problem.engine.records
+    rows = rows_of(records)
+    found = problem.engine.beginnings(fit.values, fit.noise, problem.parameters, rows, table.row_of)
+    every = [
+        (Moment(record.whole, float(record.t[row])), result)
+        for record, of_run, results in zip(records, rows, found, strict=True)
+        for row, result in zip(of_run, results, strict=False)  # none where the filter diverged
+    ]
+    best = []
+    for j, effect in enumerate(names):
+        nats = np.array([result[j][0] for _, result in every])
+        if np.isfinite(nats).any():
+            moment, result = every[int(np.argmax(nats))]
+            total = float(logsumexp(nats)) - math.log(len(every))  # each as likely as any other
+            move = dict(zip(names[effect], result[j][1].tolist(), strict=True))
+            best.append(Scored(effect, total, moment, move))
+    return sorted(best, key=lambda s: -s.nats)
+
+
+def may_begin(problem: Problem, fit: Fit, onsets: Collection[str]) -> list[str]:
+    """Effects that the machine may get or lose in flight, and that have no moment yet."""
+    others = [e for e in problem.candidates if e not in NEVER_BEGINS and e not in onsets]
+    active = set(fit.active)
+    return [e for e in others if e in active or not exclusive_with(e) & active]
+
+
+def _own(problem: Problem, effect: str) -> list[str]:
+    """Plain names of an effect's numbers that act."""
+    return [n for n in problem.acting_names(effect) if not n.endswith(BEFORE)]
+
+
+def rows_of(records: Sequence[Record]) -> list[np.ndarray]:
+    """Rows of each record at which something may begin: its first one, and every SPACING later on."""
+    spacing = max(SPACING, sum(float(r.t[-1] - r.t[0]) for r in records) / MOST_MOMENTS)
+    found = []
+    for i, record in enumerate(records):
+        t = record.t
+        times = np.arange(t[0] + SETTLED, t[-1], spacing)
+        if i > 0:
+            times = np.append(t[0], times)
+        else:
+            times = times[times > t[0] + MARGIN]
+        if i == len(records) - 1:
+            times = times[times < t[-1] - MARGIN]
+        found.append(np.unique(np.searchsorted(t, times - 1e-9)).astype(np.int64))
+    return found
+
+
+@dataclass(frozen=True)
+class _Table:
+    """What the score of a change takes that does not depend on its moment.
+
+    later: information (k, k) and slope_later: slope (k,) of all records behind each one. rest: places
+    of what is free beside a change, known: its Cholesky factor, pull: (r,) its slope. groups: places of
+    each effect's numbers, smallest: sizes that matter of these, inflation: its variances'.
+    """
+
+    quadratic: Quadratic
+    later: Sequence[np.ndarray]
+    slope_later: Sequence[np.ndarray]
+    rest: np.ndarray
+    known: tuple[np.ndarray, bool]
+    pull: np.ndarray
+    groups: Sequence[np.ndarray]
+    smallest: Sequence[np.ndarray]
+    inflation: Sequence[float]
+
+    @classmethod
+    def of(cls, state: Changing, names: Mapping[str, Sequence[str]]) -> "_Table":
+        """At a fit, for effects with these numbers."""
+        problem, quadratic = state.problem, state.quadratic
+        assert quadratic.parts is not None
+        free = problem.free_names(state.fit.active)
+        rest = quadratic.index(free)
+        pull = quadratic.g + quadratic.precision * (quadratic.at - quadratic.mean)
+        known = quadratic.G[np.ix_(rest, rest)] + np.diag(quadratic.precision[rest])
+        sizes = {
+            f"{e}.{p.name}": max(p.smallest, 1e-12) for e in names for p in problem.model.sized(e)
+        }
+        return cls(
+            quadratic,
+            _behind(quadratic.parts.information),
+            _behind(quadratic.parts.slope),
+            rest,
+            cho_factor(known),
+            pull[rest],
+            [quadratic.index(own) for own in names.values()],
+            [np.array([sizes[n] for n in own]) for own in names.values()],
+            [
+                quadratic.variance_inflation(own, [*free, *(n for n in own if n not in free)])
+                for own in names.values()
+            ],
+        )
+
+    def row_of(self, b: Beginning) -> list[tuple[float, np.ndarray]]:
+        """What each effect is worth that changes there, and by what its numbers do."""
+        q = self.quadratic
+        slope = b.slope + self.slope_later[b.record]
+        across = b.across[:, self.rest] + self.later[b.record][:, self.rest]
+        own = b.own + self.later[b.record]
+        weights = cho_solve(self.known, across.T)
+        slope = slope - weights.T @ self.pull
+        result = []
+        for c, smallest, inflation in zip(self.groups, self.smallest, self.inflation, strict=True):
+            prior = q.precision[c]
+            A = own[np.ix_(c, c)] - across[c] @ weights[:, c] + np.diag(prior)
+            x = np.linalg.solve(A, -slope[c])
+            low, high = (q.lower - q.at)[c], (q.upper - q.at)[c]
+            if np.any(x < low) or np.any(x > high):
+                x = bounded_solve(A, -slope[c], low, high)
+            gained = -float(slope[c] @ x) - 0.5 * float(x @ A @ x)
+            occam = 0.5 * float(np.linalg.slogdet(A / np.sqrt(np.outer(prior, prior)))[1])
+            large = bool(np.any(np.abs(x) >= smallest))
+            result.append((gained / inflation - occam if large else -math.inf, x))
+        return result
+
+
+def _behind(parts: np.ndarray) -> list[np.ndarray]:
+    """Sums over the records behind each one; parts: (records, ...)."""
+    total = parts.sum(0)
+    return list(total - np.cumsum(parts, axis=0))
+
+
+# --- one change, fitted -----------------------------------------------------------------------------
+
+
+def _next(state: Changing, runs: Sequence[str]) -> tuple[Changing, Onset] | None:
+    """The change that is worth most once fitted, where it pays."""
+    chosen = state.problem.settings
+    best = None
+    fit, _, quadratic = linearise(state.problem, without_drifts(state.fit))
+    steady = replace(state, fit=fit, quadratic=quadratic)
+    near = [s for s in scored(steady) if s.nats > chosen.trial_share * chosen.evidence]
+    for candidate in near[: chosen.most_trials]:
+        trial = _fitted(state, steady, candidate, runs)
+        if trial is None:
+            continue
+        onset = trial[1]
+        state.problem.report(f"{onset.effect} since {onset.t:.2f} s: {onset.nats:.1f} nats, fitted")
+        if onset.nats > (best[1].nats if best else chosen.evidence):
+            best = trial
+    return best
+
+
+def beginning(
+    problem: Problem, fit: Fit, moments: Mapping[str, Moment], runs: Sequence[str]
+) -> Problem:
+    """The problem in which effects begin at moments of theirs, or change where they are active."""
+    model = ChangingModel(problem.model.base, {**problem.model.moments, **moments}, runs)
+    own = dict(problem.own)
+    for effect in moments:
+        if effect in fit.active and not problem.changes(effect):
+            acting = set(problem.acting_names(effect))
+            own[effect] += tuple(before(f) for f in own[effect] if f.name in acting)
+    return replace(problem, own=own).with_model(model)
+
+
+def _fitted(
+    state: Changing, steady: Changing, candidate: Scored, runs: Sequence[str]
+) -> tuple[Changing, Onset] | None:
+    """A change fitted at its best moment, and what it is worth beside the state without it.
+
+    It is fitted from the steady noise in which it was seen.
+    """
+    effect, fit = candidate.effect, steady.fit
+    problem = beginning(state.problem, fit, {effect: candidate.moment}, runs)
+    values = {n: fit.values[n] + change for n, change in candidate.move.items()}
+    values |= {of_part(n, BEFORE): fit.values[n] for n in candidate.move}
+    active = fit.active if effect in fit.active else (*fit.active, effect)
+    trial = fitted(problem, replace(fit.at(values), active=active))
+    if not math.isfinite(trial.objective):
+        return None
+    problem, found = _moved(problem, trial, effect, runs)
+    trial = fitted(problem, noise_fitted(problem, trial), steps=2)
+    problem, found = _moved(problem, trial, effect, runs)
+    trial, _, quadratic = linearise(problem, trial)
+    onset = _worth(state, problem, trial, quadratic, found)
+    return Changing(problem, trial, quadratic, {**state.onsets, effect: onset}), onset
+
+
+def _worth(
+    state: Changing, problem: Problem, trial: Fit, quadratic: Quadratic, found: Onset
+) -> Onset:
+    """An onset with its evidence: beside no change, its numbers and its moment paid for.
+
+    Minus infinity where a gust could have made it, or where it is too small to matter.
+    """
+    effect = found.effect
+    same = replace(state.fit, noise=trial.noise)
+    same = fitted(state.problem, noise_fitted(state.problem, same), steps=2)
+    if state.fit.objective < same.objective:
+        same = state.fit
+    extra = _extra(problem, effect)
+    others = [n for n in problem.free_names(trial.active) if n not in extra]
+    inflation = quadratic.variance_inflation(extra, [*others, *extra])
+    price = quadratic.occam(extra, others) + math.log(_seconds(problem) / found.width)
+    nats = (same.objective - trial.objective) / inflation - price
+    if effect not in state.fit.active:  # one that was always there is preferred
+        own = {n: trial.values[n] for n in extra}
+        always = replace(state.fit.at(own), active=trial.active, noise=trial.noise)
+        always = fitted(state.problem, noise_fitted(state.problem, always), steps=2)
+        gained = (always.objective - trial.objective) / inflation
+        nats = min(nats, gained - math.log(_seconds(problem) / found.width))
+    lasting = _lasting(
+        state.problem, replace(same, noise=trial.noise), problem, trial, found.moment
+    )
+    if lasting / inflation < problem.settings.tie or not _matters(problem, trial, effect):
+        nats = -math.inf
+    return replace(found, nats=nats)
+
+
+def _extra(problem: Problem, effect: str) -> list[str]:
+    """The numbers that a change adds to no change: those before it, or where there are none its own."""
+    acting = problem.acting_names(effect)
+    return [n for n in acting if n.endswith(BEFORE)] or acting
+
+
+def _seconds(problem: Problem) -> float:
+    """Flown time that is fitted [s]."""
+    return float(sum(r.t[-1] - r.t[0] for r in problem.engine.records))
+
+
+def _matters(problem: Problem, fit: Fit, effect: str) -> bool:
+    """Whether what changes is large enough to matter in prediction."""
+    for p in problem.model.sized(effect):
+        name = f"{effect}.{p.name}"
+        was = fit.values.get(of_part(name, BEFORE), p.off)
+        if p.smallest > 0.0 and abs(fit.values[name] - was) >= p.smallest:
+            return True
+    return False
+
+
+def _lasting(
+    same_problem: Problem, same: Fit, problem: Problem, trial: Fit, moment: Moment
+) -> float:
+    """nats of a change on the rows outside OVER, where a gust at its moment has been forgotten."""
+    without = same_problem.engine.filter(same.values, same.noise)
+    with_it = problem.engine.filter(trial.values, trial.noise)
+    total = 0.0
+    for a, b in zip(without, with_it, strict=True):
+        kept = np.ones(a.record.t.size, bool)
+        if a.record.whole == moment.run:
+            since = a.record.t - moment.t
+            kept = (since < -OVER[0]) | (since > OVER[1])
+        total += 0.5 * float(np.nansum(a.innovations[kept] ** 2 - b.innovations[kept] ** 2))
+    return total
+
+
+# --- the moment -------------------------------------------------------------------------------------
+
+
+def _moved(problem: Problem, fit: Fit, effect: str, runs: Sequence[str]) -> tuple[Problem, Onset]:
+    """The problem with an effect's moment where the likelihood is largest, and the interval of it."""
+    found = moment_of(problem, fit, effect)
+    model = ChangingModel(problem.model.base, {**problem.model.moments, effect: found.moment}, runs)
+    return problem.with_model(model), found
+
+
+def moment_of(problem: Problem, fit: Fit, effect: str, inflation: float = 1.0) -> Onset:
+    """The best moment of a change near where it stands, with mean, std and width of its posterior.
+
+    From the likelihood of its run with the change at each row, all else as it is.
+
+    Args:
+        problem, fit: with the change.
+        effect: that changes.
+        inflation: of variances, by coloured innovations.
+    """
+    moment = problem.model.moments[effect]
+    records = [r for r in problem.engine.records if r.whole == moment.run]
+    t = np.concatenate([r.t for r in records])
+    near = t[np.abs(t - moment.t) <= NEAR]
+    nats = _profile(problem, fit, effect, records, near) / inflation
+    share = np.exp(nats - nats.max())
+    step = np.gradient(near) if near.size > 1 else np.ones(1)
+    weight = share * step / float(share @ step)
+    mean = float(weight @ near)
+    spread = math.hypot(math.sqrt(float(weight @ (near - mean) ** 2)), float(np.median(step)))
+    best = Moment(moment.run, float(near[int(np.argmax(nats))]))
+    return Onset(effect, best, mean, spread, float(share @ step), 0.0)
+
+
+def _profile(
+    problem: Problem, fit: Fit, effect: str, records: Sequence[Record], times: np.ndarray
+) -> np.ndarray:
+    """Log-likelihood of records with an effect's moment at each of these times (n,).
+
+    At every tenth first, then between any two of which one has a share in the interval and that differ,
+    and by a line between the others.
+    """
+    model = problem.model
+    assert isinstance(model, ChangingModel)
+
+    def nats_at(k: int) -> float:
+        moments = {**model.moments, effect: Moment(model.moments[effect].run, float(times[k]))}
+        other = ChangingModel(model.base, moments, model.runs)
+        return Engine(other, records, problem.engine.threads).log_likelihood(fit.values, fit.noise)
+
+    known: dict[int, float] = {}
+    asked = {*range(0, times.size, 10), times.size - 1}
+    while asked:
+        known |= {k: nats_at(k) for k in asked}
+        best = max(known.values())
+        asked = {
+            (a + b) // 2
+            for a, b in pairwise(sorted(known))
+            if b > a + 1
+            and max(known[a], known[b]) > best - FADED
+            and (abs(known[a] - known[b]) > SMOOTH or best in (known[a], known[b]))
+        }
+    places = sorted(known)
+    return np.interp(np.arange(times.size), places, [known[k] for k in places])
+
+
+def moments_of(
+    problem: Problem, fit: Fit, evidence: Mapping[str, Evidence], onsets: Mapping[str, Onset]
+) -> dict[str, Onset]:
+    """The onsets of causes that are still there, each with its interval at the final fit.
+
+    Args:
+        problem, fit: with the causes.
+        evidence: of each cause.
+        onsets: as they were found.
+    """
+    return {
+        effect: replace(
+            moment_of(problem, fit, effect, evidence[effect].inflation), nats=onset.nats
+        )
+        for effect, onset in onsets.items()
+        if effect in fit.active
+    }
+
+
+# --- beside a change --------------------------------------------------------------------------------
+
+
+def _searched_again(trial: Changing, bare: Fit, onsets: Mapping[str, Onset]) -> Changing:
+    """Causes searched for beside a change: from those that there are, and from none; the better."""
+    problem = trial.problem
+    begun = [trial.fit]
+    if set(trial.fit.active) > set(onsets):
+        own = {n: v for n, v in trial.fit.values.items() if n.partition(".")[0] in onsets}
+        alone = replace(bare.at(own), active=tuple(onsets), noise=trial.fit.noise,
+                        levels=trial.fit.levels)  # fmt: skip
+        begun.append(fitted(problem, alone))
+    ended = [search(problem, fit) for fit in begun]
+    fit, quadratic = min(ended, key=lambda e: _cost(problem, *e))
+    kept = {e: onset for e, onset in onsets.items() if e in fit.active}
+    return Changing(problem, fit, quadratic, kept)
+
+
+def _cost(problem: Problem, fit: Fit, quadratic: Quadratic) -> float:
+    """Minus the log evidence of a model, to second order [nats]."""
+    own = [n for e in fit.active for n in problem.acting_names(e)]
+    return fit.objective + (quadratic.occam(own, problem.base_names(fit.active)) if own else 0.0)
+
+
+def beside_onsets(
+    problem: Problem,
+    fit: Fit,
+    evidence: Mapping[str, Evidence],
+    white: Mapping[str, Whiteness],
+    onsets: Mapping[str, Onset],
+) -> dict[str, dict[str, Fit]]:
+    """The confounded alternatives of causes that began or changed: effects that begin when they do.
+
+    Args:
+        problem, fit: with the causes.
+        evidence: of each cause.
+        white: whiteness of the innovations, by channel.
+        onsets: of causes that began or changed.
+    """
+    found: dict[str, dict[str, Fit]] = {}
+    for effect, onset in onsets.items():
+        model = problem.model
+        assert isinstance(model, ChangingModel)
+        others = [e for e in may_begin(problem, fit, onsets) if e not in fit.active]
+        others += [e for e in exclusive_with(effect) if e in problem.candidates]
+        moments = {e: onset.moment for e in others if e not in fit.active}
+        then = beginning(problem, fit, moments, model.runs)
+        there, _, quadratic = linearise(then, fit)
+        found |= alternatives(then, there, quadratic, evidence, white, [effect])
+    return found
