@@ -13,7 +13,7 @@ from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.model.layout import ATTITUDE, FULL_STATES, N_STATES, STATES
 from coax_env.model.sensors import suite
 from coax_env.model.vehicle import Vehicle
-from coax_env.plain_words import unit_name
+from coax_env.plain_words import plain, unit_name
 from coax_env.report import figures
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from controllers.loading import Controller
@@ -107,7 +107,7 @@ def design_page(
 
 def _beside_section(beside: Sequence[Sequence[str]]) -> list[Section]:
     """Rows under BESIDE_HEADER, with what the lags are; nothing without rows."""
-    lags = ", ".join(f"{name.replace('_', ' ')} {lag:g} s" for name, lag in HEDGE.items())
+    lags = ", ".join(f"{plain(name)} {lag:g} s" for name, lag in HEDGE.items())
     note = f"Cost per step of 50 flights. With lags: {lags}"
     return [Section("Beside other designs", [table(BESIDE_HEADER, beside, note)])] if beside else []
 

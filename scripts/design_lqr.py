@@ -85,7 +85,8 @@ def beside_rows(designs: dict[str, margins.Design], vehicle: Vehicle, seed: int)
         row = [name]
         for flown in (vehicle, lqr.hedged(vehicle, lqr.HEDGE)):
             score = evaluate(one, flown, episodes=50, seed=seed)
-            row += [f"{margins.disk_margin(one, flown):.2f}", f"{score['mean_cost']:.3g}"]
+            disk = margins.disk_margin(one, flown)
+            row += [f"{disk:.2f}" if disk else "unstable", f"{score['mean_cost']:.3g}"]
         rows.append(row)
     return rows
 
