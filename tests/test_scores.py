@@ -18,7 +18,16 @@ from coax_env.diagnosis import confounding, remarks
 from coax_env.diagnosis.confounding import channels_of
 from coax_env.diagnosis.findings import mixtures_as_one
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.scores import damping_gain, inflation, is_large, loss, score, scores, swap
+from coax_env.diagnosis.scores import (
+    damping_gain,
+    exchanges,
+    inflation,
+    is_large,
+    loss,
+    score,
+    scores,
+    swap,
+)
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import WHITE_LEVELS
 from coax_env.estimation.quadratic import Quadratic
@@ -141,6 +150,20 @@ def test_a_swap_with_what_replaces_a_number_takes_it_back_to_the_file():
     np.testing.assert_allclose(move, expected, atol=1e-12)
     moved = q.moved(move)
     assert moved["inertia_zz"] == pytest.approx(file["inertia_zz"])
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_exchanges_are_all_swaps_that_gain_more_than_a_tie(seed):
+    """The bound by which pairs are passed over loses none."""
+    q, active = quadratic(seed, size=15.0), ("gyro_bias", "swash_gain", "ground_effect")
+    found = {(old, new): change for change, old, new, _ in exchanges(PROBLEM, q, active, active)}
+    every = {
+        (old, new): swap(PROBLEM, q, active, old, new)[0]
+        for old in active
+        for new in set(EFFECTS) - set(active)
+    }
+    tie = PROBLEM.settings.tie
+    assert found == {pair: pytest.approx(c) for pair, c in every.items() if c < -tie}
 
 
 def test_only_what_may_be_added_and_gains_something_that_matters_is_listed():

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from coax_env.diagnosis.fits import at_optimum, fitted, stepped, without
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.scores import Score, damping_gain, inflation, is_large, loss, swap
+from coax_env.diagnosis.scores import Score, damping_gain, exchanges, inflation, is_large, loss
 from coax_env.estimation.engine import RunPass
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.model import effects
@@ -153,21 +153,17 @@ def swaps(
         quadratic: linearised at the fit.
         tried: sets of effects that need no second trial.
     """
-    tie = problem.settings.tie
     better = []
-    for old in fit.active:
-        for new in problem.candidates:
-            active = tuple(new if e == old else e for e in fit.active)
-            if new not in fit.active and active not in tried:
-                change, move = swap(problem, quadratic, fit.active, old, new)
-                if change < -tie:
-                    better.append((change, old, new, active, move))
+    for change, old, new, move in exchanges(problem, quadratic, fit.active, fit.active):
+        active = tuple(new if e == old else e for e in fit.active)
+        if active not in tried:
+            better.append((change, old, new, active, move))
     for _, old, new, active, move in sorted(better, key=lambda c: c[0])[
         : problem.settings.most_trials
     ]:
         begin = replace(fit.at(quadratic.moved(move)), active=active)
         words = f"{new} explains it better than {old}, by {{:.1f}} nats"
-        yield Proposal(f"{old} -> {new}", new, begin, 0.0, tie, words)
+        yield Proposal(f"{old} -> {new}", new, begin, 0.0, problem.settings.tie, words)
 
 
 # --- backward ---------------------------------------------------------------------------------------

@@ -5,8 +5,9 @@ time: the likelihood is linearised anew in the causes' own and the vehicle's own
 cause must be worth what its share of the information asks for (replication.py): noise twice as loud
 hides a part of a true cause, and takes no more than that.
 
-Runs that have a third of what is known of each cause are enough: what a cause is worth under other
-noise is compared with what it is worth on the same runs under the fitted one.
+Runs that have a third of what is known of each cause are enough, and of a clear cause those that have a
+third of what is known of one of 14 thresholds: what a cause is worth under other noise is compared with
+what it is worth on the same runs under the fitted one.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.replication import Asked, information, same_way
+from coax_env.diagnosis.replication import Asked, Known, information, same_way
 from coax_env.diagnosis.scores import lost
 from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.quadratic import Quadratic
@@ -47,10 +48,10 @@ def not_holding(
     """
     if not fit.active:
         return {}
-    picked = _informative_runs(problem, fit, quadratic)
-    nominal = quadratic.of_parts(picked)
+    picked = _informative_runs(problem, fit, quadratic, worth)
+    nominal = Known.of(problem, fit, quadratic.of_parts(picked), worth)
     engine = Engine(problem.model, [problem.engine.records[i] for i in picked], threads=1)
-    trial = _Trial(problem, engine, fit, nominal, worth, engine.filter(fit.values, fit.noise))
+    trial = _Trial(problem, engine, fit, nominal, engine.filter(fit.values, fit.noise))
     levels = {level.words: level for level in _levels(problem, fit)}
     failing = problem.for_each(lambda words: trial.failing(levels[words]), list(levels))
     return {
@@ -70,9 +71,13 @@ def _levels(problem: Problem, fit: Fit) -> Iterable[Level]:
             yield Level(names, f"the noise of {', '.join(names)}")
 
 
-def _informative_runs(problem: Problem, fit: Fit, quadratic: Quadratic) -> list[int]:
+def _informative_runs(
+    problem: Problem, fit: Fit, quadratic: Quadratic, worth: Mapping[str, float]
+) -> list[int]:
     """Runs that have enough of the information on each cause in the least time."""
-    records = problem.engine.records
+    records, chosen = problem.engine.records, problem.settings
+    nats = np.array([max(worth[e], 1e-300) for e in fit.active])
+    enough = chosen.noise_share * np.minimum(chosen.noise_clear * chosen.evidence / nats, 1.0)
     known = np.array(
         [
             [information(problem, fit, quadratic.of_parts([i]), e) for e in fit.active]
@@ -83,24 +88,23 @@ def _informative_runs(problem: Problem, fit: Fit, quadratic: Quadratic) -> list[
     seconds = np.array([r.t[-1] - r.t[0] for r in records])
     picked: list[int] = []
     while len(picked) < len(records):
-        missing = np.maximum(problem.settings.noise_share - share[picked].sum(0), 0.0)
+        missing = np.maximum(enough - share[picked].sum(0), 0.0)
         if not missing.any():
             break
-        worth = np.minimum(share, missing).sum(1) / seconds
-        worth[picked] = -1.0
-        picked.append(int(np.argmax(worth)))
+        gained = np.minimum(share, missing).sum(1) / seconds
+        gained[picked] = -1.0
+        picked.append(int(np.argmax(gained)))
     return sorted(picked)
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """The runs flown again: their engine, the quadratic and passes at the fitted noise."""
+    """The runs flown again: their engine, what they know of each cause, passes at the fitted noise."""
 
     problem: Problem
     engine: Engine
     fit: Fit
-    nominal: Quadratic
-    worth: Mapping[str, float]
+    nominal: Mapping[str, Known]
     passes: Sequence[RunPass]
 
     def failing(self, level: Level) -> dict[str, list[str]]:
@@ -146,6 +150,6 @@ class _Trial:
 
     def _holds(self, varied: Quadratic, effect: str) -> bool:
         problem, fit = self.problem, self.fit
-        asked = Asked.of(problem, fit, self.nominal, varied, effect, self.worth[effect])
+        asked = Asked.of(problem, fit, self.nominal[effect], varied)
         gone = lost(problem, varied, fit.active, effect)
         return asked.margin(gone) >= 0.0 and same_way(problem, fit, varied, fit.active, effect)

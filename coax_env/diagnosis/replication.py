@@ -22,7 +22,7 @@ from itertools import combinations
 import numpy as np
 
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
-from coax_env.diagnosis.scores import lost, swap
+from coax_env.diagnosis.scores import exchanges, lost
 from coax_env.diagnosis.settings import Settings
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record, part
@@ -56,12 +56,13 @@ def replications(
     if not fit.active:
         return {}
     runs = of_runs(problem.engine.records)
+    known = Known.of(problem, fit, quadratic, worth)
     without = [
-        _standing(problem, fit, quadratic, quadratic.of_parts(_all_but(runs, out)), worth)
-        for out in runs
+        _standing(problem, fit, known, quadratic.of_parts(_all_but(runs, out))) for out in runs
     ]
     whole, halves = _halves(problem, fit, quadratic)
-    halved = [_standing(problem, fit, whole, whole.of_parts(half), worth) for half in halves]
+    known = known if whole is quadratic else Known.of(problem, fit, whole, worth)
+    halved = [_standing(problem, fit, known, whole.of_parts(half)) for half in halves]
     return {effect: _of_one(effect, list(runs), without, halved) for effect in fit.active}
 
 
@@ -156,16 +157,15 @@ def _pieces(record: Record, seconds: float) -> list[Record]:
 def _standing(
     problem: Problem,
     fit: Fit,
-    whole: Quadratic,
+    known: "Mapping[str, Known]",
     of_part: Quadratic,
-    worth: Mapping[str, float],
 ) -> dict[str, bool | None]:
     """Whether each name stands on a part of the flights; None where the part cannot tell.
 
     The weakest name is dropped, or exchanged for what explains it better, until all that is left
     stands.
     """
-    asked = {e: Asked.of(problem, fit, whole, of_part, e, worth[e]) for e in fit.active}
+    asked = {e: Asked.of(problem, fit, known[e], of_part) for e in fit.active}
     active = list(fit.active)
     while active:
         margins = {
@@ -189,6 +189,44 @@ def _standing(
 
 
 @dataclass(frozen=True)
+class Known:
+    """What the whole flights know of one cause.
+
+    Attributes:
+        effect: its name.
+        information: on it [nats, doubled].
+        lost: nats by the quadratic without it.
+        worth: its evidence [nats].
+    """
+
+    effect: str
+    information: float
+    lost: float
+    worth: float
+
+    @classmethod
+    def of(
+        cls, problem: Problem, fit: Fit, whole: Quadratic, worth: Mapping[str, float]
+    ) -> "dict[str, Known]":
+        """That of every active effect.
+
+        Args:
+            problem, fit: with the causes.
+            whole: linearised at the fit.
+            worth: evidence of each cause [nats].
+        """
+        return {
+            e: cls(
+                e,
+                information(problem, fit, whole, e),
+                lost(problem, whole, fit.active, e),
+                worth[e],
+            )
+            for e in fit.active
+        }
+
+
+@dataclass(frozen=True)
 class Asked:
     """What a part of the flights is asked of one cause.
 
@@ -209,24 +247,20 @@ class Asked:
         cls,
         problem: Problem,
         fit: Fit,
-        whole: Quadratic,
+        known: Known,
         of_part: Quadratic,
-        effect: str,
-        worth: float,
     ) -> "Asked":
         """What is asked of an active effect.
 
         Args:
             problem, fit: with the causes.
-            whole, of_part: linearised at the fit: the whole flights, and a part or a variation.
-            effect: its name.
-            worth: its evidence on the whole [nats].
+            known: of the effect, on the whole flights.
+            of_part: linearised at the fit: a part, or a variation.
         """
-        known = information(problem, fit, whole, effect)
-        there = information(problem, fit, of_part, effect)
-        gone = lost(problem, whole, fit.active, effect)
-        share = min(there / known, 1.0) if known > 0.0 else 0.0
-        return cls(share, worth / gone if gone > 0.0 else 0.0, worth, problem.settings)
+        there = information(problem, fit, of_part, known.effect)
+        share = min(there / known.information, 1.0) if known.information > 0.0 else 0.0
+        scale = known.worth / known.lost if known.lost > 0.0 else 0.0
+        return cls(share, scale, known.worth, problem.settings)
 
     def expected(self, nats: float) -> float:
         """The least z, in 95 of 100 cases, of a cause of so many nats spread evenly."""
@@ -283,39 +317,9 @@ def _exchange(
     problem: Problem, quadratic: Quadratic, active: Sequence[str], names: Sequence[str]
 ) -> tuple[str, str] | None:
     """A name and what explains it better, the best such pair."""
-    tie = problem.settings.tie
-    found = []
-    gains = _most_gains(problem, quadratic, active)
-    for old in names:
-        others = {e for e in active if e != old}
-        rest = [n for n in problem.free_names(active) if not n.startswith(old + ".")]
-        least = tie - quadratic.occam(problem.acting_names(old), rest)
-        for new, gain in gains.items():
-            if gain > least and not exclusive_with(new) & others:
-                change, _ = swap(problem, quadratic, active, old, new)
-                if change < -tie:
-                    found.append((change, old, new))
+    found = [
+        (change, old, new)
+        for change, old, new, _ in exchanges(problem, quadratic, active, names)
+        if not exclusive_with(new) & {e for e in active if e != old}
+    ]
     return min(found)[1:] if found else None
-
-
-def _most_gains(problem: Problem, quadratic: Quadratic, active: Sequence[str]) -> dict[str, float]:
-    """The most [nats] that each effect which is not active could gain beside all that is.
-
-    What it gains in the place of one of them is no more. All at once, bounds left out.
-    """
-    free = problem.free_names(active)
-    _, move = quadratic.best(free)
-    off = {e: problem.acting_names(e) for e in problem.candidates if e not in active}
-    own = [n for names in off.values() for n in names]
-    if not own:
-        return {}
-    known, _ = quadratic.projected(own, free)
-    i = quadratic.index(own)
-    slope = quadratic.g[i] + quadratic.G[i] @ move
-    known[np.diag_indices_from(known)] += quadratic.precision[i]
-    gains, at = {}, 0
-    for effect, names in off.items():
-        rows = slice(at, at + len(names))
-        gains[effect] = 0.5 * float(slope[rows] @ np.linalg.solve(known[rows, rows], slope[rows]))
-        at += len(names)
-    return gains

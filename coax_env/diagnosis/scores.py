@@ -10,7 +10,7 @@ base parameter goes back to its file value.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +75,8 @@ def scores(
         banned: effects that may not be added now.
     """
     found = []
-    for effect in problem.candidates:
+    _, most = most_gains(problem, quadratic, fit.active, {})
+    for effect in (e for e, gain in most.items() if gain > 0.0):
         if effect not in banned and not ({effect} | exclusive_with(effect)) & set(fit.active):
             candidate = score(problem, quadratic, fit.active, effect)
             if candidate.large and candidate.nats > 0.0:
@@ -182,6 +183,74 @@ def swap(
         return quadratic.occam(problem.acting_names(effect), rest)
 
     return then + occam(new) - now - occam(old), move
+
+
+def exchanges(
+    problem: Problem, quadratic: Quadratic, active: Sequence[str], olds: Sequence[str]
+) -> Iterator[tuple[float, str, str, np.ndarray]]:
+    """Effects in the place of active ones that explain more by the quadratic, beyond a tie.
+
+    A pair is looked at where the most that the new one could gain would do.
+
+    Args:
+        problem: what may be free.
+        quadratic: linearised at the fit.
+        active: effects in the model.
+        olds: those of them that may leave.
+
+    Yields:
+        the change of the objective [nats], who leaves, who comes, and the move of all parameters (k,).
+    """
+    tie = problem.settings.tie
+    now, _ = quadratic.best(problem.free_names(active))
+    for old in olds:
+        others = [e for e in active if e != old]
+        without, gains = most_gains(problem, quadratic, others, problem.off_values(old))
+        needed = tie + without - now
+        needed -= quadratic.occam(problem.acting_names(old), problem.free_names(others))
+        for new, gain in gains.items():
+            if gain > needed and new != old:
+                change, move = swap(problem, quadratic, active, old, new)
+                if change < -tie:
+                    yield change, old, new, move
+
+
+def most_gains(
+    problem: Problem, quadratic: Quadratic, active: Sequence[str], fixed: Mapping[str, float]
+) -> tuple[float, dict[str, float]]:
+    """The most [nats] that each other effect could gain beside some, its Occam factor deducted.
+
+    All at once, bounds and the file values of base parameters that it replaces left out.
+
+    Args:
+        problem: what may be free.
+        quadratic: linearised at the fit.
+        active: the effects beside it.
+        fixed: values that are held.
+
+    Returns:
+        the least value of the quadratic without any of them, and the gains.
+    """
+    free = problem.free_names(active)
+    value, move = quadratic.best(free, fixed)
+    names = {e: problem.acting_names(e) for e in problem.candidates if e not in active}
+    own = [n for group in names.values() for n in group]
+    if not own:
+        return value, {}
+    known, _ = quadratic.projected(own, free)
+    i = quadratic.index(own)
+    slope = quadratic.g[i] + quadratic.G[i] @ move
+    known[np.diag_indices_from(known)] += quadratic.precision[i]
+    log_prior = np.log(quadratic.precision[i])
+    gains, at = {}, 0
+    for effect, group in names.items():
+        rows = slice(at, at + len(group))
+        at = rows.stop
+        gains[effect] = 0.5 * float(slope[rows] @ np.linalg.solve(known[rows, rows], slope[rows]))
+        if not problem.file_values(effect):
+            log_known = float(np.linalg.slogdet(known[rows, rows])[1])
+            gains[effect] -= 0.5 * (log_known - float(log_prior[rows].sum()))
+    return value, gains
 
 
 def damping_gain(

@@ -98,6 +98,8 @@ class Settings:
     """Times which, and part of which, every noise level must leave a name standing (contract)."""
     noise_share: float = 0.35
     """Share of the information on each cause that the runs flown again with other noise have; ours."""
+    noise_clear: float = 14.0
+    """Thresholds: of a cause that is worth more, as much is enough as is a share of so many; ours."""
     felt_change: float = 1.0
     """Sum of squared changes of whitened innovations under which no score moves by a std: such a
     level, one at its floor above all, is not felt and not varied."""

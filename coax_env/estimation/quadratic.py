@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -99,9 +100,13 @@ class Quadratic:
             by_channel=self.parts.by_channel[chosen].sum(0),
         )
 
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
+
     def index(self, names: Collection[str]) -> np.ndarray:
         """Places of parameters."""
-        return np.array([self.names.index(n) for n in names], dtype=int)
+        return np.array([self._places[n] for n in names], dtype=int)
 
     def moved(self, move: np.ndarray) -> dict[str, float]:
         """Values of all parameters after a move (k,)."""
