@@ -11,7 +11,7 @@ from coax_env.estimation import engine as engines
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
-from coax_env.estimation.sparse import find_non_zeros, padded, with_places
+from coax_env.estimation.sparse import add_gram, find_non_zeros, padded, with_places
 from coax_env.estimation.state_space import part
 from coax_env.logs.flight import read_flight
 from coax_env.model import effects
@@ -91,3 +91,17 @@ def test_non_zeros_are_found_again_where_they_change():
         find_non_zeros(A)
         for row, places, count in zip(A.values, A.places, A.counts, strict=True):
             assert list(places[:count]) == list(np.flatnonzero(row[:20] != 0.0))
+
+
+@pytest.mark.parametrize("count", [1, 12, 32, 75])
+def test_products_of_columns_are_added_up(count):
+    """At and right of the diagonal, the column after the last with them, whatever G was before."""
+    rng = np.random.default_rng(count)
+    width = padded(count + 1)
+    J, G = np.zeros((70, width)), np.zeros((width, width))
+    J[:, : count + 1] = rng.normal(size=(70, count + 1))
+    G[:count, : count + 1] = before = rng.normal(size=(count, count + 1))
+    add_gram(J, count, G)
+    upper = np.triu(np.ones((count, count + 1), bool))
+    found, expected = G[:count, : count + 1], before + (J.T @ J)[:count, : count + 1]
+    assert_allclose(found[upper], expected[upper], rtol=1e-12, atol=1e-12)

@@ -31,6 +31,11 @@ class MachineModel(HeliModel):
         plain = {name: value for name, value in values.items() if name != ROTOR_SPEED}
         return np.append(super().vector(plain, noise), values.get(ROTOR_SPEED, 0.0))
 
+    @property
+    def input_places(self) -> np.ndarray:
+        """As `HeliModel.input_places`, and of that number."""
+        return np.append(super().input_places, -1)
+
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """As `HeliModel.inputs`, rotor commands times 1 + that number."""
         u = super().inputs(record, vector)

@@ -17,7 +17,7 @@ import numpy as np
 
 from coax_env.estimation import frozen_gains, kalman, noise_score
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
-from coax_env.estimation.sparse import aligned, padded
+from coax_env.estimation.sparse import add_gram, aligned, padded
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
 
 GATE = 8.0  # std of an innovation beyond which a reading counts as an outlier; ours
@@ -294,7 +294,8 @@ class Engine:
         def one(i: int) -> tuple[Any, ...]:
             with self._borrowed_buffers() as buffers:
                 run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
-                information = np.zeros((len(free), len(free)))
+                count, width = len(free), padded(len(free) + 1)
+                information = np.zeros((width, width))
                 by_channel = np.zeros((len(free), run.innovations.shape[1]))
                 edges, before = _block_edges(run)
                 blocks = np.zeros((edges.size - 1, len(free)))
@@ -305,12 +306,18 @@ class Engine:
                     for first in range(0, edges.size - 1, BLOCKS_AT_ONCE):
                         own = edges[first : first + BLOCKS_AT_ONCE + 1]
                         since, until = before[own[0]], before[own[-1]]
-                        J = buffers.array("J", (int(until - since), len(free)))
-                        J[:, moves.probed] = probed[since:until]
+                        J = buffers.array("J", (int(until - since), width))
+                        J[:, count:] = 0.0
+                        J[:, count] = e[since:until]
+                        J[:, np.flatnonzero(moves.probed)] = probed[since:until]
                         work(frozen_gains.Portion(int(own[0]), int(own[-1]), int(since)), J)
-                        information += J.T @ J
                         for b, (a, z) in enumerate(pairwise(before[own] - since), first):
-                            blocks[b] = e[since + a : since + z] @ J[a:z]
+                            products = np.zeros((width, width))
+                            add_gram(J[a:z], count, products)
+                            blocks[b] = products[:count, count]
+                            information += products
+                information = information[:count, :count]
+                information = np.triu(information) + np.triu(information, 1).T
                 wild = ~np.isfinite(np.diag(information))
                 information[wild] = information[:, wild] = 0.0
                 by_channel[wild] = 0.0
@@ -359,7 +366,7 @@ class Engine:
         vectors = [moves.vectors[k] for k in columns]
         sets, which = [run.inputs], np.zeros(columns.size, np.int64)
         for k, vector in enumerate(vectors):
-            inputs = self.model.inputs(run.record, vector)
+            inputs = self._inputs(run, p, vector)
             if not np.array_equal(inputs, run.inputs):
                 which[k] = len(sets)
                 sets.append(inputs)
@@ -386,20 +393,29 @@ class Engine:
 
         return of_portion
 
+    def _inputs(self, run: RunPass, p: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        """A run's inputs with the parameters `vector`, known those with `p`."""
+        places = getattr(self.model, "input_places", None)
+        if places is not None and np.array_equal(p[places], vector[places]):
+            return run.inputs
+        return self.model.inputs(run.record, vector)
+
     def _probed_signatures(
         self, i: int, run: RunPass, moves: _Moves, by_channel: np.ndarray
     ) -> np.ndarray:
         """The same where a finite step is needed, by a mean pass each: (readings, probed)."""
         there = np.isfinite(run.innovations)
+        channel, e = np.nonzero(there)[1], run.innovations[there]
         columns = np.flatnonzero(moves.probed)
-        found = np.zeros((int(there.sum()), columns.size))
+        found = np.zeros((e.size, columns.size))
         probed = np.zeros(there.shape)
         for column, k in enumerate(columns):
             if self._frozen(i, run, moves.vectors[k], probed):
-                change = np.where(there, probed - run.innovations, 0.0)
+                change = probed[there] - e
                 if np.abs(change).max(initial=0.0) < DIVERGED:
-                    found[:, column] = change[there] / moves.steps[k]
-                    by_channel[k] = np.square(change / moves.steps[k]).sum(0)
+                    change /= moves.steps[k]
+                    found[:, column] = change
+                    by_channel[k] = np.bincount(channel, change**2, by_channel.shape[1])
         return found
 
     def descend(

@@ -24,7 +24,18 @@ from coax_env.estimation.kalman import (
     in_every_lane,
     lanes_of,
 )
-from coax_env.estimation.sparse import REORDER, aligned, padded, unpack, with_places
+from coax_env.estimation.sparse import (
+    FOUR,
+    ONE,
+    REORDER,
+    THREE,
+    TWO,
+    aligned,
+    four_of_product,
+    padded,
+    unpack,
+    with_places,
+)
 from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled
 from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
@@ -236,12 +247,12 @@ def _propagate(exact, F, w):
     for i in range(nx):
         source = before if exact[i] else half
         own = 1.0 if exact[i] else 0.5
-        for b in range(blocks):
-            total = own * added[i * blocks + b]
-            for c in range(F.counts[i]):
-                j = np.uint64(F.places[i, c])
-                total += F.values[i, j] * source[j * blocks + b]
-            s[i * blocks + b] = total
+        for b in range(np.uint64(0), blocks, FOUR):
+            first, second, third, fourth = four_of_product(F, i, source, b, blocks)
+            at = i * blocks + b
+            s[at], s[at + ONE] = own * added[at] + first, own * added[at + ONE] + second
+            s[at + TWO] = own * added[at + TWO] + third
+            s[at + THREE] = own * added[at + THREE] + fourth
 
 
 @compiled(

@@ -186,6 +186,11 @@ class HeliModel:
             helicopter_noise.with_memories(vector, noise)
         return vector
 
+    @property
+    def input_places(self) -> np.ndarray:
+        """Places in the parameter vector of what `inputs` follows."""
+        return np.array([_COMMAND_DELAY, _SERVO_DELAY, _NOMINAL_VOLTAGE])
+
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """The kernel's inputs, inputs.py, (n, 6), or with input innovations, (n, 10)."""
         u = np.zeros((record.t.size, N_INPUTS))

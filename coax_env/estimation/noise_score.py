@@ -10,6 +10,7 @@ from coax_env.estimation.kalman import _A, _M, _N, SAME_STEP, TRACE, growth
 from coax_env.estimation.sparse import (
     REORDER,
     aligned,
+    combine,
     find_non_zeros,
     multiply,
     padded,
@@ -46,11 +47,7 @@ def _reading_back(b, e, per_sigma, gain, H, K, NK, r, N):
     for i in range(nx):
         K[i] = gain[i]
         pull -= K[i] * r[i]
-    for block in range(blocks):
-        total = 0.0
-        for i in range(np.uint64(nx)):
-            total += K[i] * rows[i * blocks + block]
-        product[block] = total
+    combine(K, N, nx, NK)
     for j in range(width):
         curve += K[j] * NK[j]
     for c in range(H.counts[b]):
@@ -143,13 +140,7 @@ def _decay_slope(g, x, P, dt, w):
     smoothed = x
     for j in range(w.r.size):
         smoothed += P[j] * w.r[j]
-    rows, product = simd_blocks(w.B), simd_blocks(w.NFP)
-    blocks = np.uint64(w.NFP.size // SIMD_WIDTH)
-    for block in range(blocks):
-        known = 0.0
-        for j in range(np.uint64(w.r.size)):
-            known += float64(P[j]) * rows[j * blocks + block]
-        product[block] = known
+    combine(P, w.B, w.r.size, w.NFP)
     total = 0.0
     for c in range(w.F.counts[g]):
         i = w.F.places[g, c]

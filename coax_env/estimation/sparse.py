@@ -15,9 +15,10 @@ from coax_env.kernel.simd import SIMD_WIDTH, lanes, negated, simd_blocks
 
 REORDER: dict[str, Any] = {"fastmath": {"reassoc", "contract"}}
 """Sums may be taken in the order that is fastest."""
-ROW_MULTIPLE = 16
-"""Rows of matrices are as long as a multiple of this, zeros at the end: no loop has a scalar rest."""
-ONE, TWO = np.uint64(1), np.uint64(2)
+ROW_MULTIPLE = 32
+"""Rows of matrices are as long as a multiple of this, zeros at the end: no loop has a rest. Four
+registers are summed side by side, since each sum by itself waits for what was added last."""
+ONE, TWO, THREE, FOUR = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
 """Indices without a sign: a signed one is looked at each time whether it counts from the end."""
 
 
@@ -84,6 +85,60 @@ def find_non_zeros(A):
         A.counts[i] = count
 
 
+@compiled(forceinline=True)
+def _four(registers, at):
+    """Four neighbours."""
+    return registers[at], registers[at + ONE], registers[at + TWO], registers[at + THREE]
+
+
+@compiled(forceinline=True)
+def _set_four(registers, at, first, second, third, fourth):
+    """Four neighbours set."""
+    registers[at], registers[at + ONE] = first, second
+    registers[at + TWO], registers[at + THREE] = third, fourth
+
+
+@compiled(forceinline=True, **REORDER)
+def four_of_product(A, i, rows, at, blocks):
+    """Row `i` of A times another matrix, of this the registers `at` to `at` + 3 of each row.
+
+    Args:
+        A: Sparse, its non-zeros found. i: of its rows. rows: registers of the other matrix.
+        at: the first of four. blocks: registers of a row.
+    """
+    first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+    for c in range(np.uint64(A.counts[i])):
+        a = np.uint64(A.places[i, c])
+        weight = A.values[i, a]
+        row = a * blocks + at
+        first += weight * rows[row]
+        second += weight * rows[row + ONE]
+        third += weight * rows[row + TWO]
+        fourth += weight * rows[row + THREE]
+    return first, second, third, fourth
+
+
+@compiled(forceinline=True, **REORDER)
+def combine(weights, B, count, out):
+    """Sum of the first `count` rows of B, each times its weight, into `out` (padded,).
+
+    Args:
+        weights: (count or more,). B: (rows, padded).
+    """
+    blocks = np.uint64(out.size // SIMD_WIDTH)
+    rows, total = simd_blocks(B), simd_blocks(out)
+    for b in range(np.uint64(0), blocks, FOUR):
+        first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+        for i in range(np.uint64(count)):
+            weight = float64(weights[i])
+            row = i * blocks + b
+            first += weight * rows[row]
+            second += weight * rows[row + ONE]
+            third += weight * rows[row + TWO]
+            fourth += weight * rows[row + THREE]
+        _set_four(total, b, first, second, third, fourth)
+
+
 @compiled(types.void(SPARSE, float64[:, ::1], float64[:, ::1]), **REORDER)
 def multiply(A, B, out):
     """A B, with what is not zero in A alone.
@@ -94,16 +149,43 @@ def multiply(A, B, out):
     blocks = np.uint64(out.shape[1] // SIMD_WIDTH)
     rows, product = simd_blocks(B), simd_blocks(out)
     for i in range(np.uint64(A.counts.size)):
-        at = i * blocks
-        for b in range(np.uint64(0), blocks, TWO):
-            left, right = 0.0, 0.0
-            for c in range(np.uint64(A.counts[i])):
-                a = np.uint64(A.places[i, c])
-                weight = A.values[i, a]
-                left += weight * rows[a * blocks + b]
-                right += weight * rows[a * blocks + b + ONE]
-            product[at + b] = left
-            product[at + b + ONE] = right
+        for b in range(np.uint64(0), blocks, FOUR):
+            first, second, third, fourth = four_of_product(A, i, rows, b, blocks)
+            _set_four(product, i * blocks + b, first, second, third, fourth)
+
+
+ROWS_AT_ONCE = np.uint64(32)
+"""Rows of a tall matrix that stay in the nearest cache while all their products are summed; ours."""
+
+
+@compiled(types.void(float64[:, ::1], int64, float64[:, ::1]), **REORDER)
+def add_gram(J, count, G):
+    """G += J' J, at and right of the diagonal, for the first `count` columns against all.
+
+    Own, since a BLAS that shares such small products among threads takes longer for it. Two rows of G,
+    four registers of each, are summed at a time.
+
+    Args:
+        J: (n, padded), its columns more than `count`. G: (padded, padded), in place.
+    """
+    blocks, n = np.uint64(J.shape[1] // SIMD_WIDTH), np.uint64(J.shape[0])
+    rows, products = simd_blocks(J), simd_blocks(G)
+    for since in range(np.uint64(0), n, ROWS_AT_ONCE):
+        until = min(since + ROWS_AT_ONCE, n)
+        for i in range(np.uint64(0), np.uint64(count), TWO):
+            for b in range(i // np.uint64(ROW_MULTIPLE) * FOUR, blocks, FOUR):
+                at, below = i * blocks + b, (i + ONE) * blocks + b
+                p0, p1, p2, p3 = _four(products, at)
+                q0, q1, q2, q3 = _four(products, below)
+                for k in range(since, until):
+                    weight, other = J[k, i], J[k, i + ONE]
+                    r0, r1, r2, r3 = _four(rows, k * blocks + b)
+                    p0, p1 = p0 + weight * r0, p1 + weight * r1
+                    p2, p3 = p2 + weight * r2, p3 + weight * r3
+                    q0, q1 = q0 + other * r0, q1 + other * r1
+                    q2, q3 = q2 + other * r2, q3 + other * r3
+                _set_four(products, at, p0, p1, p2, p3)
+                _set_four(products, below, q0, q1, q2, q3)
 
 
 @compiled(types.void(float32[:, :, ::1], int64, SPARSE))
