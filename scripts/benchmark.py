@@ -1,7 +1,7 @@
 """Ratios measured in one run: speed of the env against others, its start, and what effects cost.
 
-Without --peers in under three minutes; --diagnosis and --training take two more each. With --peers
-other simulators are installed, each into a venv of its own (a gigabyte each, once), and flown in turns
+Without --peers in under three minutes; --diagnosis and --training take two more each, --growth
+and --before half an hour on a slow core. With --peers other simulators are installed, each into a venv of its own (a gigabyte each, once), and flown in turns
 with ours: ours, peer, ours, peer; the best of all rounds counts. Everyone flies random actions in their
 own vector env with their own settings, which the table states. Vehicles with effects, in wind, and
 drawn fly in turns with the bare one. Absolute times depend on the machine and its neighbours; compare
@@ -95,6 +95,10 @@ def main() -> None:
     )
     parser.add_argument("--diagnosis", action="store_true",
                         help="time diagnoses of 12 runs in gusts too")  # fmt: skip
+    parser.add_argument("--growth", action="store_true",
+                        help="time diagnoses of 12, 48 and 200 runs, and their memory")  # fmt: skip
+    parser.add_argument("--before", type=Path, metavar="DIR",
+                        help="with --diagnosis: a checkout to compare with")  # fmt: skip
     parser.add_argument("--training", action="store_true",
                         help="time PPO from nothing on each vehicle too")  # fmt: skip
     parser.add_argument("--only", nargs="+", metavar="PEER", help="only these (with --peers)")
@@ -125,7 +129,10 @@ def main() -> None:
         if options.training:
             report_progress("PPO on each of them")
         trained = in_one_process("train", 1, options.rounds) if options.training else {}
-        diagnoses = diagnosis_times.measure(report_progress) if options.diagnosis else []
+        diagnoses = (
+            diagnosis_times.measure(report_progress, options.before) if options.diagnosis else []
+        )
+        diagnoses += diagnosis_times.growth(report_progress) if options.growth else []
     result = {
         "load_average": load, "processors": os.cpu_count(), "envs": options.envs, "rows": rows,
         "kernel": kernel, "cold_start_s": cold, "absent": absent,
@@ -236,10 +243,14 @@ def table(result: dict[str, Any]) -> list[list[str]]:
             share = f"{value / bare:.2f} of bare"
             lines.append([f"{what}, {name}", OURS, figure(value, "/s"), *[""] * 4, share])
     for row in result["diagnoses"]:
+        facts = [f"{1e3 * row['seconds'] / row['flown_s']:.0f} ms per second flown"]
+        if "before" in row:
+            facts.append(f"{row['seconds'] / row['before']:.2f} of before")
+        if "memory_mb" in row:
+            facts.append(f"{row['memory_mb']:.0f} MB")
         lines.append([
-            f"diagnosis, {len(row['hidden'])} hidden, {len(row['named'])} named", OURS,
-            figure(row["seconds"], "s"), "", "", "", "",
-            f"{row['flown_s'] / row['seconds']:.0f} x the time flown",
+            f"diagnosis of {row['runs']} runs, {len(row['hidden'])} hidden, {len(row['named'])} named",
+            OURS, figure(row["seconds"], "s"), "", "", "", "", ", ".join(facts),
         ])  # fmt: skip
     return lines
 

@@ -429,7 +429,10 @@ def test_the_benchmarks_table():
         },
         "kernel": found(1000.0), "cold_start_s": 12.0, "effects_off_ratio": 1.02,
         "vehicles": {"bare": 400.0, "four effects": 300.0}, "training": {},
-        "diagnoses": [{"hidden": ["a", "b"], "named": ["a"], "seconds": 11.0, "flown_s": 220.0}],
+        "diagnoses": [{
+            "hidden": ["a", "b"], "named": ["a"], "runs": 12, "seconds": 11.0, "flown_s": 220.0,
+            "before": 44.0, "memory_mb": 512.3,
+        }],
     }  # fmt: skip
     lines = benchmark.table(result)
     assert all(len(line) == len(lines[0]) for line in lines)
@@ -440,7 +443,8 @@ def test_the_benchmarks_table():
     assert any("0.60 of it in the env" in line for line in text)
     assert text[-4].startswith("effects off, against cut out|coax|+2.0 %")
     assert text[-2] == "env-steps, four effects|coax|300 /s|||||0.75 of bare"
-    assert text[-1] == "diagnosis, 2 hidden, 1 named|coax|11 s|||||20 x the time flown"
+    told = "50 ms per second flown, 0.25 of before, 512 MB"
+    assert text[-1] == f"diagnosis of 12 runs, 2 hidden, 1 named|coax|11 s|||||{told}"
 
 
 def test_the_better_of_two_rounds_counts(monkeypatch):
