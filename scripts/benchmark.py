@@ -1,12 +1,11 @@
 """Ratios measured in one run: speed of the env against others, its start, and what effects cost.
 
 Without --peers in under three minutes; --diagnosis and --training take two more each, --growth and
---before half an hour on a slow core. With --peers
-other simulators are installed, each into a venv of its own (a gigabyte each, once), and flown in turns
-with ours: ours, peer, ours, peer; the best of all rounds counts. Everyone flies random actions in their
-own vector env with their own settings, which the table states. Vehicles with effects, in wind, and
-drawn fly in turns with the bare one. Absolute times depend on the machine and its neighbours; compare
-ratios only.
+--before half an hour on a slow core. With --peers other simulators are installed, each into a venv of
+its own (a gigabyte each, once), and flown in turns with ours: ours, peer, ours, peer; the best of all
+rounds counts. Everyone flies random actions in their own vector env with their own settings, which the
+table states. Vehicles with effects, in wind, and drawn fly in turns with the bare one. Absolute times
+depend on the machine and its neighbours; compare ratios only.
 """
 
 import json

@@ -41,7 +41,7 @@ def measure(
 
     Args:
         report_progress: called with a line of text.
-        before: another checkout, whose diagnoses are timed in turn: `before` of each row.
+        before: another checkout, whose diagnoses are timed after ours: `before` of each row.
     """
     report_progress("diagnoses of twelve runs")
     rows = _of_program("kinds", ROOT)
