@@ -185,8 +185,8 @@ def test_the_injector_changes_nothing_before_its_moment(tmp_path):
 )  # fmt: skip
 def test_what_begins_in_flight_is_named_with_its_moment(tmp_path, later):
     constant = {"motor_lag": {"upper": 0.1, "lower": 0.1}}
-    # in these gusts a plate that is 0.02 rad off is not seen at all, constant or not
-    injector.fly(tmp_path, constant, gusts="swash_offset" not in later, seed=8, runs=RUNS,
+    # in these gusts a plate 0.02 rad off is not seen at all, a torque that begins is worth 8 nats
+    injector.fly(tmp_path, constant, gusts="gyro_bias" in later, seed=8, runs=RUNS,
                  later=later, since=("heave_3211", 6.0), longest=9.0)  # fmt: skip
     causes = diagnose(tmp_path, hold_out=[]).findings["causes"]
     assert {c["effect"] for c in causes} == {*constant, *later}
