@@ -20,19 +20,19 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
-from coax_env.diagnosis.confounding import alternatives
+from coax_env.diagnosis.confounding import alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, without_drifts
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.search import search
 from coax_env.estimation.beginnings import Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
-from coax_env.estimation.engine import Engine
+from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.parted_engine import of_part
 from coax_env.estimation.quadratic import Quadratic, bounded_solve
 from coax_env.estimation.state_space import Record
-from coax_env.estimation.whiteness import Whiteness
+from coax_env.estimation.whiteness import Whiteness, whiteness
 
 NEVER_BEGINS = frozenset(
     {"wind", "battery_sag", "ground_effect", "battery_voltage", "trim_drift", "wake_interference",
@@ -331,7 +331,8 @@ def _worth(
 ) -> Onset:
     """An onset with its evidence: beside no change, its numbers and its moment paid for.
 
-    Minus infinity where a gust could have made it, or where it is too small to matter.
+    Minus infinity where a gust could have made it, where it is too small to matter, and where the
+    channels that show it stay coloured: a model that is wrong there always finds a moment.
     """
     effect = found.effect
     same = replace(state.fit, noise=trial.noise)
@@ -349,10 +350,16 @@ def _worth(
         always = fitted(state.problem, noise_fitted(state.problem, always), steps=2)
         gained = (always.objective - trial.objective) / inflation
         nats = min(nats, gained - math.log(_seconds(problem) / found.width))
-    lasting = _lasting(
-        state.problem, replace(same, noise=trial.noise), problem, trial, found.moment
-    )
-    if lasting / inflation < problem.settings.tie or not _matters(problem, trial, effect):
+    without = state.problem.engine.filter(same.values, trial.noise)
+    with_it = problem.engine.filter(trial.values, trial.noise)
+    lasting = _lasting(without, with_it, found.moment) / inflation
+    white = whiteness(with_it, problem.model.channels)
+    shows = channels_of(problem, trial, quadratic, effect)
+    if (
+        lasting < problem.settings.tie
+        or not _matters(problem, trial, effect)
+        or any(c in white and not white[c].white for c in shows)
+    ):
         nats = -math.inf
     return replace(found, nats=nats)
 
@@ -378,12 +385,8 @@ def _matters(problem: Problem, fit: Fit, effect: str) -> bool:
     return False
 
 
-def _lasting(
-    same_problem: Problem, same: Fit, problem: Problem, trial: Fit, moment: Moment
-) -> float:
+def _lasting(without: Sequence[RunPass], with_it: Sequence[RunPass], moment: Moment) -> float:
     """nats of a change on the rows outside OVER, where a gust at its moment has been forgotten."""
-    without = same_problem.engine.filter(same.values, same.noise)
-    with_it = problem.engine.filter(trial.values, trial.noise)
     total = 0.0
     for a, b in zip(without, with_it, strict=True):
         kept = np.ones(a.record.t.size, bool)
