@@ -37,7 +37,7 @@ def problem_of(runs: int) -> Problem:
     """Effects with one number each on runs that were never flown."""
     free = [FreeParameter(name, 0.0, WIDE) for name in NAMES]
     engine = SimpleNamespace(records=[SimpleNamespace(whole=f"run {i}") for i in range(runs)])
-    model = SimpleNamespace(bare_values={})
+    model = SimpleNamespace(bare_values={}, moments={})
     base = (FreeParameter("mass", 0.0, WIDE),)
     own = {effect: (f,) for effect, f in zip(EFFECTS, free, strict=True)}
     return Problem(model, engine, base, own)  # type: ignore[arg-type]

@@ -166,7 +166,11 @@ def scored(state: Changing) -> list[Scored]:
 
 
 def may_begin(problem: Problem, fit: Fit, onsets: Collection[str]) -> list[str]:
-    """Effects that the machine may get or lose in flight, and that have no moment yet."""
+    """Effects that the machine may get or lose in flight, and that have no moment yet.
+
+    Args:
+        problem, fit: with what was found so far. onsets: effects that have a moment.
+    """
     others = [e for e in problem.candidates if e not in NEVER_BEGINS and e not in onsets]
     active = set(fit.active)
     return [e for e in others if e in active or not exclusive_with(e) & active]
@@ -293,7 +297,12 @@ def _next(state: Changing, runs: Sequence[str]) -> tuple[Changing, Onset] | None
 def beginning(
     problem: Problem, fit: Fit, moments: Mapping[str, Moment], runs: Sequence[str]
 ) -> Problem:
-    """The problem in which effects begin at moments of theirs, or change where they are active."""
+    """The problem in which effects begin at moments of theirs, or change where they are active.
+
+    Args:
+        problem, fit: with what was found so far. moments: of the effects.
+        runs: names of all runs, in the order in which they were flown.
+    """
     model = ChangingModel(problem.model.base, {**problem.model.moments, **moments}, runs)
     own = dict(problem.own)
     for effect in moments:

@@ -7,7 +7,7 @@ stretch first, and behind them a block's length; an input more says which block 
 """
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -165,6 +165,13 @@ class ChangingModel(HeliModel):
 
     def _blocks(self, vector: np.ndarray) -> np.ndarray:
         return vector[:-1].reshape(-1, int(vector[-1]))
+
+    @cached_property
+    def input_places(self) -> np.ndarray:
+        """As `HeliModel.input_places`, in every stretch's block."""
+        size = self.base.vector(self.base.bare_values).size
+        own = np.arange(size)[self.base.input_places]
+        return np.concatenate([s * size + own for s in range(len(self._times) + 1)])
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """The model's inputs with each row's parameters, and which these are, (n, nu + 1)."""
