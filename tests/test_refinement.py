@@ -64,7 +64,7 @@ def problem(
     best = np.array([0.3, -0.8, 0.6])
     engine = Made(best, curvature, curvature if information is None else information,
                   np.array(beyond))  # fmt: skip
-    engine.model = SimpleNamespace(channels=("p",))
+    engine.model = SimpleNamespace(channels=("p",), moments={})
     free = [FreeParameter(n, 0.0, s) for n, s in zip(NAMES, PRIOR, strict=True)]
     free[2] = replace(free[2], upper=upper)
     made = Problem(engine.model, engine, (free[0],), {"gyro_bias": tuple(free[1:])})
