@@ -408,7 +408,7 @@ def test_the_threshold_in_use_is_calibrated() -> None:
     rate = calibration.calibrated(SETTINGS.evidence, CLEAN).rate
     assert rate is not None and rate <= 0.02
     other = calibration.calibrated(SETTINGS.evidence, CLEAN | {"rate_hz": 25.0})
-    assert other.rate is None and "rate hz 25" in other.why
+    assert other.rate is None and "rows per second 25" in other.why
 
 
 def test_the_share_beyond_a_threshold() -> None:

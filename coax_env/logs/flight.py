@@ -25,6 +25,9 @@ cell where there is no new reading (an empty command holds the last one). Only `
 The card says the vehicle, the runs, and how the columns differ from that. One with every key; only
 ``[vehicle]`` and the runs' files are needed::
 
+    date = "2026-05-01"               # optional: the order of a logbook
+    synthetic = true                  # optional: a simulator flew it, and reports say so
+
     [vehicle]
     name = "lama400d"                 # shipped, or the path of a vehicle file
 

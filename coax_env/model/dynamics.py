@@ -17,6 +17,7 @@ exactly over the step. A reading at a row is taken just after the row's command 
 
 import math
 from collections.abc import Callable, Collection
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -597,6 +598,7 @@ def _stages_with(used: Collection[str] | None = None) -> dict[str, Any]:
     }
 
 
+@cache
 def drift_and_measure_of_registers() -> tuple[Any, Any]:
     """`drift_and_readings` and `measure` with every effect, to be called with SIMD registers."""
     names = _stages_with()
