@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import injector
 import numpy as np
@@ -78,6 +79,18 @@ def expected(term: str, s: dict[str, float], command: np.ndarray) -> float:
     if term.startswith("abs_"):
         return abs(s[term[4]]) * s[term[4]]
     return math.prod(s[name] for name in term.split("_"))
+
+
+def test_a_terms_std_has_its_colour_in_it():
+    """Variance 9, inflated by 2.25 as its own direction is: 4.5."""
+    quadratic = SimpleNamespace(
+        covariance=lambda names: np.diag([4.0, 9.0]),
+        variance_inflation=lambda asked, names: 2.25 if asked == ["own"] else 1.0,
+    )
+    problem = SimpleNamespace(free_names=lambda active: ["mass", "own"])
+    fit = SimpleNamespace(active=())
+    assert unlisted.standard_deviation(problem, fit, quadratic, "own") == 4.5
+    assert unlisted.standard_deviation(problem, fit, quadratic, "mass") == 2.0
 
 
 @pytest.mark.parametrize("term", [t.key for t in TERMS])

@@ -14,6 +14,7 @@ import coax_env
 from coax_env.env import fleet, hover, tasks
 from coax_env.env.gym_env import CoaxEnv
 from coax_env.env.period import DT
+from coax_env.env.randomisation import Draws
 from coax_env.env.turbulence import dryden
 from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.errors import InputError
@@ -631,6 +632,17 @@ def test_ranges_draw_uniformly_and_fly():
     assert (info["vehicle"]["ground_effect.decay"] == 2.0).all()
     assert (info["vehicle"]["gravity"] == LAMA["gravity"].value).all()
     assert info["_vehicle"].all()
+
+
+def test_the_most_a_number_can_be_is_known_before_any_flight():
+    """The end of its range, the largest of a list, its limit where a spread has no end."""
+    late = LAMA.with_effect("servo_delay", time=0.04)
+    drawn = Draws(LAMA, {"servo_delay.time": (0.0, 0.05)})
+    assert drawn.most("servo_delay.time") == 0.05 and drawn.most("command_delay.time") == 0.0
+    assert Draws(LAMA, [LAMA, late]).most("servo_delay.time") == 0.04
+    assert Draws(late).most("servo_delay.time") == 0.04
+    limit = effects.CATALOGUE["servo_delay"].parameters[0].upper
+    assert Draws(late, "posterior").most("servo_delay.time") == limit
 
 
 @pytest.mark.usefixtures("one_by_one")
