@@ -122,7 +122,8 @@ def add_air(parser: Parser) -> None:
     """``--wind`` and ``--turbulence``, for `air`."""
     parser.add_argument(
         "--wind", nargs="+", metavar="M/S",
-        help="north east; a speed from anywhere; or LOWEST..HIGHEST, drawn for every flight",
+        help="north east; a speed from anywhere; or LOWEST..HIGHEST, drawn for every flight; it acts on"
+        " vehicles with drag or blow-back, as lama400d_outdoor",
     )  # fmt: skip
     parser.add_argument("--turbulence", help="Dryden's: light, moderate, severe, or m/s at 6 m")
 
