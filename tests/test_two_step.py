@@ -319,6 +319,16 @@ def test_step_one_starts_from_rest_at_the_median_of_the_first_echoes():
     assert np.isnan(found.residual[::5]).sum() == 1 and np.isnan(found.residual[1])
 
 
+def test_loads_follow_the_tilt_that_is_given_whatever_the_bars_gains():
+    """The upper disc's tilt is an argument: how the stabiliser bar makes it does not matter."""
+    tilts = {"alpha": (0.05, 0.02), "beta": (-0.03, 0.04)}
+    one = loads(LAMA, 210.0, 205.0, **tilts)
+    gains = {"flybar_to_rotor_lon": 0.7, "flybar_to_rotor_lat": 0.4}
+    other = loads(LAMA.with_values(gains), 210.0, 205.0, **tilts)
+    for name in ("X", "Y", "Z", "L", "M", "N"):
+        assert getattr(other, name) == pytest.approx(getattr(one, name), abs=1e-12), name
+
+
 def test_flapping_follows_its_closed_form():
     dt, tau, gain = 0.01, 0.05, 0.91
     t = dt * np.arange(200)
