@@ -968,8 +968,10 @@ def test_entries_are_complete(name):
 def test_no_two_compiled_functions_share_a_name():
     """Else one's machine code runs as the other's, where a process loads what two have compiled."""
     names = {}
+    gc.collect()
     for thing in gc.get_objects():
-        if isinstance(thing, Dispatcher) and thing.py_func.__module__.startswith("coax_env"):
+        # its type, not isinstance: that asks a weak reference, whose object may be gone
+        if issubclass(type(thing), Dispatcher) and thing.py_func.__module__.startswith("coax_env"):
             name = (thing.py_func.__module__, thing.py_func.__qualname__)
             assert names.setdefault(name, thing) is thing, name
     assert len(names) > 50
