@@ -60,7 +60,12 @@ def with_unit(value: float | None, unit: str, digits: int = 3) -> str:
     """
     if value is None or not math.isfinite(value):
         return number(None)
-    return _joined(number(read_factor(unit) * value, digits), unit_name(unit))
+    return _joined(number_in(value, unit, digits), unit_name(unit))
+
+
+def number_in(value: float | None, unit: str, digits: int = 3) -> str:
+    """The number of `with_unit` alone, for where the unit stands elsewhere; arguments as there."""
+    return number(None if value is None else read_factor(unit) * value, digits)
 
 
 def _joined(text: str, shown: str) -> str:

@@ -9,7 +9,7 @@ from coax_env.model.generic_terms import AXES, TERMS
 from coax_env.plain_words import (
     and_list,
     channel_name,
-    number,
+    number_in,
     read_factor,
     seconds,
     unit_name,
@@ -113,19 +113,20 @@ def _error_left(entry: Mapping[str, Any]) -> float:
 
 def _row(channel: str, entry: Mapping[str, Any]) -> list[str]:
     """A channel of the gain in a table."""
-    place, by = f"gain/channels/{channel}", read_factor(entry["unit"])
+    place, unit = f"gain/channels/{channel}", entry["unit"]
+    by = read_factor(unit)
 
     def shown(key: str) -> str:
         value = entry[key]
-        return datum(number(None if value is None else by * value), f"{place}/{key}", value, by)
+        return datum(number_in(value, unit), f"{place}/{key}", value, by)
 
     ends = [
-        datum(number(None if end is None else by * end), f"{place}/ci95/{k}", end, by)
+        datum(number_in(end, unit), f"{place}/ci95/{k}", end, by)
         for k, end in enumerate(entry.get("ci95") or ())
     ]
     return [
         channel_name(channel),
-        unit_name(entry["unit"]),
+        unit_name(unit),
         shown("before"),
         shown("before_refitted"),
         shown("after"),

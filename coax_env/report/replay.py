@@ -12,7 +12,7 @@ from coax_env.plain_words import (
     capital,
     channel_name,
     number,
-    read_factor,
+    number_in,
     seconds,
     unit_name,
     with_unit,
@@ -88,7 +88,7 @@ def _overview(
     units = {c: e["unit"] for entries in tables.values() for c, e in entries.items()}
     header = ["run", *(f"{channel_name(c)} [{unit_name(units[c])}]" for c in channels)]
     numbers = [
-        [run, *("–" if e is None else _read(e) for e in row)]
+        [run, *("–" if e is None else number_in(e["rms"], e["unit"]) for e in row)]
         for run, row in zip(tables, cells, strict=True)
     ]
     return [
@@ -119,12 +119,6 @@ def _error_over_noise(entry: Entry | None, missing: float = math.nan) -> float:
     if entry is None or entry["rms"] is None or not entry["noise_rms"]:
         return missing
     return float(entry["rms"] / entry["noise_rms"])
-
-
-def _read(entry: Entry) -> str:
-    """The error in the unit of its column."""
-    rms = entry["rms"]
-    return number(None if rms is None else read_factor(entry["unit"]) * rms)
 
 
 def _cell(entry: Entry | None) -> str:
