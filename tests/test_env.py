@@ -68,8 +68,10 @@ def test_gymnasium_checks_the_vector_env_without_a_warning():
 
 def test_import_is_light():
     code = (
-        "import sys, coax_env, gymnasium; gymnasium.make('CoaxHeli-v0').reset(seed=0);"
-        "heavy = ('torch', 'plotly', 'control', 'stable_baselines3');"
+        "import sys, coax_env, gymnasium; env = gymnasium.make('CoaxHeli-v0');"
+        "env.reset(seed=0); env.step(env.action_space.sample());"
+        "heavy = ('torch', 'plotly', 'control', 'stable_baselines3', 'scipy.interpolate',"
+        " 'scipy.optimize', 'scipy.spatial');"
         "print([m for m in heavy if m in sys.modules])"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
