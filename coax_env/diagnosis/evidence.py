@@ -1,11 +1,12 @@
 """What each cause is worth once everything else, noise levels too, is refitted without it."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, without
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.refinement import refined
-from coax_env.diagnosis.scores import inflation
+from coax_env.diagnosis.scores import inflation, loss
 from coax_env.estimation.quadratic import Quadratic
 
 
@@ -22,29 +23,42 @@ class Evidence:
         return self.lost / self.inflation
 
 
-def weigh(problem: Problem, fit: Fit, quadratic: Quadratic) -> dict[str, Evidence]:
-    """Evidence of every active effect.
+@dataclass(frozen=True)
+class Weighed:
+    """What a cause is worth, and the fit without it."""
+
+    evidence: Evidence
+    rest: Fit
+
+
+def weigh(
+    problem: Problem, fit: Fit, quadratic: Quadratic, which: Sequence[str]
+) -> dict[str, Weighed]:
+    """Evidence of active effects, each from a refit without it.
 
     Args:
         problem, fit: what may be free, and where.
         quadratic: linearised at the fit.
+        which: the effects.
     """
     chosen = problem.settings
 
-    def one(effect: str) -> Evidence:
+    def one(effect: str) -> Weighed:
         held = tuple(problem.file_values(effect))
         factor = inflation(problem, quadratic, fit.active, effect)
         rest = noise_fitted(problem, without(problem, fit, quadratic, effect))
         rest = fitted(problem, rest, steps=1, held=held)
         if rest.objective - fit.objective < chosen.clear_evidence * chosen.evidence * factor:
             rest = converged(problem, rest, held)
-        return Evidence(float(rest.objective - fit.objective), factor)
+        return Weighed(Evidence(float(rest.objective - fit.objective), factor), rest)
 
-    return problem.for_each(one, fit.active)
+    return problem.for_each(one, which)
 
 
 def prune(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic, dict[str, Evidence]]:
     """Remove, one at a time, causes whose evidence is gone once the noise levels are fitted too.
+
+    What is in doubt by the quadratic is weighed first: the clear ones wait until nothing is removed.
 
     Returns:
         the refined fit, the quadratic at it, and the evidence of what is left.
@@ -52,15 +66,40 @@ def prune(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic, dict[str, Evidenc
     while True:
         fit = refined(problem, converged(problem, fit))
         fit, _, quadratic = linearise(problem, fit)
-        evidence = weigh(problem, fit, quadratic)
-        weakest = min(evidence, key=lambda e: evidence[e].nats, default=None)
-        if weakest is None or evidence[weakest].nats >= problem.settings.evidence:
-            return fit, quadratic, evidence
-        nats = evidence[weakest].nats
-        problem.report(f"dropped {weakest}: worth {nats:.1f} nats in the end")
-        fit = _dropped(problem, fit, weakest).noted(f"- {weakest}", max(nats, 0.0))
+        doubtful = [e for e in fit.active if _is_doubtful(problem, fit, quadratic, e)]
+        weighed: dict[str, Weighed] = {}
+        for which in (doubtful, [e for e in fit.active if e not in doubtful]):
+            weighed |= weigh(problem, fit, quadratic, which)
+            better = _better(problem, fit, weighed)
+            if better is not None:
+                fit = better
+                break
+        else:
+            return fit, quadratic, {e: weighed[e].evidence for e in fit.active}
 
 
-def _dropped(problem: Problem, fit: Fit, effect: str) -> Fit:
-    off = problem.off_values(effect) | problem.file_values(effect)
-    return replace(fit.at(off), active=fit.rest(effect))
+def _is_doubtful(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:
+    """Whether a cause is not worth several thresholds by the quadratic."""
+    factor = inflation(problem, quadratic, fit.active, effect)
+    worth = loss(problem, quadratic, fit.active, effect, factor)
+    return worth < problem.settings.clear_evidence * problem.settings.evidence
+
+
+def _better(problem: Problem, fit: Fit, weighed: Mapping[str, Weighed]) -> Fit | None:
+    """A fit to go on from: with noise levels of larger likelihood, else without the weakest cause.
+
+    A model with one cause less cannot be likelier but by its noise levels: the fit's have then not
+    converged, and the cause has its say beside better ones before it may be removed.
+    """
+    if not weighed:
+        return None
+    weakest = min(weighed, key=lambda e: weighed[e].evidence.nats)
+    evidence, rest = weighed[weakest].evidence, weighed[weakest].rest
+    if evidence.lost < -problem.settings.tie:
+        again = converged(problem, replace(fit, noise=rest.noise))
+        if again.objective < fit.objective - problem.settings.tie:
+            return again
+    if evidence.nats >= problem.settings.evidence:
+        return None
+    problem.report(f"dropped {weakest}: worth {evidence.nats:.1f} nats in the end")
+    return rest.noted(f"- {weakest}", max(evidence.nats, 0.0))

@@ -162,7 +162,8 @@ def is_over(x):
 
 def in_world(states: np.ndarray) -> np.ndarray:
     """Velocities north, east and down [m/s], shape (..., 3), of states (..., >=16)."""
-    from scipy.spatial.transform import Rotation  # here: its import takes as long as all of an env's
+    # here, since the import takes as long as all of an env's
+    from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_euler("ZYX", states[..., [S.PSI, S.THETA, S.PHI]].reshape(-1, 3))
     return turn.apply(states[..., VELOCITY].reshape(-1, 3)).reshape(*states.shape[:-1], 3)

@@ -154,7 +154,8 @@ def _checked(rows: np.ndarray, what: str) -> np.ndarray:
 
 def _through(rows: np.ndarray) -> tuple[np.ndarray, int]:
     """A cubic spline through the rows, at rest at both ends; the last point is held."""
-    from scipy.interpolate import CubicSpline  # here: its import takes longer than an env's first step
+    # here, since the import takes longer than an env's first step
+    from scipy.interpolate import CubicSpline
 
     spline = CubicSpline(rows[:, 0], rows[:, 1:] * (1.0, 1.0, -1.0, 1.0), bc_type="clamped")
     t = hover.CONTROL_PERIOD * np.arange(round(rows[-1, 0] / hover.CONTROL_PERIOD) + 1)
