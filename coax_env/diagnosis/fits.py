@@ -29,7 +29,7 @@ def start(problem: Problem, noise: Noise, held: Collection[str] = ()) -> Fit:
     levels = tuple(name for name in fitted_levels(noise) if name not in held)
     noise = fit_noise(
         problem.engine, values, noise, levels,
-        chosen.first_noise_evaluations, chosen.step_gain, chosen.noise_fit_seconds,
+        chosen.first_noise_evaluations, chosen.step_gain, problem.noise_fit_seconds,
     )  # fmt: skip
     fit = Fit((), values, noise, levels=levels)
     return with_latent_noise(problem, fit) or fit
@@ -123,7 +123,7 @@ def noise_fitted(problem: Problem, fit: Fit, seconds: float | None = None) -> Fi
     noise = fit_noise(
         problem.engine, fit.values, fit.noise, fit.levels,
         evaluations=chosen.noise_evaluations, tolerance=chosen.step_gain,
-        seconds=chosen.noise_fit_seconds if seconds is None else seconds,
+        seconds=problem.noise_fit_seconds if seconds is None else seconds,
     )  # fmt: skip
     return replace(fit, noise=noise)
 
@@ -193,7 +193,7 @@ def with_latent_noise(problem: Problem, fit: Fit) -> Fit | None:
     levels = (*fit.levels, *asked)
     noise = fit_noise(
         engine, fit.values, fit.noise.with_levels(first), levels,
-        chosen.first_noise_evaluations, chosen.step_gain, chosen.noise_fit_seconds,
+        chosen.first_noise_evaluations, chosen.step_gain, problem.noise_fit_seconds,
     )  # fmt: skip
     gained = engine.log_likelihood(fit.values, noise)
     gained -= engine.log_likelihood(fit.values, fit.noise)

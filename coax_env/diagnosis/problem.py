@@ -163,6 +163,12 @@ class Problem:
         """Values at which an effect is not there."""
         return {f.name: f.value for f in self.own[effect]}
 
+    @property
+    def noise_fit_seconds(self) -> float:
+        """s of flight on which noise levels are fitted while the search goes on."""
+        flown = sum(float(r.t[-1] - r.t[0]) for r in self.engine.records)
+        return max(self.settings.noise_fit_seconds, self.settings.noise_fit_share * flown)
+
     # --- work -----------------------------------------------------------------------------------------
 
     def report(self, text: str) -> None:

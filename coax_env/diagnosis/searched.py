@@ -101,7 +101,7 @@ def _with_jitter(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]]
     trial = replace(fit.at({REACTION.name: REACTION.value}), levels=levels)
     noise = fit_noise(
         wider.engine, trial.values, start, levels,
-        chosen.first_noise_evaluations, chosen.step_gain, chosen.noise_fit_seconds,
+        chosen.first_noise_evaluations, chosen.step_gain, problem.noise_fit_seconds,
     )  # fmt: skip
     gained = wider.engine.log_likelihood(trial.values, noise)
     gained -= sum(run.log_likelihood for run in passes)
