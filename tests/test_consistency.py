@@ -337,7 +337,9 @@ WORDS = {"compare": ("sound", "f"), "logbook": (".",)}
 """Of scripts that take another thing than the one flight."""
 
 
-@pytest.mark.parametrize("script", ["diagnose", "identify", "replay", "compare", "logbook"])
+@pytest.mark.parametrize("script", ["diagnose", *(
+    pytest.param(s, marks=pytest.mark.slow) for s in ("identify", "replay", "compare", "logbook")
+)])  # fmt: skip
 def test_the_scripts_refuse_in_one_line(tmp_path, monkeypatch, script):
     """What ran for 290 s before and gave false causes; nothing is written."""
     import importlib

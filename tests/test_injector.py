@@ -104,6 +104,7 @@ def test_a_flight_of_it_looks_like_open_none(tmp_path: Path) -> None:
         assert 0.3 < ours.run(name).command[:, 2].std() / theirs.run(name).command[:, 2].std() < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", injector.EFFECTS)
 def test_every_effect_can_be_flown_with(tmp_path: Path, effect: str) -> None:
     flight = read_flight(
@@ -253,6 +254,7 @@ def test_unrest_of_rotors_and_trim(tmp_path: Path) -> None:
     assert turn == pytest.approx(expected, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gusts", GUSTS)
 @pytest.mark.parametrize("craft", [LAMA, COAX, draw(np.random.default_rng(8))])
 def test_every_pilot_flies_every_craft_in_every_air(
