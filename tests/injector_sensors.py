@@ -1,5 +1,6 @@
 """The injector's sensors: what a log has, how often, how exactly, and what its card says of it."""
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
@@ -11,6 +12,9 @@ NOISE = {
     "h": 0.05, "vn": 0.5, "ve": 0.5, "vd": 0.5,
 }  # fmt: skip
 """The paper's Table V."""
+
+FAST = ("rpm_upper", "rpm_lower", "p", "q", "r", "ax", "ay", "az")
+"""What is read in every row of a fast log."""
 
 POSE = {"phi": 1.4e-3, "theta": 1.6e-3, "psi": 8e-4, "pn": 1e-4, "pe": 1e-4, "h": 2e-4}
 """What third differences of the real CoaX flights show: rad and m."""
@@ -51,6 +55,10 @@ SENSORS = {
     "onboard": Sensors(
         NOISE | {"vn": 0.2, "ve": 0.2, "vd": 0.2},
         {"h": 5, "phi": 2, "theta": 2, "psi": 2, "vn": 10, "ve": 10, "vd": 10},
+    ),
+    "fast": Sensors(  # the inertial sensors in each of 500 rows a second, as noisy in 10 ms as above
+        {c: std * (math.sqrt(5.0) if c in FAST else 1.0) for c, std in NOISE.items()},
+        {c: 5 for c in NOISE if c not in FAST}, step=0.002,
     ),
     "pose": Sensors(
         POSE, step=1.0 / 150.0, unrest=0.2, lost=0.01, outliers=0.002,

@@ -15,6 +15,7 @@ from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import ROTORS, HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.state_space import Noise, Record
+from coax_env.logs.fast_rows import decimated
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
@@ -135,7 +136,7 @@ def one_flight(
     flown = flown_parts(flight, vehicle)
     remarks = refuse_disagreement(flown, vehicle, waive)
     lines, calm, still = vibration.calmed(flown, vehicle)
-    still = vibration.without(still)
+    still, calm = vibration.without(still), decimated(calm)
     return OneFlight(name, calm, lines, still, starting_noise(calm, still), remarks)
 
 

@@ -41,6 +41,7 @@ from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import WARM_UP
 from coax_env.estimation.quadratic import bounded_solve
 from coax_env.estimation.state_space import Record
+from coax_env.logs.fast_rows import decimated
 from coax_env.logs.flight import Flight
 from coax_env.model import effects
 from coax_env.model.layout import N_COMMANDS
@@ -155,13 +156,13 @@ class Changes:
 
 
 def calm(flight: Flight, vehicle: Vehicle) -> Flight:
-    """What was flown, without what vibrates at a rotor's speed: what a model is fitted to.
+    """What was flown, without what vibrates at a rotor's speed, in no more rows than a fit needs.
 
     Args:
         flight: as read.
         vehicle: in the flight's air.
     """
-    return vibration.calmed(flown_parts(flight, vehicle), vehicle)[1]
+    return decimated(vibration.calmed(flown_parts(flight, vehicle), vehicle)[1])
 
 
 def fitted_model(

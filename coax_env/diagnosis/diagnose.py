@@ -50,6 +50,7 @@ from coax_env.estimation.helicopter_noise import sensor_std, starting_noise
 from coax_env.estimation.prediction import RunReplay, gusts_of, replay_runs
 from coax_env.estimation.state_space import Record
 from coax_env.estimation.whiteness import Whiteness, whiteness
+from coax_env.logs.fast_rows import decimated
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model import effects
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
@@ -146,6 +147,7 @@ def diagnose(
     lines, calm, calm_vehicle = (
         ((), flight, vehicle) if "vibration" in exclude else vibration.calmed(flight, vehicle)
     )
+    flight, calm = decimated(flight), decimated(calm)
     new_lines = lines if "vibration" not in vehicle.effects else ()
     model = HeliModel(vehicle, stated(flight))
     noise = starting_noise(calm, calm_vehicle)

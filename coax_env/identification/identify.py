@@ -38,6 +38,7 @@ from coax_env.identification.maximum_likelihood import (
 )
 from coax_env.identification.two_step.method import TwoStep, two_step
 from coax_env.identification.undetermined import left_open
+from coax_env.logs.fast_rows import decimated
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
@@ -152,6 +153,8 @@ def identify(
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
     flight = flown_parts(flight, vehicle)
     passed_over = refuse_disagreement(flight, vehicle, waive)
+    if method != "paper":
+        flight = decimated(flight)
     flight, held = _split(flight, hold_out)
     known = (*flight.notes, *passed_over, *double_counting(flight, vehicle))
     if method == "paper":

@@ -1,0 +1,151 @@
+"""Logs with more rows than a body of this size moves by: fewer rows, and nothing lost.
+
+A fit costs so much for every row, and 500 rows a second tell nothing of a flight that their means
+over a hundredth of a second do not. So rows are kept every hundredth of a second, and besides all rows
+with a reading of a sensor slower than the log, untouched. Of a sensor with a reading in every row the
+mean around a kept row stands there, over as much time before as after: what changes evenly stays as it
+is. Of a command the mean of what was held until the next kept row stands, whose effect is the same.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from coax_env.kernel.angles import wrap_angles
+from coax_env.logs.flight import Flight, Run
+from coax_env.logs.held_signal import integral_of_held
+from coax_env.model.layout import ANGLES
+from coax_env.plain_words import and_list
+
+ENOUGH_RATE = 100.0
+"""Rows per second that a fit needs [Hz]: ten times what the shipped vehicles' rates turn over by, and
+the rate that all was measured at; ours."""
+IN_EVERY_ROW = 0.9
+"""Share of the rows from which on a sensor is as fast as the log; ours."""
+
+
+def decimated(flight: Flight) -> Flight:
+    """The flight with no more than about ENOUGH_RATE rows per second, and a note of it.
+
+    A flight of less than twice that rate is returned as it is. The stated noise of what was averaged
+    becomes that of the means.
+
+    Args:
+        flight: its runs as flown, without gaps.
+    """
+    factors = [_factor(run.t) for run in flight.runs]
+    if max(factors, default=1) < 2:
+        return flight
+    fast = [_fast_channels(run) for run in flight.runs]
+    runs = tuple(
+        _decimated_run(run, k, own) if k > 1 else run
+        for run, k, own in zip(flight.runs, factors, fast, strict=True)
+    )
+    averaged = [c for c in flight.channels if any(c in own for own in fast)]
+    least = min(k for k in factors if k > 1)
+    rows = sum(run.t.size for run in flight.runs), sum(run.t.size for run in runs)
+    counts = Counter(flight.counts) + Counter({"rows averaged": rows[0] - rows[1]})
+    return replace(
+        flight, runs=runs, noise=_of_means(flight.noise, averaged, least), counts=dict(counts),
+        notes=(*flight.notes, _note(averaged, max(factors), *rows)),
+    )  # fmt: skip
+
+
+def _factor(t: np.ndarray) -> int:
+    """Rows of a run whose time one row may stand for."""
+    if t.size < 3:
+        return 1
+    return max(1, int(1.001 / (ENOUGH_RATE * float(np.median(np.diff(t))))))
+
+
+def _fast_channels(run: Run) -> frozenset[str]:
+    return frozenset(
+        c for c, values in run.measured.items() if np.isfinite(values).mean() > IN_EVERY_ROW
+    )
+
+
+def _decimated_run(run: Run, factor: int, fast: frozenset[str]) -> Run:
+    """A run with a row for `factor`, and those of readings of channels that are not `fast`."""
+    slow = [np.isfinite(values) for c, values in run.measured.items() if c not in fast]
+    kept = _kept_rows(run.t.size, factor, _rows_with(slow))
+    measured = {
+        c: _means(c, values, kept) if c in fast else values[kept]
+        for c, values in run.measured.items()
+    }
+    battery = None if run.battery is None else run.battery[kept]
+    return replace(
+        run, t=run.t[kept], command=_held_means(run, kept), measured=measured, battery=battery,
+        began=run.beginning,
+    )  # fmt: skip
+
+
+def _rows_with(readings: Sequence[np.ndarray]) -> np.ndarray:
+    """Rows in which one of some channels has a reading; (n,) of each whether it has."""
+    return np.flatnonzero(np.any(readings, axis=0)) if readings else np.empty(0, np.int64)
+
+
+def _kept_rows(count: int, factor: int, needed: np.ndarray) -> np.ndarray:
+    """Rows no more than `factor` apart, evenly between those needed; half as many lie at either end."""
+    first, last = factor // 2, count - 1 - factor // 2
+    needed = needed[(needed >= first) & (needed <= last)]
+    if not needed.size:
+        return np.arange(first, last + 1, factor)
+    between = [
+        np.linspace(a, b, math.ceil((b - a) / factor) + 1)[1:].round() for a, b in pairwise(needed)
+    ]
+    before = np.arange(needed[0], first - 1, -factor)[::-1]
+    behind = np.arange(needed[-1], last + 1, factor)[1:]
+    return np.concatenate([before, *between, behind]).astype(np.int64)
+
+
+def _means(channel: str, values: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Means around the rows kept, as far as half the way to the nearer neighbour on either side.
+
+    A row half way belongs to both by half.
+    """
+    there = np.flatnonzero(np.isfinite(values))
+    smooth = values.copy()
+    if channel in ANGLES:
+        smooth[there] = np.unwrap(values[there])
+    finite = np.isfinite(smooth)
+    sums = np.append(0.0, np.cumsum(np.where(finite, smooth, 0.0)))
+    counts = np.append(0, np.cumsum(finite))
+    apart = np.diff(kept)
+    spacing = np.minimum(np.append(apart[:1], apart), np.append(apart, apart[-1:]))
+    half, even = spacing // 2, (spacing % 2 == 0) & (spacing > 0)
+    first, last = kept - half, kept + half
+    total = sums[last + 1] - sums[first]
+    weight = (counts[last + 1] - counts[first]).astype(float)
+    for end in (first, last):
+        total -= np.where(even, 0.5 * np.where(finite[end], smooth[end], 0.0), 0.0)
+        weight -= np.where(even, 0.5 * finite[end], 0.0)
+    found = np.full(kept.size, np.nan)
+    np.divide(total, weight, out=found, where=weight > 0.0)
+    return wrap_angles(found) if channel in ANGLES else found
+
+
+def _held_means(run: Run, kept: np.ndarray) -> np.ndarray:
+    """Of each command the mean from a kept row to the next, (rows, 4); at the last what it is there."""
+    t = run.t[kept]
+    means = [
+        np.append(np.diff(integral_of_held(run.t, column)(t)) / np.diff(t), column[kept[-1]])
+        for column in run.command.T
+    ]
+    return np.array(means).T
+
+
+def _of_means(noise: Mapping[str, float], averaged: Sequence[str], rows: int) -> dict[str, float]:
+    return {c: std / np.sqrt(rows) if c in averaged else std for c, std in noise.items()}
+
+
+def _note(averaged: Sequence[str], factor: int, before: int, after: int) -> str:
+    said = f"{before} rows taken as {after}, about {ENOUGH_RATE:g} a second"
+    if not averaged:
+        return said
+    return (
+        f"{said}: means over {factor} of {and_list(list(averaged))}, and their noise is the means'"
+    )

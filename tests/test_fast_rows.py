@@ -1,0 +1,121 @@
+"""Logs of many rows a second: what their means keep, in closed form, and what is found in them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from causes import check_causes, truth_of
+from injector import fly
+from injector_sensors import FAST, SENSORS
+
+import coax_env
+from coax_env.logs.fast_rows import ENOUGH_RATE, decimated
+from coax_env.logs.flight import Flight, Run, read_flight
+
+RNG = np.random.default_rng(3)
+
+
+def log(rate: float, seconds: float = 4.0, **channels: np.ndarray) -> Flight:
+    """A flight of one run with these channels and commands that change in every row."""
+    t = np.arange(round(rate * seconds)) / rate
+    command = RNG.normal(size=(t.size, 4))
+    return Flight(
+        "lama400d", (Run("hover", t, command, channels),), noise=dict.fromkeys(channels, 0.1)
+    )
+
+
+def times(rate: float, seconds: float = 4.0) -> np.ndarray:
+    return np.arange(round(rate * seconds)) / rate
+
+
+@pytest.mark.parametrize("rate", [25.0, 100.0, 150.0, 199.0])
+def test_a_log_of_usual_rate_is_left_alone(rate):
+    flight = log(rate, p=RNG.normal(size=times(rate).size))
+    assert decimated(flight) is flight
+
+
+@pytest.mark.parametrize("rate", [200.0, 333.0, 400.0, 500.0, 1000.0])
+def test_what_changes_evenly_stays_as_it_is(rate):
+    t = times(rate)
+    flight = log(rate, p=3.0 - 2.0 * t, psi=(3.0 + 5.0 * t + np.pi) % (2 * np.pi) - np.pi)
+    run = decimated(flight).runs[0]
+    assert ENOUGH_RATE <= 1.001 / np.median(np.diff(run.t)) < 2.0 * ENOUGH_RATE
+    assert np.isin(run.t, t).all()
+    np.testing.assert_allclose(run.measured["p"], 3.0 - 2.0 * run.t, atol=1e-11)
+    turned = run.measured["psi"] - (3.0 + 5.0 * run.t)
+    np.testing.assert_allclose(np.exp(1j * turned), 1.0, atol=1e-11)
+    assert np.abs(run.measured["psi"]).max() <= np.pi
+    assert run.beginning == 0.0
+
+
+@pytest.mark.parametrize(
+    ("rate", "variance"), [(500.0, 1 / 5), (400.0, 3.5 / 16), (200.0, 1.5 / 4)]
+)
+def test_white_noise_is_that_of_the_means(rate, variance):
+    """Of 2 m + 1 rows, those at the ends by half where neighbours share them: squared weights."""
+    flight = log(rate, 400.0, q=RNG.normal(size=round(rate * 400.0)))
+    kept = decimated(flight)
+    q = kept.runs[0].measured["q"]
+    assert np.var(q) == pytest.approx(variance, rel=5 * np.sqrt(2 / q.size))
+    assert kept.noise["q"] == pytest.approx(0.1 * np.sqrt(100.0 / rate))
+
+
+def test_readings_of_slower_sensors_stay_where_and_what_they_were():
+    t = times(500.0)
+    slow = np.full(t.size, np.nan)
+    slow[3::8] = RNG.normal(size=slow[3::8].size)
+    flight = log(500.0, p=np.sin(3.0 * t), h=slow)
+    kept = decimated(flight)
+    run = kept.runs[0]
+    inside = (t >= run.t[0]) & (t <= run.t[-1]) & np.isfinite(slow)
+    assert np.count_nonzero(inside) >= np.count_nonzero(np.isfinite(slow)) - 2
+    there = np.isfinite(run.measured["h"])
+    np.testing.assert_array_equal(run.t[there], t[inside])
+    np.testing.assert_array_equal(run.measured["h"][there], slow[inside])
+    assert np.diff(run.t).max() <= 5.001 / 500.0
+    assert np.diff(run.t).min() >= 3.999 / 500.0  # evenly between them
+    assert kept.noise == {"p": pytest.approx(0.1 / np.sqrt(5.0)), "h": 0.1}
+
+
+def test_a_missing_reading_is_no_zero():
+    t = times(500.0)
+    p = 2.0 + 0.0 * t
+    p[RNG.random(t.size) < 0.05] = np.nan
+    p[1000:1012] = np.nan
+    found = decimated(log(500.0, p=p)).runs[0].measured["p"]
+    assert np.isnan(found).sum() in (1, 2)
+    np.testing.assert_allclose(found[np.isfinite(found)], 2.0, atol=1e-9)
+
+
+def test_commands_bring_the_same_in_all():
+    """The integral of a held command from a kept row to any other is that of the log."""
+    flight = log(500.0, p=np.zeros(2000))
+    whole, run = flight.runs[0], decimated(flight).runs[0]
+    rows = np.searchsorted(whole.t, run.t)
+    before = np.vstack([np.zeros(4), np.cumsum(whole.command[:-1] * 0.002, axis=0)])[rows]
+    after = np.vstack([np.zeros(4), np.cumsum(run.command[:-1] * np.diff(run.t)[:, None], axis=0)])
+    np.testing.assert_allclose(after, before - before[0], atol=1e-12)
+    np.testing.assert_array_equal(run.command[-1], whole.command[rows[-1]])
+
+
+def test_what_was_done_is_said():
+    t = times(500.0)
+    slow = np.where(np.arange(t.size) % 10 == 0, 1.0, np.nan)
+    flight = decimated(log(500.0, p=np.sin(t), q=np.cos(t), h=slow))
+    (note,) = flight.notes
+    rows = flight.runs[0].t.size
+    assert note.startswith(
+        f"2000 rows taken as {rows}, about 100 a second: means over 5 of p and q"
+    )
+    assert flight.counts == {"rows averaged": 2000 - rows}
+
+
+@pytest.mark.slow
+def test_a_log_of_500_hz_gives_up_what_is_hidden_in_it(tmp_path: Path):
+    hidden = {"motor_lag": {"upper": 0.08, "lower": 0.08}, "gyro_bias": {"x": 0.02}}
+    folder = fly(tmp_path, hidden, gusts=True, sensors="fast", seed=5)
+    result = coax_env.diagnose(read_flight(folder))
+    assert any("rows taken as" in remark for remark in result.remarks)
+    check_causes(result.findings, *truth_of(folder))
+    assert result.noise["p"] == pytest.approx(SENSORS["fast"].noise["p"] / np.sqrt(5.0), rel=0.05)
+    assert set(FAST) <= set(result.flight.channels)
