@@ -48,6 +48,8 @@ OWN: dict[str, tuple[str, ...]] = {
     "controllers/estimator.py": (
         "tests/test_estimator.py", "tests/test_faulty_sensors.py", "tests/test_controllers.py",
     ),
+    "coax_env/estimation/beginnings.py": ("tests/test_onset.py",),
+    "coax_env/estimation/changing_model.py": ("tests/test_onset.py",),
     "coax_env/estimation/flown.py": ("tests/test_blinding_logs.py", "tests/test_estimation.py"),
     "coax_env/estimation/parted_engine.py": ("tests/test_compare.py", "tests/test_estimation.py"),
     "coax_env/estimation/quadratic.py": ("tests/test_quadratic.py", "tests/test_diagnosis.py"),
@@ -71,6 +73,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/diagnosis/trust.py": ("tests/test_trust.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/replication.py": ("tests/test_trust.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/changes.py": ("tests/test_edits.py",),
+    "coax_env/diagnosis/evidence.py": ("tests/test_fits.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/refinement.py": (
         "tests/test_refinement.py", "tests/test_diagnosis.py", "tests/test_unlisted.py",
     ),
