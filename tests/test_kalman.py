@@ -23,9 +23,19 @@ from test_estimation import (
 )
 
 from coax_env.estimation import kalman
-from coax_env.estimation.sparse import ROW_MULTIPLE, find_non_zeros, multiply, padded, with_places
+from coax_env.estimation.sparse import (
+    ROW_MULTIPLE,
+    aligned,
+    combine,
+    find_non_zeros,
+    multiply,
+    padded,
+    unpack,
+    with_places,
+)
 from coax_env.estimation.state_space import Record
 from coax_env.kernel.angles import wrap_angles
+from coax_env.kernel.simd import SIMD_WIDTH
 
 GATE = 8.0
 H = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
@@ -203,3 +213,49 @@ def test_a_sparse_product_is_the_dense_one(share):
 @pytest.mark.parametrize("count", [1, ROW_MULTIPLE - 1, ROW_MULTIPLE, ROW_MULTIPLE + 1])
 def test_rows_are_padded_to_whole_multiples(count):
     assert padded(count) % ROW_MULTIPLE == 0 and 0 <= padded(count) - count < ROW_MULTIPLE
+
+
+@pytest.mark.parametrize("width", [5, SIMD_WIDTH, SIMD_WIDTH + 3, 4 * SIMD_WIDTH])
+def test_places_are_noted_anew_wherever_a_value_changes(width):
+    """Rows of whole registers remember which lanes were not zero; others are looked through."""
+    A = with_places(np.zeros((2, width)), width)
+    assert A.seen.shape == (2, width // SIMD_WIDTH if width % SIMD_WIDTH == 0 else 0)
+    find_non_zeros(A)
+    assert list(A.counts) == [0, 0]
+    for j in range(width):
+        A.values[1, j] = -1.5
+        find_non_zeros(A)
+        assert list(A.counts) == [0, 1] and A.places[1, 0] == j
+        A.values[1, j] = 0.0
+    find_non_zeros(A)
+    assert list(A.counts) == [0, 0]
+
+
+@pytest.mark.parametrize("rows", [1, 3, 7])
+def test_rows_begin_at_a_line_of_the_cache(rows):
+    """64 bytes, wherever the memory was taken from; zeros, as many as asked for."""
+    kept = [aligned(rows, width) for width in (8, 16, 40) for _ in range(6)]
+    for k, A in enumerate(kept):
+        assert A.shape == (rows, (8, 16, 40)[k // 6]) and not A.any()
+        assert A.ctypes.data % 64 == 0
+        A += k + 1.0
+    assert all(np.all(A == k + 1.0) for k, A in enumerate(kept)), "and none lies in another"
+
+
+def test_rows_are_combined_by_their_weights():
+    """The first so many of them; what is beyond counts for nothing."""
+    rng = np.random.default_rng(7)
+    B, weights = rng.normal(size=(6, padded(40))), rng.normal(size=8).astype(np.float32)
+    out = np.full(padded(40), np.nan)
+    combine(weights, B, 5, out)
+    np.testing.assert_allclose(out, weights[:5].astype(float) @ B[:5], atol=1e-13)
+
+
+def test_a_stored_matrix_comes_back_with_its_non_zeros():
+    stored = np.zeros((3, 2, 5), np.float32)
+    stored[1] = [[0.0, 2.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 4.0]]
+    A = with_places(np.ones((2, padded(5))), 5)
+    A.values[:, 5:] = 0.0
+    unpack(stored, 1, A)
+    np.testing.assert_array_equal(A.values[:, :5], stored[1])
+    assert list(A.counts) == [2, 1] and list(A.places[0, :2]) == [1, 3] and A.places[1, 0] == 4

@@ -74,7 +74,9 @@ OWN: dict[str, tuple[str, ...]] = {
     ),
     "coax_env/diagnosis/gain.py": ("tests/test_gain.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/trust.py": ("tests/test_trust.py", "tests/test_diagnosis.py"),
-    "coax_env/diagnosis/replication.py": ("tests/test_trust.py", "tests/test_diagnosis.py"),
+    "coax_env/diagnosis/replication.py": (
+        "tests/test_trust.py", "tests/test_noise_variation.py", "tests/test_diagnosis.py",
+    ),
     "coax_env/diagnosis/changes.py": ("tests/test_edits.py",),
     "coax_env/diagnosis/evidence.py": ("tests/test_fits.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/refinement.py": (
