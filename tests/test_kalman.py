@@ -66,7 +66,7 @@ def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) ->
     x, P = Pendulum.start_at.copy(), np.diag(Pendulum.start_std**2)
     dt = np.append(np.diff(record.t), 0.0)
     found: dict[str, Any] = {
-        name: [] for name in ("x", "P", "predicted", "F", "e", "K", "per_sigma")
+        name: [] for name in ("x", "P", "predicted", "F", "e", "K", "per_sigma", "outside")
     }
     log_likelihood = 0.0
     beyond = 0
@@ -79,6 +79,7 @@ def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) ->
         R_k = R.copy()
         for i in there:
             s2 = H[i] @ P @ H[i] + R[i]
+            found["outside"].append(1.0 / s2 if v[i] ** 2 > GATE**2 * s2 else 0.0)
             if v[i] ** 2 > GATE**2 * s2:
                 R_k[i] += v[i] ** 2 / GATE**2 - s2
                 log_likelihood -= 0.5 * (GATE**2 - 1.0) * math.log(v[i] ** 2 / GATE**2 / s2)
@@ -165,7 +166,8 @@ def test_the_pass_is_the_textbooks_filter(sine, clock):
     for ours, theirs in (
         (trace.states, dense["x"]), (kept.P, dense["P"]), (trace.e, dense["e"]),
         (trace.path.predicted, dense["predicted"]), (trace.gains.K, dense["K"]),
-        (trace.gains.per_sigma, dense["per_sigma"]), (trace.path.P, dense["P"]),
+        (trace.gains.per_sigma, dense["per_sigma"]), (trace.path.beyond, dense["outside"]),
+        (trace.path.P, dense["P"]),
         (trace.path.F[trace.path.F_of[:-1]], dense["F"][:-1]),
         (trace.gains.H, np.broadcast_to(H, trace.gains.H.shape)),
     ):  # fmt: skip
@@ -239,7 +241,8 @@ def test_rows_begin_at_a_line_of_the_cache(rows):
         assert A.shape == (rows, (8, 16, 40)[k // 6]) and not A.any()
         assert A.ctypes.data % 64 == 0
         A += k + 1.0
-    assert all(np.all(A == k + 1.0) for k, A in enumerate(kept)), "and none lies in another"
+    for k, A in enumerate(kept):
+        np.testing.assert_array_equal(A, k + 1.0, err_msg="one lies in another")
 
 
 def test_rows_are_combined_by_their_weights():
