@@ -85,6 +85,10 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/diagnosis/hold_out.py": (
         "tests/test_hold_out.py", "tests/test_trust.py", "tests/test_diagnosis.py",
     ),
+    "coax_env/diagnosis/unlisted.py": (
+        "tests/test_unlisted.py", "tests/test_terms_weighed.py", "tests/test_diagnosis.py",
+        "tests/test_input_innovations.py",
+    ),
     "coax_env/diagnosis/vibration.py": ("tests/test_vibration.py", "tests/test_unlisted.py"),
     "coax_env/diagnosis/calibration.py": ("tests/test_study.py",),
     "coax_env/diagnosis/*": (
