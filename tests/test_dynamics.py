@@ -655,10 +655,10 @@ def test_wind_acts_through_the_velocity_in_the_air(carrier, seed):
     state, command = random_state(seed)
     wind = np.array([1.5, -2.0, 0.0])
     values, change = ON_RATES[carrier]
-    second = Second(state, command, LAMA)
+    second = Second(state, command, COUPLED)
     second.air = state[:3] - second.R.T @ wind
     change(second, values)
-    vehicle = LAMA.with_effect(carrier, **values).with_effect("wind", north=1.5, east=-2.0)
+    vehicle = COUPLED.with_effect(carrier, **values).with_effect("wind", north=1.5, east=-2.0)
     close(derivative(state, command, vehicle), second.rates())
 
 
@@ -680,7 +680,7 @@ def test_battery_sag_slows_the_rotors_with_time():
 
 def test_spin_up_reaction_keeps_the_angular_momentum():
     """N = g ((J_u + J_f) w_u' - J_l w_l'): at gain 1 the body takes what the rotors gain."""
-    vehicle = LAMA.with_values(
+    vehicle = COUPLED.with_values(
         {"torque_coefficient_upper": 0.0, "torque_coefficient_lower": 0.0}
     ).with_effect("motor_lag", upper=0.1, lower=0.06)
     vehicle = vehicle.with_effect("spin_up_reaction", gain=1.0)
@@ -688,7 +688,7 @@ def test_spin_up_reaction_keeps_the_angular_momentum():
     start[16:18] = 200.0, 220.0
     command = np.array([230.0, 215.0, 0.0, 0.0])
     end = fly(start, command, 0.3, 0.01, vehicle)
-    v = LAMA.values()
+    v = COUPLED.values()
     upper = v["rotor_inertia_upper"] + v["flybar_inertia"]
 
     def momentum(x):
@@ -701,9 +701,9 @@ def test_spin_up_reaction_keeps_the_angular_momentum():
 def test_a_reading_sees_the_rotors_speed_up_each_with_its_own_lag():
     """Off the axis, the accelerometer reads the yaw that N = g ((J_u + J_f) w_u' - J_l w_l') makes."""
     arm, lags = 0.2, np.array([0.06, 0.11])
-    vehicle = LAMA.with_effect("motor_lag", upper=lags[0], lower=lags[1])
+    vehicle = COUPLED.with_effect("motor_lag", upper=lags[0], lower=lags[1])
     vehicle = vehicle.with_effect("imu_lever_arm", x=arm, y=0.0, z=0.0)
-    x, command = dynamics.full_state(*hover_trim(LAMA), LAMA), hover_trim(LAMA)[1]
+    x, command = dynamics.full_state(*hover_trim(COUPLED), COUPLED), hover_trim(COUPLED)[1]
     x[16:18] += -20.0, 15.0
     ay = []
     for gain in (0.0, 1.0):
@@ -711,7 +711,7 @@ def test_a_reading_sees_the_rotors_speed_up_each_with_its_own_lag():
         values = vehicle.with_effect("spin_up_reaction", gain=gain).vector
         dynamics.measure(x, dynamics.kernel_input(command), values, work, out)
         ay.append(out[list(CHANNELS).index("ay")])
-    v = LAMA.values()
+    v = COUPLED.values()
     speeding = (command[:2] - x[16:18]) / lags
     moment = (v["rotor_inertia_upper"] + v["flybar_inertia"]) * speeding[0]
     moment -= v["rotor_inertia_lower"] * speeding[1]

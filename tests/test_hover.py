@@ -141,6 +141,28 @@ def test_the_way_to_the_target_is_in_the_headings_axes(name, seed):
     assert -math.pi <= out[3] < math.pi
 
 
+@pytest.mark.parametrize("psi", [0.0, 0.9, -2.5])
+def test_how_a_target_moves_is_told_in_the_headings_axes_and_within_bounds(psi):
+    """Velocity and acceleration ahead, right and up, and the turn; each no more than its bound."""
+    point = np.array([9.0, 9.0, 9.0, 9.0, 0.8, -0.5, 0.3, 0.2, -0.6, 0.4, 0.7])
+    out = np.zeros(tasks.N_MOTION)
+    tasks.motion_of_target(point, psi, out)
+    turn = np.exp(-1j * psi)
+    velocity, acceleration = complex(0.8, -0.5) * turn, complex(-0.6, 0.4) * turn
+    expected = [velocity.real, velocity.imag, -0.3, 0.2, acceleration.real, acceleration.imag, -0.7]
+    np.testing.assert_allclose(out, expected, atol=1e-12)
+    for side in (-1.0, 1.0):
+        tasks.motion_of_target(side * 1e4 * point, 0.0, out)
+        wanted = np.sign([0.8, -0.5, -0.3, 0.2, -0.6, 0.4, -0.7]) * tasks._MOTION_BOUNDS
+        np.testing.assert_allclose(out, side * wanted)
+
+
+def test_a_path_goes_on_from_its_seam():
+    """Ten rows of which the fourth follows the last."""
+    rows = [int(tasks.row_of_path(row, 10, 4)) for row in range(24)]
+    assert rows == [*range(10), *range(4, 10), *range(4, 10), 4, 5]
+
+
 def test_the_way_is_held_within_its_bounds():
     sensors = suite("mocap")
     places, out = tasks.places("position", sensors), np.zeros(4)
