@@ -53,6 +53,9 @@ OWN: dict[str, tuple[str, ...]] = {
     ),
     "coax_env/estimation/beginnings.py": ("tests/test_onset.py",),
     "coax_env/estimation/changing_model.py": ("tests/test_onset.py",),
+    "coax_env/estimation/sparse.py": (
+        "tests/test_kalman.py", "tests/test_side_by_side.py", "tests/test_estimation.py",
+    ),
     "coax_env/estimation/flown.py": ("tests/test_blinding_logs.py", "tests/test_estimation.py"),
     "coax_env/estimation/parted_engine.py": ("tests/test_compare.py", "tests/test_estimation.py"),
     "coax_env/estimation/quadratic.py": ("tests/test_quadratic.py", "tests/test_diagnosis.py"),
@@ -93,7 +96,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/diagnosis/calibration.py": ("tests/test_study.py",),
     "coax_env/diagnosis/*": (
         "tests/test_scores.py", "tests/test_diagnosis.py", "tests/test_unlisted.py",
-        "tests/test_input_innovations.py", "tests/test_gain.py",
+        "tests/test_input_innovations.py", "tests/test_gain.py", "tests/test_moves.py",
     ),
 }  # fmt: skip
 """Pattern of files -> the tests that belong to them, tried first, in this order; the first fit."""
