@@ -631,6 +631,42 @@ def test_effect_on_the_rates(name, seed):
     assert np.abs(found - derivative(state, command, COUPLED)).max() > 1e-4
 
 
+@pytest.mark.parametrize("rotor", ["upper", "lower"])
+def test_a_rotor_that_droops_alone_follows_a_share_of_its_command(rotor):
+    """About the bare model's hover, the other one as commanded."""
+    state, command = random_state(3)
+    free = COUPLED.with_values({"fuselage_drag_coefficient": 0.0})
+    i = ("upper", "lower").index(rotor)
+    hover = hover_trim(free)[1][i]
+    followed = command.copy()
+    followed[i] = hover + 0.8 * (command[i] - hover)
+    vehicle = COUPLED.with_effect("motor_droop", upper=0.2 * (i == 0), lower=0.2 * (i == 1))
+    found = derivative(state, command, vehicle)
+    close(found, Second(state, followed, COUPLED).rates(), 1e-7)
+    assert np.abs(found - derivative(state, command, COUPLED)).max() > 1e-2
+
+
+ALONE = [
+    (name, key)
+    for name in ("swash_phase", "swash_offset", "airframe_drag", "cg_offset", "hub_stiffness")
+    for key in ON_RATES[name][0]
+]
+"""Numbers of an effect that act each by itself."""
+
+
+@pytest.mark.parametrize(("name", "key"), ALONE)
+def test_each_number_of_an_effect_acts_alone(name, key):
+    """The same formula, with all but one of its numbers at nothing."""
+    values, change = ON_RATES[name]
+    values = {k: v if k == key else 0.0 for k, v in values.items()}
+    state, command = random_state(2)
+    second = Second(state, command, COUPLED)
+    change(second, values)
+    found = derivative(state, command, COUPLED.with_effect(name, **values))
+    close(found, second.rates())
+    assert np.abs(found - derivative(state, command, COUPLED)).max() > 1e-6
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_bodys_own_gyroscopic_moment_does_no_work(seed):
     """omega . (omega x I omega) = 0, and a body alone keeps its momentum in the world's axes."""
@@ -900,6 +936,15 @@ def test_marker_offset(seed):
     velocity = ("vn", "ve", "vd")
     close(vector(biased, velocity), vector(bare, velocity) + R @ np.cross(omega, arm))
     assert {c for c in CHANNELS if bare[c] != biased[c]} == {"pn", "pe", "h", *velocity}
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_marker_beside_the_centre_along_one_axis_alone(axis):
+    arm = 0.04 * np.eye(3)[axis]
+    values = dict(zip("xyz", arm.tolist(), strict=True))
+    state, _, bare, biased = sensor_case("marker_offset", values, 1)
+    place = vector(bare, ("pn", "pe", "h")) + (body_to_world(state) @ arm) * [1, 1, -1]
+    close(vector(biased, ("pn", "pe", "h")), place)
 
 
 @pytest.mark.parametrize("angle", [0.3, -1.2])
