@@ -481,6 +481,30 @@ def test_gusts_push_and_fade():
     close(rate[3:6] * inertia, start[23:26])
 
 
+@pytest.mark.parametrize("axis", range(6))
+def test_each_gust_fades_by_its_own_memory_and_pushes_meanwhile(axis):
+    """Rotors at rest: of g exp(-t/T) / m the speed is g T (1 - exp(-t/T)) / m, axis by axis."""
+    memories = np.array([0.2, 0.2, 0.5, 0.9, 0.9, 1.7])
+    p = LAMA.vector.copy()
+    p[P.GUST_MEMORIES] = memories[[0, 2, 3, 5]]
+    v = LAMA.values()
+    inertia = [v["mass"]] * 3 + [v[f"inertia_{a}"] for a in ("xx", "yy", "zz")]
+    gust = np.array([0.3, 0.3, 0.3, 1e-3, 1e-3, 1e-3])[axis]
+    x, still, work = np.zeros(N_FULL), np.zeros(N_FULL), np.zeros(dynamics.WORK_SIZE)
+    x[20 + axis] = gust
+    u = dynamics.kernel_input(np.zeros(4))
+    out = np.zeros(N_FULL + N_CHANNELS)
+    dynamics.drift_and_readings(x, u, 0.02, p, work, out)
+    assert out[20 + axis] == pytest.approx(gust * math.expm1(-0.02 / memories[axis]), rel=1e-9)
+    for _ in range(20):
+        dynamics.step(x, u, 0.02, p, work, x)
+        dynamics.step(still, u, 0.02, p, work, still)
+    left = math.exp(-0.4 / memories[axis])
+    assert x[20 + axis] == pytest.approx(gust * left)
+    pushed = gust * memories[axis] * (1.0 - left) / inertia[axis]
+    assert x[axis] - still[axis] == pytest.approx(pushed, rel=1e-5)
+
+
 # --- the catalogue ------------------------------------------------------------------------------
 
 

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from coax_env.env import hover, tasks
-from coax_env.kernel.random_streams import stream_key
+from coax_env.env import hover, period, tasks
+from coax_env.kernel.random_streams import stream_key, two_normals
+from coax_env.model import parameters as P
 from coax_env.model.layout import N_FULL, STATES
 from coax_env.model.sensors import suite
 
@@ -116,6 +117,24 @@ def test_starts_are_uniform_about_hover_and_settled():
     np.testing.assert_allclose(away.std(axis=0), half / math.sqrt(3.0), rtol=0.06)
     assert (np.abs(away.mean(axis=0)) <= 4.0 * half / math.sqrt(9000.0)).all()
     assert np.abs(np.corrcoef(away[:, half > 0.0].T) - np.eye(10)).max() < 0.1
+
+
+@pytest.mark.parametrize("gust", [(0.3, 2e-3), (0.3, 0.0), (0.0, 2e-3)])
+def test_each_gust_is_kicked_by_what_its_own_memory_loses(gust):
+    """From nothing: std times sqrt(1 - exp(-2 dt/T)) of a normal number each, a pair and one."""
+    p = np.zeros(P.GUST_MEMORIES.stop)
+    p[P.GUST_MEMORIES] = memories = np.array([0.2, 0.5, 0.9, 1.7])
+    own, copy = stream(4), stream(4)
+    x, expected = np.zeros(N_FULL), np.zeros(6)
+    period.add_gusts(x, p, np.array(gust), own)
+    share = np.sqrt(-np.expm1(-2.0 * period.DT / memories))
+    for half, first in ((0, 0), (1, 3)):
+        if gust[half]:
+            pair, single = two_normals(copy), two_normals(copy)
+            expected[first : first + 2] = gust[half] * share[2 * half] * np.array(pair)
+            expected[first + 2] = gust[half] * share[2 * half + 1] * single[0]
+    np.testing.assert_allclose(x[20:26], expected, rtol=1e-12)
+    assert np.array_equal(own, copy) and not x[:20].any()
 
 
 # --- targets --------------------------------------------------------------------------------------
