@@ -261,7 +261,7 @@ def test_beside_a_large_axis_the_others_are_as_wide():
     ("size", "words"),
     [
         (2.45, ""),
-        (-2.55, "2.5 usual sizes"),
+        (-2.6, "2.6 usual sizes"),
         (4.9, "4.9 usual sizes"),
         (4.97, "limit"),
         (-5.0, "limit"),
