@@ -268,6 +268,37 @@ def test_faster_rotors_are_flown_as_larger_commands(monkeypatch):
     np.testing.assert_allclose(slopes[:4], [[200, 1], [210, 1], [0, 1], [0, 1]], atol=1e-9)
 
 
+@pytest.mark.parametrize("scale", [1.0, -0.5])
+def test_rotors_of_any_speed_are_flown(monkeypatch, scale):
+    """Twice and half as fast; and where they are as fast as before no engine is made anew."""
+    monkeypatch.setattr(changes, "Engine", Echo)
+    records = [record("a", 1.0, 0.0)]
+    logs = logs_of(records, [np.ones((2, 4), bool)])
+    found = logs.difference({"wind.north": 0.0, ROTOR_SCALE: scale})[:4]
+    faster = 1.0 + scale
+    np.testing.assert_allclose(found, [200 * (faster - 0.5), 210 * (faster - 0.5), 0.015, -0.01])
+    monkeypatch.setattr(changes, "Engine", None)
+    assert logs.difference({"wind.north": 0.0})[0] == 100.0
+
+
+def test_readings_of_a_filters_first_second_do_not_count(monkeypatch):
+    """By each run's own clock, from one second on; nor do those that are missing."""
+    monkeypatch.setattr(changes, "coordinates", lambda problem, fit: KNOWN["wind"])
+    records = [record("a", 3.0, 30.0), record("b", 2.0, 4.0)]
+    engine = Echo(None, records)
+    records[1].command[3, 2] = np.nan
+    said: list[str] = []
+    made = SimpleNamespace(engine=engine, report=said.append)
+    found = changes.Before.of(made, FIT)  # type: ignore[arg-type]
+    expected = [np.repeat([[False] * 4, [True] * 4], [2, n - 2], axis=0) for n in (6, 4)]
+    expected[1][3, 2] = False
+    for there, wanted in zip(found.there, expected, strict=True):
+        np.testing.assert_array_equal(there, wanted)
+    assert found.slopes["wind"].shape == (16 + 7, 1)
+    np.testing.assert_allclose(found.slopes["wind"], 1.0)
+    assert said == ["what 1 numbers change of the innovations"]
+
+
 def test_logs_of_other_rows_are_of_another_flight():
     one, late = record("a", 5.0, 0.0), record("a", 5.0, 0.1)
     changes._check_same_rows([one], [replace(one, z=one.z + 1.0)])
