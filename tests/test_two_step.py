@@ -964,6 +964,21 @@ def test_errors_of_a_row_are_what_the_sensors_noise_does(clean_runs):
     assert rows.t[0] == pytest.approx(0.5, abs=0.01) and rows.lengths == (len(rows.t),)
 
 
+def test_rows_are_timed_from_their_runs_start(clean_runs):
+    """Half a second is left out at either end, whenever the clock began."""
+    run = clean_runs[0]
+    first, late = (rows_of(r, LAMA, NOISE, 5.0) for r in (run, replace(run, t=run.t + 64.0)))
+    n = min(len(first.t), len(late.t))
+    np.testing.assert_allclose(late.t[:n], first.t[:n], atol=1e-9)
+    assert first.t[0] == pytest.approx(0.5, abs=1e-9)
+    assert first.t[-1] == pytest.approx(run.t[-1] - run.t[0] - 0.5, abs=0.011)
+    inside = slice(100, n - 100)
+    for name in ("delta_lon", "C_X", "alpha_l"):
+        np.testing.assert_allclose(
+            late.columns[name][inside], first.columns[name][inside], atol=1e-6, err_msg=name
+        )
+
+
 def test_a_number_is_joined_with_the_files_own_by_precision():
     """Logs of independent factors: weights are the inverse squares of the relative stds."""
     physics = next(p for p in PHYSICS if p.name == "pitch")
