@@ -282,6 +282,20 @@ def test_a_size_is_unusual_from_two_and_a_half_on_and_a_limit_at_five(size, word
     assert bool(found) == bool(words) and all(words in text for text in found)
 
 
+def test_a_size_is_that_beyond_the_off_value():
+    """A decay of the ground effect of 2 per radius is what it is when nothing is known of it."""
+    model = HeliModel(LAMA)
+    own = {"ground_effect": tuple(model.effect_parameters("ground_effect"))}
+    problem = replace(problem_of(1), model=model, own=own)
+    usual = {f.name: f.std for f in own["ground_effect"]}
+    for sizes, words in ((0.0, ""), (3.0, "3.0 usual sizes"), (-2.6, "")):
+        decay = 2.0 + sizes * usual["ground_effect.decay"]
+        values = {"ground_effect.gain": 0.1, "ground_effect.decay": decay}
+        fit = Fit(("ground_effect",), values, Noise({}))
+        found = " ".join(trust_module._sizes(problem, fit, "ground_effect"))
+        assert words in found and (sizes != 0.0 or not found)
+
+
 def test_doubts_name_three_variations_and_count_the_rest():
     one, many = ["twice force xy"], [f"half level {k}" for k in range(5)]
     assert list(trust_module._under_noise([])) == []
