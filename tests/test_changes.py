@@ -180,6 +180,36 @@ def test_what_stood_for_a_later_change_is_dropped():
         assert found.effects == left
 
 
+@pytest.mark.parametrize(
+    ("true", "found"), [((0.02, 0.0, 3.0), {"gyro_bias", "wind"}), ((0.0, 0.0, 3.0), {"wind"}),
+                        ((0.0, 0.0, 0.0), set())],
+)  # fmt: skip
+def test_changes_are_found_one_by_one_until_none_holds(monkeypatch, true, found):
+    """Of two logs alike nothing is asked; another effect of the same column is its alternative."""
+    quiet = Made(lambda x: SLOPES @ (x - np.array(true)) + 1e-3 * LEFT, FIT)
+    known = KNOWN | {"twin": [replace(c, effect="twin") for c in KNOWN["wind"]]}
+    slopes = {"gyro_bias": SLOPES[:, :2], "wind": SLOPES[:, 2:], "twin": 0.999 * SLOPES[:, 2:]}
+    monkeypatch.setattr(changes, "_Logs", lambda *given: quiet)
+    monkeypatch.setattr(changes, "_of_readings", lambda before, there: slopes)
+    monkeypatch.setattr(
+        changes, "_stated", lambda problem, logs, known, best, alike, nothing: (best, alike)
+    )
+    one = record("a", 2.0, 0.0)
+    made = SimpleNamespace(
+        settings=SETTINGS, model=None, engine=SimpleNamespace(records=[one], threads=1)
+    )
+    monkeypatch.setattr(changes, "Engine", Echo)
+    before = changes.Before(made, FIT, [], [np.ones((4, 18), bool)], known, slopes)  # type: ignore
+    best, alike = changes.changes(before, [one])  # type: ignore[misc]
+    names = {"wind" if e == "twin" else e for e in best.effects}
+    assert names == found
+    for effect, others in alike.items():
+        twins = {"wind", "twin"} - {effect} if effect != "gyro_bias" else set()
+        assert twins <= set(others)
+        if len(found) == 1:  # of two that are needed one nearly does what the other does
+            assert twins == set(others)
+
+
 # --- how well a change is known -----------------------------------------------------------------------
 
 

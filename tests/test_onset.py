@@ -164,6 +164,27 @@ def test_later_runs_and_held_out_thirds_are_flown_as_after_the_moment(short):
     assert np.array_equal(there.stretches(third), own)
 
 
+def test_what_changes_has_numbers_before_and_what_begins_has_none(short):
+    """Under the same priors; with the moments that there were, over the same records."""
+    model, records, noise = short
+    first, second = (Moment(records[1].whole, float(records[1].t[k])) for k in (100, 200))
+    runs = [r.whole for r in records]
+    made = Problem.of(model, records, ("swash_offset", "gyro_bias", "wind"))
+    fit = Fit(("swash_offset",), model.bare_values, noise)
+    made = onset.beginning(made, fit, {"wind": first}, runs)
+    begun = onset.beginning(made, fit, {"swash_offset": second, "gyro_bias": second}, runs)
+    names = [f.name for f in begun.own["swash_offset"]]
+    plain = ["swash_offset.lon", "swash_offset.lat"]
+    assert names == [*plain, *(of_part(n, BEFORE) for n in plain)]
+    assert begun.own["gyro_bias"] == made.own["gyro_bias"] and begun.own["wind"] == made.own["wind"]
+    own = begun.own["swash_offset"]
+    assert [(f.value, f.std) for f in own[2:]] == [(f.value, f.std) for f in own[:2]]
+    assert begun.model.moments == {"wind": first, "swash_offset": second, "gyro_bias": second}
+    assert begun.engine.records == made.engine.records and begun.engine.model is begun.model
+    again = onset.beginning(begun, fit, {"swash_offset": first}, runs)
+    assert again.own["swash_offset"] == own, "its numbers before are there already"
+
+
 # --- hidden by other code ---------------------------------------------------------------------------
 
 
