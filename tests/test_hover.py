@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from coax_env.env import hover, period, tasks
+from coax_env.env import flight_loop, hover, period, tasks
 from coax_env.kernel.random_streams import stream_key, two_normals
 from coax_env.model import parameters as P
 from coax_env.model.layout import N_FULL, STATES
@@ -135,6 +135,21 @@ def test_each_gust_is_kicked_by_what_its_own_memory_loses(gust):
             expected[first + 2] = gust[half] * share[2 * half + 1] * single[0]
     np.testing.assert_allclose(x[20:26], expected, rtol=1e-12)
     assert np.array_equal(own, copy) and not x[:20].any()
+
+
+@pytest.mark.parametrize("steady", [(2.0, -1.5), (-0.4, 3.0), (0.0, 0.0)])
+def test_turbulence_blows_along_the_wind_and_across_it_to_the_right(steady):
+    """On top of the steady wind; where there is none, along is north."""
+    x, own, air = np.zeros(N_FULL), np.zeros(3), np.zeros(3)
+    x[15] = -2.0
+    flight_loop.move_air(x, own, stream(5), np.ones(5), np.array(steady), 4.0, air)
+    along, across, down = air
+    assert min(abs(air)) > 0.05
+    wind = complex(*steady)
+    direction = wind / abs(wind) if wind else 1.0
+    found = complex(own[flight_loop.AIR_NORTH], own[flight_loop.AIR_EAST])
+    assert found == pytest.approx(wind + direction * complex(along, across))
+    assert own[flight_loop.AIR_DOWN] == down
 
 
 # --- targets --------------------------------------------------------------------------------------
