@@ -133,7 +133,8 @@ def test_a_gain_s_prior_is_what_the_filter_does_not_know_over_what_commands_show
 @pytest.mark.parametrize(("fallen", "taken"), [(6.1, True), (5.9, False), (-3.0, False)])
 def test_gains_are_fitted_where_that_is_worth_more_than_a_tie(monkeypatch, fallen, taken):
     """And only beside white innovations: what a model gets wrong follows the commands too."""
-    gains = [FreeParameter("command_gain_pq", 0.0, 0.1)]
+    first, *others = P.COMMAND_GAINS
+    gains = [FreeParameter(first, 0.0, 0.1)]
     asked = []
 
     def fitted(problem, fit, tolerance):
@@ -145,7 +146,7 @@ def test_gains_are_fitted_where_that_is_worth_more_than_a_tie(monkeypatch, falle
     monkeypatch.setattr(input_innovations, "_gains", lambda passes, found: gains)
     monkeypatch.setattr(input_innovations, "fitted", fitted)
     made = Problem(HeliModel(LAMA), Engine(HeliModel(LAMA), []), (), {})
-    fit = Fit((), {"mass": 0.8, P.COMMAND_GAINS[0]: 0.2}, Noise({}), objective=300.0)
+    fit = Fit((), {"mass": 0.8, first: 0.2}, Noise({}), objective=300.0)
     for white in (True, False):
         monkeypatch.setattr(input_innovations, "is_white", lambda p, c, white=white: white)
         wider, found = input_innovations.with_command_gains(made, fit)
@@ -154,8 +155,8 @@ def test_gains_are_fitted_where_that_is_worth_more_than_a_tie(monkeypatch, falle
         else:
             assert wider is made and found is fit
     ((values, tolerance),) = asked
-    assert tolerance == 3.0 and values[P.COMMAND_GAINS[0]] == 0.2, "from where they stand"
-    assert {values[n] for n in P.COMMAND_GAINS[1:]} == {0.0}
+    assert tolerance == 3.0 and values[first] == 0.2, "from where they stand"
+    assert {values[n] for n in others} == {0.0}
 
 
 @pytest.mark.slow
