@@ -107,6 +107,26 @@ def test_moved_from_a_row_on_is_the_model_that_changes_there(short):
     assert b.own[3:, 3:] * np.outer(unit, unit) == pytest.approx(exact, abs=0.01)
 
 
+def test_what_begins_and_what_always_was_share_the_rows_from_there_on(short):
+    """Information across: the column of what begins, times that before and after together."""
+    model, records, noise = short
+    names, row = ("swash_offset", "gyro_bias"), 200
+    own = [f for e in names for f in model.effect_parameters(e)]
+    values = {**model.bare_values, **{f.name: f.value for f in own}}
+    _, (b,) = Engine(model, records).beginnings(
+        values, noise, own, [np.empty(0, np.int64), np.array([row])], lambda b: b
+    )
+    same = {of_part(f.name, BEFORE): values[f.name] for f in own}
+    there = Engine(changing(model, records, names, row), records)
+    _, lin = there.linearise({**values, **same}, noise, [*own, *map(before, own)])
+    k, information = len(own), lin.information[1]
+    across = information[:k, :k] + information[:k, k:]
+    whole = across + information[k:, :k] + information[k:, k:]
+    unit = np.outer(np.diag(information[:k, :k]) ** -0.5, np.diag(whole) ** -0.5)
+    assert b.across * unit == pytest.approx(across * unit, abs=0.02)
+    assert np.abs(information[:k, k:] * unit).max() > 0.05, "and the past is felt"
+
+
 def test_nothing_begins_at_the_ends_of_a_flight(short):
     _, records, _ = short
     first, last = rows_of(records)
