@@ -481,6 +481,30 @@ def test_gusts_push_and_fade():
     close(rate[3:6] * inertia, start[23:26])
 
 
+@pytest.mark.parametrize("axis", range(6))
+def test_each_gust_fades_by_its_own_memory_and_pushes_meanwhile(axis):
+    """Rotors at rest: of g exp(-t/T) / m the speed is g T (1 - exp(-t/T)) / m, axis by axis."""
+    memories = np.array([0.2, 0.2, 0.5, 0.9, 0.9, 1.7])
+    p = LAMA.vector.copy()
+    p[P.GUST_MEMORIES] = memories[[0, 2, 3, 5]]
+    v = LAMA.values()
+    inertia = [v["mass"]] * 3 + [v[f"inertia_{a}"] for a in ("xx", "yy", "zz")]
+    gust = np.array([0.3, 0.3, 0.3, 1e-3, 1e-3, 1e-3])[axis]
+    x, still, work = np.zeros(N_FULL), np.zeros(N_FULL), np.zeros(dynamics.WORK_SIZE)
+    x[20 + axis] = gust
+    u = dynamics.kernel_input(np.zeros(4))
+    out = np.zeros(N_FULL + N_CHANNELS)
+    dynamics.drift_and_readings(x, u, 0.02, p, work, out)
+    assert out[20 + axis] == pytest.approx(gust * math.expm1(-0.02 / memories[axis]), rel=1e-9)
+    for _ in range(20):
+        dynamics.step(x, u, 0.02, p, work, x)
+        dynamics.step(still, u, 0.02, p, work, still)
+    left = math.exp(-0.4 / memories[axis])
+    assert x[20 + axis] == pytest.approx(gust * left)
+    pushed = gust * memories[axis] * (1.0 - left) / inertia[axis]
+    assert x[axis] - still[axis] == pytest.approx(pushed, rel=1e-5)
+
+
 # --- the catalogue ------------------------------------------------------------------------------
 
 
@@ -631,6 +655,42 @@ def test_effect_on_the_rates(name, seed):
     assert np.abs(found - derivative(state, command, COUPLED)).max() > 1e-4
 
 
+@pytest.mark.parametrize("rotor", ["upper", "lower"])
+def test_a_rotor_that_droops_alone_follows_a_share_of_its_command(rotor):
+    """About the bare model's hover, the other one as commanded."""
+    state, command = random_state(3)
+    free = COUPLED.with_values({"fuselage_drag_coefficient": 0.0})
+    i = ("upper", "lower").index(rotor)
+    hover = hover_trim(free)[1][i]
+    followed = command.copy()
+    followed[i] = hover + 0.8 * (command[i] - hover)
+    vehicle = COUPLED.with_effect("motor_droop", upper=0.2 * (i == 0), lower=0.2 * (i == 1))
+    found = derivative(state, command, vehicle)
+    close(found, Second(state, followed, COUPLED).rates(), 1e-7)
+    assert np.abs(found - derivative(state, command, COUPLED)).max() > 1e-2
+
+
+ALONE = [
+    (name, key)
+    for name in ("swash_phase", "swash_offset", "airframe_drag", "cg_offset", "hub_stiffness")
+    for key in ON_RATES[name][0]
+]
+"""Numbers of an effect that act each by itself."""
+
+
+@pytest.mark.parametrize(("name", "key"), ALONE)
+def test_each_number_of_an_effect_acts_alone(name, key):
+    """The same formula, with all but one of its numbers at nothing."""
+    values, change = ON_RATES[name]
+    values = {k: v if k == key else 0.0 for k, v in values.items()}
+    state, command = random_state(2)
+    second = Second(state, command, COUPLED)
+    change(second, values)
+    found = derivative(state, command, COUPLED.with_effect(name, **values))
+    close(found, second.rates())
+    assert np.abs(found - derivative(state, command, COUPLED)).max() > 1e-6
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_bodys_own_gyroscopic_moment_does_no_work(seed):
     """omega . (omega x I omega) = 0, and a body alone keeps its momentum in the world's axes."""
@@ -655,10 +715,10 @@ def test_wind_acts_through_the_velocity_in_the_air(carrier, seed):
     state, command = random_state(seed)
     wind = np.array([1.5, -2.0, 0.0])
     values, change = ON_RATES[carrier]
-    second = Second(state, command, LAMA)
+    second = Second(state, command, COUPLED)
     second.air = state[:3] - second.R.T @ wind
     change(second, values)
-    vehicle = LAMA.with_effect(carrier, **values).with_effect("wind", north=1.5, east=-2.0)
+    vehicle = COUPLED.with_effect(carrier, **values).with_effect("wind", north=1.5, east=-2.0)
     close(derivative(state, command, vehicle), second.rates())
 
 
@@ -680,7 +740,7 @@ def test_battery_sag_slows_the_rotors_with_time():
 
 def test_spin_up_reaction_keeps_the_angular_momentum():
     """N = g ((J_u + J_f) w_u' - J_l w_l'): at gain 1 the body takes what the rotors gain."""
-    vehicle = LAMA.with_values(
+    vehicle = COUPLED.with_values(
         {"torque_coefficient_upper": 0.0, "torque_coefficient_lower": 0.0}
     ).with_effect("motor_lag", upper=0.1, lower=0.06)
     vehicle = vehicle.with_effect("spin_up_reaction", gain=1.0)
@@ -688,7 +748,7 @@ def test_spin_up_reaction_keeps_the_angular_momentum():
     start[16:18] = 200.0, 220.0
     command = np.array([230.0, 215.0, 0.0, 0.0])
     end = fly(start, command, 0.3, 0.01, vehicle)
-    v = LAMA.values()
+    v = COUPLED.values()
     upper = v["rotor_inertia_upper"] + v["flybar_inertia"]
 
     def momentum(x):
@@ -701,9 +761,9 @@ def test_spin_up_reaction_keeps_the_angular_momentum():
 def test_a_reading_sees_the_rotors_speed_up_each_with_its_own_lag():
     """Off the axis, the accelerometer reads the yaw that N = g ((J_u + J_f) w_u' - J_l w_l') makes."""
     arm, lags = 0.2, np.array([0.06, 0.11])
-    vehicle = LAMA.with_effect("motor_lag", upper=lags[0], lower=lags[1])
+    vehicle = COUPLED.with_effect("motor_lag", upper=lags[0], lower=lags[1])
     vehicle = vehicle.with_effect("imu_lever_arm", x=arm, y=0.0, z=0.0)
-    x, command = dynamics.full_state(*hover_trim(LAMA), LAMA), hover_trim(LAMA)[1]
+    x, command = dynamics.full_state(*hover_trim(COUPLED), COUPLED), hover_trim(COUPLED)[1]
     x[16:18] += -20.0, 15.0
     ay = []
     for gain in (0.0, 1.0):
@@ -711,7 +771,7 @@ def test_a_reading_sees_the_rotors_speed_up_each_with_its_own_lag():
         values = vehicle.with_effect("spin_up_reaction", gain=gain).vector
         dynamics.measure(x, dynamics.kernel_input(command), values, work, out)
         ay.append(out[list(CHANNELS).index("ay")])
-    v = LAMA.values()
+    v = COUPLED.values()
     speeding = (command[:2] - x[16:18]) / lags
     moment = (v["rotor_inertia_upper"] + v["flybar_inertia"]) * speeding[0]
     moment -= v["rotor_inertia_lower"] * speeding[1]
@@ -900,6 +960,15 @@ def test_marker_offset(seed):
     velocity = ("vn", "ve", "vd")
     close(vector(biased, velocity), vector(bare, velocity) + R @ np.cross(omega, arm))
     assert {c for c in CHANNELS if bare[c] != biased[c]} == {"pn", "pe", "h", *velocity}
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_marker_beside_the_centre_along_one_axis_alone(axis):
+    arm = 0.04 * np.eye(3)[axis]
+    values = dict(zip("xyz", arm.tolist(), strict=True))
+    state, _, bare, biased = sensor_case("marker_offset", values, 1)
+    place = vector(bare, ("pn", "pe", "h")) + (body_to_world(state) @ arm) * [1, 1, -1]
+    close(vector(biased, ("pn", "pe", "h")), place)
 
 
 @pytest.mark.parametrize("angle", [0.3, -1.2])

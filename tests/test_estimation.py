@@ -307,6 +307,49 @@ def test_noise_score_is_the_gradient_of_the_likelihood():
         assert found == pytest.approx(exact, rel=0.02, abs=0.02)
 
 
+def stacked(record: Record, q: np.ndarray, first: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Covariance of all readings of a linear record that there are, one after the other.
+
+    Args:
+        q: (2,) intensities of the noise. first: (2,) variances of the first state. R: (3,).
+    """
+    n, H = record.t.size, np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    k, d = TRUTH["stiffness"], TRUTH["damping"]
+    F = np.array([[1.0 - DT**2 * k, DT - DT**2 * d], [-DT * k, 1.0 - DT * d]])
+    blocks, P = np.zeros((n, 2, n, 2)), np.diag(first)
+    for row in range(n):
+        cross = P
+        for later in range(row, n):
+            blocks[later, :, row, :], blocks[row, :, later, :] = cross, cross.T
+            cross = F @ cross
+        P = F @ P @ F.T + np.diag(q * DT)
+    H_all = np.kron(np.eye(n), H)
+    V = H_all @ blocks.reshape(2 * n, 2 * n) @ H_all.T + np.diag(np.tile(R, n))
+    there = np.isfinite(record.z.ravel())
+    return V[np.ix_(there, there)]
+
+
+def test_what_is_expected_of_a_variance_is_half_a_trace():
+    """Of N(0, V) the slope in a number a of V is half z' W V_a W z less half tr(W V_a), W = 1/V."""
+    record = with_holes(swing(7, n=60), 0.2, 3)
+    score = Engine(Pendulum(), [record]).noise_score(TRUTH, NOISE)
+    q = np.array([0.0, NOISE.process["torque"] ** 2])
+    R = np.array([NOISE.reading[c] ** 2 for c in CHANNELS])
+    first = Pendulum.start_std**2
+    W = np.linalg.inv(stacked(record, q, first, R))
+    nothing = stacked(record, 0.0 * q, 0.0 * first, 0.0 * R)
+
+    def half_trace(**one: np.ndarray) -> float:
+        given = {"q": 0.0 * q, "first": 0.0 * first, "R": 0.0 * R} | one
+        return 0.5 * float(np.sum(W * (stacked(record, **given) - nothing)))
+
+    for i, axis in enumerate(np.eye(2)):
+        assert score.noise_expected[i] == pytest.approx(half_trace(q=axis), rel=1e-3)
+        assert score.start_expected[0, i] == pytest.approx(half_trace(first=axis), rel=1e-3)
+    for i, axis in enumerate(np.eye(3)):
+        assert score.reading_expected[i] == pytest.approx(half_trace(R=axis), rel=1e-3)
+
+
 @pytest.mark.parametrize("state", [ANGLE, RATE])
 def test_start_score_is_the_gradient_in_the_first_variances(state):
     """Exact too, where the pendulum is linear; with uncertain starts too small, right and too large."""

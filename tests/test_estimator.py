@@ -299,6 +299,19 @@ def test_where_the_target_moves_the_estimate_moves_and_the_machine_does_not(psi)
         assert abs(known[1][0][name] - known[0][0][name]) < 1e-4, name
 
 
+def test_what_flies_with_the_target_is_told_to_be_at_rest():
+    """Its velocity and turn, and the tilt of its acceleration over g: a lean ahead speeds it up."""
+    design = design_estimator(LAMA, sensors="mocap")
+    tracker = Tracker(design, 2)
+    motion = np.array([[1.0, -0.5, 0.3, 0.7, 0.9, -0.4, 8.0], np.zeros(7)])
+    found = tracker._reference(motion)
+    expected = {"u": 1.0, "v": -0.5, "w": -0.3, "r": 0.7, "theta": -0.9 / 9.80665,
+                "phi": -0.4 / 9.80665}  # fmt: skip
+    for j, name in enumerate(design.states):
+        assert found[0, j] == pytest.approx(expected.get(name, 0.0), rel=1e-2), name
+    assert not found[1].any()
+
+
 def test_a_heading_that_crosses_the_seam_brings_no_surprise(onboard):
     """From just east of south to just west of it: the estimate goes on, within a turn."""
     tracker = Tracker(onboard)

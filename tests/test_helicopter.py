@@ -280,6 +280,55 @@ def test_gusts_start_small_and_end_at_a_floor_below():
         assert noise.process[name] == noise.floor[name]
 
 
+OTHER = LAMA.with_values(
+    {"mass": 0.61, "arm_upper": 0.14, "rotor_radius": 0.3, "inertia_xx": 4e-3, "inertia_zz": 3e-3}
+)
+
+
+@pytest.mark.parametrize("vehicle", [LAMA, OTHER], ids=["lama", "other"])
+def test_gusts_begin_as_shares_of_weight_and_end_as_accelerations(vehicle):
+    """A hundredth of the weight, at the rotor's arm half of that and a third; floors in g, and g per
+    radius."""
+    noise = starting_noise(a_flight(h=np.zeros(10)), vehicle)
+    own = vehicle.values()
+    weight, arm = own["mass"] * own["gravity"], own["arm_upper"]
+    for name, share in (("force_xy", 0.01), ("force_z", 0.01), ("moment_xy", 0.005 * arm),
+                        ("moment_z", 0.003 * arm)):  # fmt: skip
+        assert noise.process[name] == pytest.approx(share * weight), name
+    spin = own["gravity"] / own["rotor_radius"]
+    floor = {"force_xy": 5e-4 * weight, "force_z": 5e-4 * weight,
+             "moment_xy": 2e-3 * spin * own["inertia_xx"],
+             "moment_z": 1.5e-3 * spin * own["inertia_zz"]}  # fmt: skip
+    for axes, least in floor.items():
+        assert noise.floor[axes] == pytest.approx(least)
+        assert noise.floor[f"white_{axes}"] == pytest.approx(0.1 * least)
+        assert noise.ceiling[axes] == pytest.approx(1e4 * least)
+        assert noise.floor[f"memory_{axes}"] == 0.015 and noise.ceiling[f"memory_{axes}"] == 20.0
+    assert noise.floor["trim_force_z"] == pytest.approx(0.02 * floor["force_z"])
+    assert noise.floor["trim_moment_z"] == pytest.approx(0.02 * floor["moment_z"])
+    rotor = noise.process[ROTOR_LEVEL]
+    speeds = dynamics.hover_trim(vehicle.with_values({"fuselage_drag_coefficient": 0.0}))[1][:2]
+    assert rotor == pytest.approx(5e-4 * speeds.mean(), rel=1e-6)
+    assert noise.floor[ROTOR_LEVEL] == pytest.approx(0.02 * rotor)
+    assert noise.ceiling[ROTOR_LEVEL] == pytest.approx(50.0 * rotor)
+
+
+def test_a_readings_std_may_be_twenty_times_off():
+    """Under a prior of 0.7 in its logarithm where the card states it, else of 1.5."""
+    noise = starting_noise(a_flight({"az": 0.3}, az=np.zeros(10), h=np.arange(10.0) % 3), LAMA)
+    for channel, spread in (("az", 0.7), ("h", 1.5)):
+        std = noise.reading[channel]
+        assert noise.floor[channel] == pytest.approx(std / 20.0)
+        assert noise.ceiling[channel] == pytest.approx(std * 20.0)
+        assert noise.prior[channel] == (std, spread)
+
+
+def test_a_steplike_sensors_std_is_at_least_that_of_its_steps():
+    """Uniform over the least step between two readings: step / sqrt 12."""
+    ramp = 0.5 * np.floor(np.arange(400) / 40.0)
+    assert sensor_std(a_flight(h=ramp), "h") == pytest.approx(0.5 / math.sqrt(12.0))
+
+
 def test_record_of_puts_every_channel_in_its_column():
     flight = a_flight(h=np.arange(10.0), q=-np.arange(10.0))
     found = record_of(flight.runs[0])

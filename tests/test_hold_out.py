@@ -1,9 +1,14 @@
 """Which runs are held out, from information that is given by hand: nothing else may decide."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from coax_env import InputError, load_vehicle
+from coax_env.diagnosis import hold_out
 from coax_env.diagnosis.hold_out import check_hold_out, fair_part, split
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter import HeliModel
@@ -69,3 +74,46 @@ def test_runs_that_are_named_are_held_out_and_not_all_may_be():
     check_hold_out(None, ["a"])
     with pytest.raises(InputError, match="nothing is left"):
         check_hold_out(["b", "a"], ["a", "b"])
+
+
+class Told:
+    """Stands for the engine: each run's information on one effect's numbers, whatever was flown."""
+
+    table: np.ndarray
+
+    def __init__(self, model: Any, records: list[Record]) -> None:
+        self.records = records
+
+    def linearise(self, values: Any, noise: Noise, free: Any) -> tuple[list[Any], Any]:
+        own = self.table[[int(r.whole.split()[-1]) for r in self.records]]
+        information = np.array([row * np.eye(len(free)) for row in own])
+        return [], SimpleNamespace(information=information)
+
+
+@pytest.mark.parametrize("clock", [0.0, 900.0])
+def test_a_run_that_is_more_than_a_third_of_the_time_is_fitted(monkeypatch, clock):
+    """However fair its information: the next fair one is held out, whatever the clocks say."""
+    model = SimpleNamespace(
+        effect_parameters=MODEL.effect_parameters, bare_values=MODEL.bare_values
+    )  # fmt: skip
+    monkeypatch.setattr(hold_out, "Engine", Told)
+    monkeypatch.setattr(hold_out, "excitation", lambda model, values, passes: {})
+    monkeypatch.setattr(Told, "table", np.array([25.0, 22.0, 23.0, 30.0]), raising=False)
+    some = [records(1, seconds, start)[0] for seconds, start in
+            ((9.0, clock), (5.0, 20.0), (5.0, clock), (5.0, 20.0))]  # fmt: skip
+    named = [replace(r, name=f"run {k}") for k, r in enumerate(some)]
+    _, out = split(model, named, Noise({}), None, ("gyro_bias",), SETTINGS)  # type: ignore[arg-type]
+    assert [r.name for r in out] == ["run 2"], "of 24 s a third are 8"
+    short = [replace(r, name=f"run {k}") for k, r in enumerate(records(4))]
+    _, out = split(model, short, Noise({}), None, ("gyro_bias",), SETTINGS)  # type: ignore[arg-type]
+    assert [r.name for r in out] == ["run 0"]
+
+
+def test_shares_are_those_of_every_number_and_effects_count_alike():
+    """Each group's columns share one weight; what no run shows is no column."""
+    groups = [np.array([[1.0, 0.0, 2.0], [3.0, 0.0, 6.0]]), np.array([[5.0], [5.0]])]
+    shares, weights = hold_out._shares(groups)
+    np.testing.assert_allclose(shares, [[0.25, 0.25, 0.5], [0.75, 0.75, 0.5]])
+    np.testing.assert_allclose(weights, [0.5, 0.5, 1.0])
+    nothing, none = hold_out._shares([np.zeros((2, 3)), groups[1]])
+    assert nothing.shape == (2, 1) and none.tolist() == [1.0]

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from coax_env.env import hover, tasks
-from coax_env.kernel.random_streams import stream_key
+from coax_env.env import flight_loop, hover, period, tasks
+from coax_env.kernel.random_streams import stream_key, two_normals
+from coax_env.model import parameters as P
 from coax_env.model.layout import N_FULL, STATES
 from coax_env.model.sensors import suite
 
@@ -118,6 +119,39 @@ def test_starts_are_uniform_about_hover_and_settled():
     assert np.abs(np.corrcoef(away[:, half > 0.0].T) - np.eye(10)).max() < 0.1
 
 
+@pytest.mark.parametrize("gust", [(0.3, 2e-3), (0.3, 0.0), (0.0, 2e-3)])
+def test_each_gust_is_kicked_by_what_its_own_memory_loses(gust):
+    """From nothing: std times sqrt(1 - exp(-2 dt/T)) of a normal number each, a pair and one."""
+    p = np.zeros(P.GUST_MEMORIES.stop)
+    p[P.GUST_MEMORIES] = memories = np.array([0.2, 0.5, 0.9, 1.7])
+    own, copy = stream(4), stream(4)
+    x, expected = np.zeros(N_FULL), np.zeros(6)
+    period.add_gusts(x, p, np.array(gust), own)
+    share = np.sqrt(-np.expm1(-2.0 * period.DT / memories))
+    for half, first in ((0, 0), (1, 3)):
+        if gust[half]:
+            pair, single = two_normals(copy), two_normals(copy)
+            expected[first : first + 2] = gust[half] * share[2 * half] * np.array(pair)
+            expected[first + 2] = gust[half] * share[2 * half + 1] * single[0]
+    np.testing.assert_allclose(x[20:26], expected, rtol=1e-12)
+    assert np.array_equal(own, copy) and not x[:20].any()
+
+
+@pytest.mark.parametrize("steady", [(2.0, -1.5), (-0.4, 3.0), (0.0, 0.0)])
+def test_turbulence_blows_along_the_wind_and_across_it_to_the_right(steady):
+    """On top of the steady wind; where there is none, along is north."""
+    x, own, air = np.zeros(N_FULL), np.zeros(3), np.zeros(3)
+    x[15] = -2.0
+    flight_loop.move_air(x, own, stream(5), np.ones(5), np.array(steady), 4.0, air)
+    along, across, down = air
+    assert min(abs(air)) > 0.05
+    wind = complex(*steady)
+    direction = wind / abs(wind) if wind else 1.0
+    found = complex(own[flight_loop.AIR_NORTH], own[flight_loop.AIR_EAST])
+    assert found == pytest.approx(wind + direction * complex(along, across))
+    assert own[flight_loop.AIR_DOWN] == down
+
+
 # --- targets --------------------------------------------------------------------------------------
 
 
@@ -139,6 +173,28 @@ def test_the_way_to_the_target_is_in_the_headings_axes(name, seed):
     np.testing.assert_allclose(out[:3], expected, atol=1e-12)
     assert math.cos(out[3] - (target[3] - psi)) == pytest.approx(1.0)
     assert -math.pi <= out[3] < math.pi
+
+
+@pytest.mark.parametrize("psi", [0.0, 0.9, -2.5])
+def test_how_a_target_moves_is_told_in_the_headings_axes_and_within_bounds(psi):
+    """Velocity and acceleration ahead, right and up, and the turn; each no more than its bound."""
+    point = np.array([9.0, 9.0, 9.0, 9.0, 0.8, -0.5, 0.3, 0.2, -0.6, 0.4, 0.7])
+    out = np.zeros(tasks.N_MOTION)
+    tasks.motion_of_target(point, psi, out)
+    turn = np.exp(-1j * psi)
+    velocity, acceleration = complex(0.8, -0.5) * turn, complex(-0.6, 0.4) * turn
+    expected = [velocity.real, velocity.imag, -0.3, 0.2, acceleration.real, acceleration.imag, -0.7]
+    np.testing.assert_allclose(out, expected, atol=1e-12)
+    for side in (-1.0, 1.0):
+        tasks.motion_of_target(side * 1e4 * point, 0.0, out)
+        wanted = np.sign([0.8, -0.5, -0.3, 0.2, -0.6, 0.4, -0.7]) * tasks._MOTION_BOUNDS
+        np.testing.assert_allclose(out, side * wanted)
+
+
+def test_a_path_goes_on_from_its_seam():
+    """Ten rows of which the fourth follows the last."""
+    rows = [int(tasks.row_of_path(row, 10, 4)) for row in range(24)]
+    assert rows == [*range(10), *range(4, 10), *range(4, 10), 4, 5]
 
 
 def test_the_way_is_held_within_its_bounds():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from coax_env import read_flight
+from coax_env.diagnosis import input_innovations
 from coax_env.diagnosis.fits import converged, fitted, linearise, start
 from coax_env.diagnosis.input_innovations import (
     _gains,
@@ -20,9 +21,11 @@ from coax_env.diagnosis.input_innovations import (
 )
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation import kalman
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import replay_runs
+from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.model import parameters as P
 from coax_env.model.layout import CHANNELS, GUSTS, N_FULL
 from coax_env.model.vehicle_file import load_vehicle
@@ -125,6 +128,35 @@ def test_a_gain_s_prior_is_what_the_filter_does_not_know_over_what_commands_show
     tied[:, 1] = tied[:, 0]  # the rotors are only moved together
     names = [f.name for f in _gains([run], [tied])]
     assert not any(n.endswith(("rate_z", "moment_z")) for n in names) and len(names) == 5
+
+
+@pytest.mark.parametrize(("fallen", "taken"), [(6.1, True), (5.9, False), (-3.0, False)])
+def test_gains_are_fitted_where_that_is_worth_more_than_a_tie(monkeypatch, fallen, taken):
+    """And only beside white innovations: what a model gets wrong follows the commands too."""
+    first, *others = P.COMMAND_GAINS
+    gains = [FreeParameter(first, 0.0, 0.1)]
+    asked = []
+
+    def fitted(problem, fit, tolerance):
+        asked.append((dict(fit.values), tolerance))
+        return replace(fit, objective=300.0 - fallen)
+
+    monkeypatch.setattr(input_innovations, "_passes", lambda engine, fit: [])
+    monkeypatch.setattr(input_innovations, "_innovations", lambda passes: [])
+    monkeypatch.setattr(input_innovations, "_gains", lambda passes, found: gains)
+    monkeypatch.setattr(input_innovations, "fitted", fitted)
+    made = Problem(HeliModel(LAMA), Engine(HeliModel(LAMA), []), (), {})
+    fit = Fit((), {"mass": 0.8, first: 0.2}, Noise({}), objective=300.0)
+    for white in (True, False):
+        monkeypatch.setattr(input_innovations, "is_white", lambda p, c, white=white: white)
+        wider, found = input_innovations.with_command_gains(made, fit)
+        if white and taken:
+            assert wider.added == tuple(gains) and found.objective == 300.0 - fallen
+        else:
+            assert wider is made and found is fit
+    ((values, tolerance),) = asked
+    assert tolerance == 3.0 and values[first] == 0.2, "from where they stand"
+    assert {values[n] for n in others} == {0.0}
 
 
 @pytest.mark.slow

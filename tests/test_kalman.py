@@ -23,9 +23,19 @@ from test_estimation import (
 )
 
 from coax_env.estimation import kalman
-from coax_env.estimation.sparse import ROW_MULTIPLE, find_non_zeros, multiply, padded, with_places
+from coax_env.estimation.sparse import (
+    ROW_MULTIPLE,
+    aligned,
+    combine,
+    find_non_zeros,
+    multiply,
+    padded,
+    unpack,
+    with_places,
+)
 from coax_env.estimation.state_space import Record
 from coax_env.kernel.angles import wrap_angles
+from coax_env.kernel.simd import SIMD_WIDTH
 
 GATE = 8.0
 H = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
@@ -56,7 +66,7 @@ def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) ->
     x, P = Pendulum.start_at.copy(), np.diag(Pendulum.start_std**2)
     dt = np.append(np.diff(record.t), 0.0)
     found: dict[str, Any] = {
-        name: [] for name in ("x", "P", "predicted", "F", "e", "K", "per_sigma")
+        name: [] for name in ("x", "P", "predicted", "F", "e", "K", "per_sigma", "outside")
     }
     log_likelihood = 0.0
     beyond = 0
@@ -69,6 +79,7 @@ def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) ->
         R_k = R.copy()
         for i in there:
             s2 = H[i] @ P @ H[i] + R[i]
+            found["outside"].append(1.0 / s2 if v[i] ** 2 > GATE**2 * s2 else 0.0)
             if v[i] ** 2 > GATE**2 * s2:
                 R_k[i] += v[i] ** 2 / GATE**2 - s2
                 log_likelihood -= 0.5 * (GATE**2 - 1.0) * math.log(v[i] ** 2 / GATE**2 / s2)
@@ -155,7 +166,8 @@ def test_the_pass_is_the_textbooks_filter(sine, clock):
     for ours, theirs in (
         (trace.states, dense["x"]), (kept.P, dense["P"]), (trace.e, dense["e"]),
         (trace.path.predicted, dense["predicted"]), (trace.gains.K, dense["K"]),
-        (trace.gains.per_sigma, dense["per_sigma"]), (trace.path.P, dense["P"]),
+        (trace.gains.per_sigma, dense["per_sigma"]), (trace.path.beyond, dense["outside"]),
+        (trace.path.P, dense["P"]),
         (trace.path.F[trace.path.F_of[:-1]], dense["F"][:-1]),
         (trace.gains.H, np.broadcast_to(H, trace.gains.H.shape)),
     ):  # fmt: skip
@@ -203,3 +215,50 @@ def test_a_sparse_product_is_the_dense_one(share):
 @pytest.mark.parametrize("count", [1, ROW_MULTIPLE - 1, ROW_MULTIPLE, ROW_MULTIPLE + 1])
 def test_rows_are_padded_to_whole_multiples(count):
     assert padded(count) % ROW_MULTIPLE == 0 and 0 <= padded(count) - count < ROW_MULTIPLE
+
+
+@pytest.mark.parametrize("width", [5, SIMD_WIDTH, SIMD_WIDTH + 3, 4 * SIMD_WIDTH])
+def test_places_are_noted_anew_wherever_a_value_changes(width):
+    """Rows of whole registers remember which lanes were not zero; others are looked through."""
+    A = with_places(np.zeros((2, width)), width)
+    assert A.seen.shape == (2, width // SIMD_WIDTH if width % SIMD_WIDTH == 0 else 0)
+    find_non_zeros(A)
+    assert list(A.counts) == [0, 0]
+    for j in range(width):
+        A.values[1, j] = -1.5
+        find_non_zeros(A)
+        assert list(A.counts) == [0, 1] and A.places[1, 0] == j
+        A.values[1, j] = 0.0
+    find_non_zeros(A)
+    assert list(A.counts) == [0, 0]
+
+
+@pytest.mark.parametrize("rows", [1, 3, 7])
+def test_rows_begin_at_a_line_of_the_cache(rows):
+    """64 bytes, wherever the memory was taken from; zeros, as many as asked for."""
+    kept = [aligned(rows, width) for width in (8, 16, 40) for _ in range(6)]
+    for k, A in enumerate(kept):
+        assert A.shape == (rows, (8, 16, 40)[k // 6]) and not A.any()
+        assert A.ctypes.data % 64 == 0
+        A += k + 1.0
+    for k, A in enumerate(kept):
+        np.testing.assert_array_equal(A, k + 1.0, err_msg="one lies in another")
+
+
+def test_rows_are_combined_by_their_weights():
+    """The first so many of them; what is beyond counts for nothing."""
+    rng = np.random.default_rng(7)
+    B, weights = rng.normal(size=(6, padded(40))), rng.normal(size=8).astype(np.float32)
+    out = np.full(padded(40), np.nan)
+    combine(weights, B, 5, out)
+    np.testing.assert_allclose(out, weights[:5].astype(float) @ B[:5], atol=1e-13)
+
+
+def test_a_stored_matrix_comes_back_with_its_non_zeros():
+    stored = np.zeros((3, 2, 5), np.float32)
+    stored[1] = [[0.0, 2.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 4.0]]
+    A = with_places(np.ones((2, padded(5))), 5)
+    A.values[:, 5:] = 0.0
+    unpack(stored, 1, A)
+    np.testing.assert_array_equal(A.values[:, :5], stored[1])
+    assert list(A.counts) == [2, 1] and list(A.places[0, :2]) == [1, 3] and A.places[1, 0] == 4

@@ -1,14 +1,31 @@
 """Does the fitted model make such flights? Gusty ones by other code, their noise known, then wrong."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import injector
 import numpy as np
 import pytest
+from scipy.stats import chi2, norm
 
 from coax_env import load_vehicle, read_flight
-from coax_env.diagnosis.model_check import LARGE, SEEN, ModelCheck, _spectra, model_check
+from coax_env.diagnosis import model_check as model_check_module
+from coax_env.diagnosis.model_check import (
+    LAGS,
+    LARGE,
+    SEEN,
+    ModelCheck,
+    _answers,
+    _correlation,
+    _late_rows,
+    _power,
+    _rows_ahead,
+    _spectra,
+    _starts,
+    _unseen,
+    model_check,
+)
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import one_step_against_a_second
 from coax_env.diagnosis.settings import SETTINGS
@@ -123,3 +140,159 @@ def test_a_better_likelihood_with_a_worse_second_is_said(better, low, said):
     assert not said or ("50 nats" in texts[0] and "heading" in texts[0])
     assert one_step_against_a_second(None, [], [], SETTINGS) == []
     assert np.isnan(RunReplay("run", {}, False, {}).log_likelihood)
+
+
+# --- where predictions start, and what they are compared with ---------------------------------------
+
+
+T = 50.0 + 0.1 * np.arange(301)
+"""30 s at 10 Hz, on a clock that started elsewhere."""
+
+
+def record_at(t: np.ndarray, shown: bool = False) -> Record:
+    ones = np.ones((t.size, len(CHANNELS)))
+    innovations = np.ones((t.size, 4)) if shown else None
+    return Record("a", t, np.zeros((t.size, 4)), ones, t[0], innovations)
+
+
+def test_starts_are_five_seconds_apart_from_two_seconds_on():
+    """Two seconds of readings and three of flight; a second set lies halfway; the last sees 0.25 s."""
+    np.testing.assert_allclose(_starts(record_at(T), 0.0), [52.0, 57.0, 62.0, 67.0, 72.0, 77.0])
+    np.testing.assert_allclose(_starts(record_at(T), 0.5), [54.5, 59.5, 64.5, 69.5, 74.5, 79.5])
+    assert _starts(record_at(T[:22]), 0.0).size == 0
+
+
+def test_three_seconds_from_each_start_are_unseen():
+    """In the readings and in what commands show; the start's own row is seen."""
+    for shown in (False, True):
+        blind = _unseen(record_at(T, shown), np.array([52.0, 60.0]))
+        there = np.isfinite(blind.z).all(axis=1)
+        hidden = ((T > 52.01) & (T < 55.01)) | ((T > 60.01) & (T < 63.01))
+        np.testing.assert_array_equal(there, ~hidden)
+        if shown:
+            assert blind.input_innovations is not None
+            np.testing.assert_array_equal(blind.input_innovations[:, 2], np.where(hidden, 0.0, 1.0))
+        else:
+            assert blind.input_innovations is None
+
+
+def test_each_horizon_ends_at_its_row_or_not_at_all():
+    rows = _rows_ahead(T, np.array([52.0, 78.6]))
+    assert rows.tolist() == [[22, 25, 30, 40, 50], [288, 291, 296, -1, -1]]
+
+
+def test_the_last_reading_within_a_tail_counts():
+    """0.15 s: of two rows before, and none of three."""
+    z = np.full((T.size, 3), np.nan)
+    z[38:41, 0] = 1.0
+    z[39, 1] = 1.0
+    z[38, 2] = 1.0
+    assert _late_rows(T, z, 40).tolist() == [40, 39, -1]
+
+
+@pytest.fixture
+def errors(monkeypatch):
+    """Predictions of one channel alone, whose scaled errors are given: by phase, (starts, horizon)."""
+
+    def of(table: list[np.ndarray]) -> list[dict[str, Any]]:
+        def made(problem: Any, fit: Any, phase: float) -> np.ndarray:
+            own = table[round(phase * len(table))]
+            result = np.full((*own.shape, len(CHANNELS)), np.nan)
+            result[:, :, CHANNELS.index("psi")] = own
+            return result
+
+        monkeypatch.setattr(model_check_module, "scaled_errors", made)
+        return list(model_check_module._predictions(None, None))
+
+    return of
+
+
+def test_errors_are_large_where_their_rms_is_no_chance(errors):
+    """40 of 2 at each of two phases: 40 independent ones. By chance 1.66 are once in 10^5."""
+    least = math.sqrt(chi2.isf(1e-5, 40) / 40)
+    assert 1.4 < least < 1.7
+    for size, said in ((1.02 * least, True), (0.98 * least, False)):
+        table = np.full((40, 5), 0.5)
+        table[:, 2] = size
+        found = errors([table, table])
+        assert bool(found) == said
+        if said:
+            (entry,) = found
+            assert entry == {"channel": "psi", "horizon_s": 1.0, "ratio": round(size, 2)}
+    few = np.full((7, 5), 9.0)
+    assert errors([few, few]) == []
+    assert len(errors([np.full((8, 5), 9.0)] * 2)) == 5
+    many = np.full((4000, 5), 1.2)
+    assert errors([many, many]) == [], "no chance, but less than a quarter"
+    mixed = np.full((4000, 5), 0.0)
+    mixed[::2] = 2.0
+    assert {e["ratio"] for e in errors([mixed, 0.0 * mixed + 1.4])} == {1.41}
+
+
+# --- spectra and answers ----------------------------------------------------------------------------
+
+
+def passed(e: np.ndarray, t: np.ndarray, command: np.ndarray | None = None) -> RunPass:
+    innovations = np.full((t.size, len(CHANNELS)), np.nan)
+    innovations[:, CHANNELS.index("q")] = e
+    none = np.empty(0)
+    record = Record("a", t, np.zeros((t.size, 4)) if command is None else command, innovations)
+    return RunPass(record, none, 0.0, innovations, none, 0, none, none, none, none, none)
+
+
+def test_a_bands_power_is_that_of_its_frequencies():
+    """A sine of amplitude a over n readings has a^2 n/4 at its own line, in its own band alone."""
+    t = 7.0 + 0.05 * np.arange(441)  # the last 400 of them are looked at, from 9.05 s on
+    wave = 0.3 * np.sin(2.0 * np.pi * 3.0 * (t - 9.05))
+    run, c = passed(wave, t), CHANNELS.index("q")
+    power = _power(run, c, 2.0, 8.0)
+    assert power.size == 120 and power.max() == pytest.approx(0.09 * 400 / 4.0, rel=1e-6)
+    assert power.sum() == pytest.approx(power.max(), rel=1e-6)
+    assert _power(run, c, 0.5, 2.0).sum() == pytest.approx(0.0, abs=1e-9)
+    assert _power(run, c, 0.0, 0.5).size == 10 and _power(run, c, 8.0, 25.0).size == 39
+    few = wave.copy()
+    few[-(441 - 41 - 31):] = np.nan  # fmt: skip
+    assert _power(passed(few, t), c, 0.0, 25.0).size == 0
+
+
+def test_a_correlation_is_with_what_the_command_did_in_the_twentieth_before():
+    """Innovations that are that change, lag seconds late, of one run; nothing in the other."""
+    rng = np.random.default_rng(6)
+    t = 3.0 + 0.02 * np.arange(1000)
+    command = np.zeros((t.size, 4))
+    command[:, 2] = np.cumsum(rng.standard_normal(t.size))
+    late = np.roll(np.diff(command[:, 2], prepend=0.0), 10)
+    found, c = {}, CHANNELS.index("q")
+    for lag in LAGS:
+        found[lag], count = _correlation([passed(late, t, command)], c, 2, lag)
+        assert count == 1000 - 101
+    assert found[0.2] == pytest.approx(1.0, abs=1e-9)
+    assert max(abs(v) for lag, v in found.items() if lag != 0.2) < 0.15
+    half = [passed(late, t, command), passed(np.where(t < 0, 1.0, 0.0), t, command)]
+    value, count = _correlation(half, c, 2, 0.2)
+    assert value == pytest.approx(1.0 / math.sqrt(2.0), abs=0.05) and count == 2 * 899
+    assert _correlation([passed(late, t, 0.0 * command)], c, 2, 0.2)[0] == 0.0
+    entries = list(_answers([passed(late, t, command)]))
+    assert entries == [
+        {"channel": "q", "command": "longitudinal swash", "lag_s": 0.2, "correlation": 1.0}
+    ]
+
+
+@pytest.mark.parametrize(("size", "said"), [(0.16, True), (0.12, False)])
+def test_a_weak_answer_is_said_from_where_it_is_no_chance(size, said, monkeypatch):
+    """Of 900 readings a correlation of 0.142 is once in 10^5 by chance."""
+    assert norm.isf(1e-5) / math.sqrt(900) == pytest.approx(0.142, abs=0.001)
+    monkeypatch.setattr(
+        model_check_module, "_correlation", lambda passes, c, k, lag: (-size * (k == 1 and c == 4), 900)
+    )  # fmt: skip
+    assert bool(list(_answers([]))) == said
+
+
+def test_the_worst_of_a_kind_is_in_the_words():
+    loud = [{"channel": "q", "band_hz": [0.5, 2.0], "ratio": r} for r in (1.3, 1.9, 1.5)]
+    follows = [{"channel": "p", "command": "upper rotor", "lag_s": 0.1, "correlation": r}
+               for r in (0.2, -0.4)]  # fmt: skip
+    spectrum, command = ModelCheck([], loud, follows).remarks
+    assert (
+        "1.9 times" in spectrum and "0.5 to 2 Hz" in spectrum and "(correlation -0.40)" in command
+    )

@@ -241,6 +241,19 @@ def test_where_whole_flights_judge_the_slow_tests_of_a_file_count(toy):
     }  # fmt: skip
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("mark", "caught"), [("", True), ("@pytest.mark.slow\n", False)])
+def test_quick_tests_without_end_are_a_catch_and_slow_ones_are_none(
+    toy, tmp_path, monkeypatch, mark, caught
+):
+    root, _ = toy
+    endless = f"import pytest, time\n\n{mark}def test_endless():\n    time.sleep(60)\n"
+    (root / "tests/test_toy.py").write_text(endless)
+    monkeypatch.setattr(trial, "LIMIT", 10.0)  # an interpreter starts in less
+    (mutation, *_) = draw.all_sites(root)
+    assert trial.Tree(root, tmp_path / "job").try_out(mutation, rest=False)["caught"] == caught
+
+
 def test_a_tree_whose_tests_fail_as_it_is_has_no_score(toy):
     root, call = toy
     (root / "tests/test_toy.py").write_text(TEST.replace("6.0", "7.0"))

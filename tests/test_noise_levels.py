@@ -11,6 +11,7 @@ import pytest
 
 from coax_env import load_vehicle, simulate
 from coax_env.diagnosis.findings import noise_levels
+from coax_env.estimation import noise_levels as noise_fits
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import (
@@ -19,6 +20,7 @@ from coax_env.estimation.helicopter_noise import (
     starting_noise,
 )
 from coax_env.estimation.noise_levels import fit_noise, level_slopes
+from coax_env.estimation.state_space import Noise
 from coax_env.simulation.simulate import Gusts
 
 LAMA = load_vehicle("lama400d")
@@ -94,3 +96,94 @@ def test_the_memory_of_the_gusts_is_found(memory):
         assert found.level(axes) == pytest.approx(level, rel=0.35), axes
         assert abs(np.log(found.level(f"memory_{axes}") / memory)) < np.log(1.8), axes
     assert found.level("p") == pytest.approx(noise.level("p"), rel=0.1)
+
+
+# --- the steps of a fit, on a posterior that is known -------------------------------------------------
+
+
+def point(**changed: object) -> noise_fits._Point:
+    """Three levels at 1, 2 and 3, with slopes and scales, between a tenth and ten times."""
+    noise = Noise({"a": 1.0, "b": 2.0, "c": 3.0}, {}, {}, {})
+    logs = np.log([1.0, 2.0, 3.0])
+    given = dict(
+        names=("a", "b", "c"), noise=noise, logs=logs, lower=logs - np.log(10.0),
+        upper=logs + np.log(10.0), value=-50.0, slope=np.array([3.0, -2.0, 0.5]),
+        scale=np.array([1.0, 4.0, 2.0]), ratio=np.ones(3),
+    )  # fmt: skip
+    return noise_fits._Point(**{**given, **changed})
+
+
+def test_a_level_promises_half_the_square_of_its_slope_in_std():
+    """But nothing at a bound that it wants to cross; at the other bound it does."""
+    gains = 0.5 * np.array([9.0, 0.25, 0.0625])
+    one = point()
+    np.testing.assert_allclose(one.predicted_gains(), gains)
+    top = point(upper=one.logs)
+    np.testing.assert_allclose(top.predicted_gains(), gains * [0.0, 1.0, 0.0])
+    bottom = point(lower=one.logs)
+    np.testing.assert_allclose(bottom.predicted_gains(), gains * [1.0, 0.0, 1.0])
+
+
+def test_a_prior_is_normal_in_the_logarithm():
+    """Its value, slope and information; a level without one has none."""
+    noise = Noise({"a": 2.0, "b": 0.5}, {}, prior={"a": (1.0, 0.7)})
+    value, slope, information = noise_fits._log_prior(noise, ["a", "b"])
+    away = np.log(2.0)
+    assert value == pytest.approx(-0.5 * (away / 0.7) ** 2)
+    np.testing.assert_allclose(slope, [-away / 0.49, 0.0])
+    np.testing.assert_allclose(information, [1.0 / 0.49, 0.0])
+
+
+class Climb:
+    """Points whose ratio is (best / level)^power, evaluated so many times."""
+
+    def __init__(self, monkeypatch, best: float, falls: bool = False) -> None:
+        self.asked: list[float] = []
+
+        def moved(own: noise_fits._Point, engine: object, values: object, logs: np.ndarray):
+            self.asked.append(float(np.exp(logs[0])))
+            value = own.value + (-1.0 if falls else 1.0)
+            ratio = np.array([(best / np.exp(logs[0])) ** 2.0])
+            return replace(own, logs=np.array(logs), value=value, ratio=ratio)
+
+        monkeypatch.setattr(noise_fits._Point, "moved", moved)
+        self.begin = replace(
+            point().only(np.array([0])), lower=np.array([-20.0]), upper=np.array([20.0]),
+            ratio=np.array([best**2.0]),
+        )  # fmt: skip
+
+    def climbed(self, evaluations: int = 16) -> tuple[float, int]:
+        there, left = noise_fits._from_afar(None, {}, self.begin, evaluations)
+        return float(np.exp(there.logs[0])), left
+
+
+def test_from_afar_a_variance_is_taken_times_what_is_shown_of_it(monkeypatch):
+    """A level 9 times too small is right after one step; none where it asks for less than e^0.4."""
+    near = Climb(monkeypatch, 9.0)
+    assert near.climbed() == (pytest.approx(9.0), 15)
+    assert near.asked == [pytest.approx(9.0)]
+    for factor, steps in ((1.45, 0), (1.55, 1), (1.0 / 1.45, 0), (1.0 / 1.55, 1)):
+        small = Climb(monkeypatch, factor)
+        small.climbed()
+        assert len(small.asked) == steps, factor
+    far = Climb(monkeypatch, 1e3)
+    assert far.climbed() == (pytest.approx(1e3), 13)
+    np.testing.assert_allclose(far.asked, [np.exp(3.0), np.exp(6.0), 1e3])
+    assert Climb(monkeypatch, 1e3).climbed(2)[1] == 0
+    worse = Climb(monkeypatch, 9.0, falls=True)
+    assert worse.climbed() == (pytest.approx(1.0), 15)
+
+
+def test_levels_that_ask_for_nothing_stay(flown):
+    """Only those that promise something are moved; no fit where all of them promise too little."""
+    engine, noise = flown
+    values = engine.model.bare_values
+    first = noise_fits._Point.at(engine, values, noise, ["p", "q", "force_xy"])
+    assert fit_noise(engine, values, noise, ["p", "q"], tolerance=1e6) is noise
+    loud = noise.with_levels({"p": 4.0 * noise.reading["p"]})
+    assert noise_fits._Point.at(engine, values, loud, ["p"]).ratio[0] < 0.5
+    found = fit_noise(engine, values, replace(loud, prior={}), ["p"], evaluations=6)
+    assert found.reading["p"] == pytest.approx(noise.reading["p"], rel=0.2)
+    assert found.process == loud.process
+    np.testing.assert_allclose(first.lower[0], np.log(noise.floor["p"]))
+    np.testing.assert_allclose(first.upper[0], np.log(noise.ceiling["p"]))

@@ -1,8 +1,11 @@
 """What begins in flight: scored at every moment, named with its moment, and nowhere else."""
 
 import csv
+import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import injector
 import numpy as np
@@ -10,14 +13,19 @@ import pytest
 from causes import check_causes, truth_of
 from test_estimation import NOISE, TRUTH, Pendulum, prior, swing
 
+from coax_env.diagnosis import onset
 from coax_env.diagnosis.diagnose import diagnose
-from coax_env.diagnosis.onset import rows_of
+from coax_env.diagnosis.onset import Changing, rows_of
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation.beginnings import Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, Moment, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.parted_engine import of_part
+from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.rotor_jitter import JitteryModel, with_jitter
+from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.flight import read_flight
 from coax_env.model.vehicle_file import load_vehicle
 
@@ -99,6 +107,26 @@ def test_moved_from_a_row_on_is_the_model_that_changes_there(short):
     assert b.own[3:, 3:] * np.outer(unit, unit) == pytest.approx(exact, abs=0.01)
 
 
+def test_what_begins_and_what_always_was_share_the_rows_from_there_on(short):
+    """Information across: the column of what begins, times that before and after together."""
+    model, records, noise = short
+    names, row = ("swash_offset", "gyro_bias"), 200
+    own = [f for e in names for f in model.effect_parameters(e)]
+    values = {**model.bare_values, **{f.name: f.value for f in own}}
+    _, (b,) = Engine(model, records).beginnings(
+        values, noise, own, [np.empty(0, np.int64), np.array([row])], lambda b: b
+    )
+    same = {of_part(f.name, BEFORE): values[f.name] for f in own}
+    there = Engine(changing(model, records, names, row), records)
+    _, lin = there.linearise({**values, **same}, noise, [*own, *map(before, own)])
+    k, information = len(own), lin.information[1]
+    across = information[:k, :k] + information[:k, k:]
+    whole = across + information[k:, :k] + information[k:, k:]
+    unit = np.outer(np.diag(information[:k, :k]) ** -0.5, np.diag(whole) ** -0.5)
+    assert b.across * unit == pytest.approx(across * unit, abs=0.02)
+    assert np.abs(information[:k, k:] * unit).max() > 0.05, "and the past is felt"
+
+
 def test_nothing_begins_at_the_ends_of_a_flight(short):
     _, records, _ = short
     first, last = rows_of(records)
@@ -156,6 +184,27 @@ def test_later_runs_and_held_out_thirds_are_flown_as_after_the_moment(short):
     assert np.array_equal(there.stretches(third), own)
 
 
+def test_what_changes_has_numbers_before_and_what_begins_has_none(short):
+    """Under the same priors; with the moments that there were, over the same records."""
+    model, records, noise = short
+    first, second = (Moment(records[1].whole, float(records[1].t[k])) for k in (100, 200))
+    runs = [r.whole for r in records]
+    made = Problem.of(model, records, ("swash_offset", "gyro_bias", "wind"))
+    fit = Fit(("swash_offset",), model.bare_values, noise)
+    made = onset.beginning(made, fit, {"wind": first}, runs)
+    begun = onset.beginning(made, fit, {"swash_offset": second, "gyro_bias": second}, runs)
+    names = [f.name for f in begun.own["swash_offset"]]
+    plain = ["swash_offset.lon", "swash_offset.lat"]
+    assert names == [*plain, *(of_part(n, BEFORE) for n in plain)]
+    assert begun.own["gyro_bias"] == made.own["gyro_bias"] and begun.own["wind"] == made.own["wind"]
+    own = begun.own["swash_offset"]
+    assert [(f.value, f.std) for f in own[2:]] == [(f.value, f.std) for f in own[:2]]
+    assert begun.model.moments == {"wind": first, "swash_offset": second, "gyro_bias": second}
+    assert begun.engine.records == made.engine.records and begun.engine.model is begun.model
+    again = onset.beginning(begun, fit, {"swash_offset": first}, runs)
+    assert again.own["swash_offset"] == own, "its numbers before are there already"
+
+
 # --- hidden by other code ---------------------------------------------------------------------------
 
 
@@ -205,3 +254,234 @@ def test_nothing_begins_where_a_cause_is_constant(tmp_path):
     findings = diagnose(tmp_path, hold_out=[]).findings
     check_causes(findings, *truth_of(tmp_path))
     assert all(c["since"] is None for c in findings["causes"])
+
+
+# --- what a change is worth, and when it was --------------------------------------------------------
+
+
+def test_on_long_flights_moments_are_farther_apart():
+    """A thousand seconds in two runs: some six hundred moments, from a second after a start on."""
+    t = np.arange(0.0, 500.005, 0.01)
+    none = np.zeros((t.size, 4))
+    first, last = rows_of([Record(name, t + 7.0, none, none) for name in "ab"])
+    spacing = 1000.0 / 600.0
+    np.testing.assert_allclose(np.diff(first), 100.0 * spacing, atol=1.01)
+    assert t[first[0]] == pytest.approx(1.0 + spacing, abs=0.011)
+    np.testing.assert_allclose(np.diff(last[1:]), 100.0 * spacing, atol=1.01)
+    assert t[last[1]] == pytest.approx(1.0, abs=0.011) and last[0] == 0
+    assert t[last[-1]] < 498.5 < t[last[-1]] + spacing + 0.01
+    short = rows_of([Record("a", t[:1001], none[:1001], none[:1001])])[0]
+    assert 1.49 < t[short[0]] < 1.61 and set(np.diff(short)) == {10}
+
+
+NAMES = ("mass", "gyro_bias.x", "gyro_bias.y", "gyro_bias.z", "yaw_damping.coefficient")
+
+
+def table(at: dict[str, float], slope: np.ndarray, inflation: float = 1.0):
+    """The table of two effects at a fit whose slopes are these, of three runs, and its quadratic."""
+    model = HeliModel(load_vehicle("lama400d"))
+    own = {e: tuple(model.effect_parameters(e)) for e in ("gyro_bias", "yaw_damping")}
+    mass = next(f for f in model.base_parameters() if f.name == "mass")
+    problem = Problem(model, None, (mass,), own)
+    free = problem.parameters
+    assert tuple(f.name for f in free) == NAMES
+    std = np.array([f.std for f in free])
+    rng = np.random.default_rng(1)
+    A = 2.0 * rng.standard_normal((3, 12, len(free))) / std
+    information = np.einsum("rni,rnj->rij", A, A)
+    lin = Linearised(
+        NAMES, information, slope / std, np.ones((3, len(free), 1)), rng.standard_normal((30, 5))
+    )
+    values = {f.name: f.value + at.get(f.name, 0.0) * f.std for f in free}
+    quadratic = Quadratic.of(lin, free, values)
+    state = Changing(problem, Fit((), values, NOISE_OF_ALL), quadratic, {})
+    found = onset._Table.of(state, {e: [f.name for f in own[e]] for e in own})
+    return replace(found, inflation=[inflation] * 2), quadratic, std
+
+
+NOISE_OF_ALL = Noise({})
+SLOPES = np.array([[0.4, 9.0, -7.0, 5.0, -30.0], [-0.2, 3.0, 4.0, 8.0, -20.0],
+                   [0.1, 6.0, -5.0, 2.0, -9.0]])  # fmt: skip
+
+
+def log_evidence(G, g, precision, away) -> float:
+    """log of the integral of exp(-g'x - x'Gx/2) times the normal priors of x + away."""
+    P = np.diag(precision)
+    pull = g + precision * away
+    logs = np.linalg.slogdet(P)[1] - np.linalg.slogdet(G + P)[1]
+    return float(0.5 * pull @ np.linalg.solve(G + P, pull) + 0.5 * logs)
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_changes_score_is_the_log_of_the_ratio_of_two_evidences(row):
+    """A change in the second run acts on a part of it and on all of the third; all else on all runs."""
+    found, q, _ = table({"mass": 0.3}, SLOPES)
+    parts = q.parts
+    assert parts is not None
+    share = (0.7, 0.2)[row]
+    here = Beginning(1, 10, share * parts.slope[1], share * parts.information[1],
+                     share * parts.information[1])  # fmt: skip
+    for (nats, x), names in zip(found.row_of(here), (NAMES[1:4], NAMES[4:]), strict=True):
+        c = q.index(names)
+        later_G = (here.own + parts.information[2])[np.ix_(c, c)]
+        later_g = (here.slope + parts.slope[2])[c]
+        across = (here.across + parts.information[2])[np.ix_(c, [0])]
+        G = np.block([[q.G[:1, :1], across.T], [across, later_G]])
+        g = np.concatenate([q.g[:1], later_g])
+        precision = np.concatenate([q.precision[:1], q.precision[c]])
+        away = np.concatenate([(q.at - q.mean)[:1], np.zeros(len(c))])
+        alone = log_evidence(q.G[:1, :1], q.g[:1], q.precision[:1], away[:1])
+        best = np.linalg.solve(G + np.diag(precision), -(g + precision * away))[1:]
+        np.testing.assert_allclose(x, best, atol=1e-9 * np.abs(best).max())
+        assert nats == pytest.approx(log_evidence(G, g, precision, away) - alone, rel=1e-9)
+
+
+def test_a_changes_score_is_less_where_innovations_are_coloured_and_none_where_it_is_small():
+    here = Beginning(2, 5, SLOPES[2], np.zeros((5, 5)), np.zeros((5, 5)))
+    one, q, std = table({}, SLOPES)
+    parts = q.parts
+    assert parts is not None
+    here = replace(
+        here, slope=parts.slope[2], own=parts.information[2], across=parts.information[2]
+    )
+    thrice = replace(one, inflation=[3.0, 3.0])
+    first, coloured = one.row_of(here)[0][0], thrice.row_of(here)[0][0]
+    G = parts.information[2][1:4, 1:4]
+    occam = 0.5 * np.linalg.slogdet(
+        (G - np.outer(parts.information[2][1:4, 0], parts.information[2][0, 1:4])
+         / (q.G[0, 0] + q.precision[0])) * np.outer(std[1:4], std[1:4]) + np.eye(3)
+    )[1]  # fmt: skip
+    assert coloured + occam == pytest.approx((first + occam) / 3.0)
+    small = replace(here, slope=1e-6 * here.slope)
+    none = table({}, 1e-6 * SLOPES)[0]
+    assert [nats for nats, _ in none.row_of(small)] == [-math.inf, -math.inf]
+
+
+def test_a_change_stays_within_what_physics_gives():
+    """A damping that wants to be negative is at nothing: no change, and no worth."""
+    found, q, _ = table({}, -SLOPES)
+    parts = q.parts
+    assert parts is not None
+    here = Beginning(0, 0, parts.slope[0], parts.information[0], parts.information[0])
+    nats, x = found.row_of(here)[1]
+    assert x == pytest.approx([0.0], abs=1e-12) and nats == -math.inf
+
+
+def test_what_lies_behind_a_run_is_the_sum_of_the_later_ones():
+    parts = np.array([[1.0, 2.0], [3.0, 5.0], [7.0, 11.0]])
+    np.testing.assert_allclose(onset._behind(parts), [[10.0, 16.0], [7.0, 11.0], [0.0, 0.0]])
+
+
+def flown(t: np.ndarray, e: float, whole: str):
+    return SimpleNamespace(
+        record=SimpleNamespace(t=t, whole=whole), innovations=np.full((t.size, 2), e)
+    )
+
+
+def test_what_a_gust_may_have_made_counts_for_nothing():
+    """Half a second before a moment and one and a half behind it, in its own run alone."""
+    t = 20.0 + 0.1 * np.arange(100)
+    without = [flown(t, 3.0, "a"), flown(t, 2.0, "b")]
+    with_it = [flown(t, 1.0, "a"), flown(t, 1.0, "b")]
+    found = onset._lasting(without, with_it, Moment("b", 25.04))
+    rows = 100 - 20  # 24.6 to 26.5 s are left out
+    assert found == pytest.approx(0.5 * 2 * (100 * (9.0 - 1.0) + rows * (4.0 - 1.0)))
+    with_it[0].innovations[7, 1] = np.nan
+    assert onset._lasting(without, with_it, Moment("b", 25.04)) == pytest.approx(found - 4.0)
+
+
+def test_a_change_matters_from_its_smallest_size_on():
+    """Against what it was before: its number then, or off."""
+    model = HeliModel(load_vehicle("lama400d"))
+    problem = SimpleNamespace(model=model)
+    p = next(p for p in model.sized("gyro_bias") if p.name == "y")
+    name = "gyro_bias.y"
+    off = {"gyro_bias.x": 0.0, "gyro_bias.z": 0.0}
+    for change, matters in ((1.01, True), (-1.01, True), (0.99, False), (-0.99, False)):
+        fit = Fit((), {**off, name: change * p.smallest}, NOISE_OF_ALL)
+        assert onset._matters(problem, fit, "gyro_bias") == matters
+        was = {of_part(n, BEFORE): 0.0 for n in off} | {of_part(name, BEFORE): 5.0 * p.smallest}
+        moved = fit.at({name: (5.0 + change) * p.smallest, **was})
+        assert onset._matters(problem, moved, "gyro_bias") == matters
+
+
+@pytest.fixture
+def profile(monkeypatch):
+    """A problem whose likelihood of a moment is a function of its time, and where it was asked."""
+    asked: list[float] = []
+
+    def of(nats, t: np.ndarray, moment: float) -> Any:
+        class Model:
+            def __init__(self, base: Any, moments: dict[str, Moment], runs: Any) -> None:
+                self.base, self.moments, self.runs = base, moments, runs
+
+        class Likelihood:
+            def __init__(self, model: Model, records: Any, threads: int) -> None:
+                self.t = model.moments["wind"].t
+                assert [r.whole for r in records] == ["b", "b"]
+
+            def log_likelihood(self, values: Any, noise: Any) -> float:
+                asked.append(self.t)
+                return float(nats(self.t))
+
+        monkeypatch.setattr(onset, "ChangingModel", Model)
+        monkeypatch.setattr(onset, "Engine", Likelihood)
+        half = t.size // 2
+        records = [SimpleNamespace(whole=w, t=own)
+                   for w, own in (("a", t), ("b", t[:half]), ("b", t[half:]))]  # fmt: skip
+        model = Model(None, {"wind": Moment("b", moment)}, ("a", "b"))
+        return SimpleNamespace(model=model, engine=SimpleNamespace(records=records, threads=1))
+
+    return of, asked
+
+
+@pytest.mark.parametrize("inflation", [1.0, 4.0])
+def test_the_interval_of_a_moment_is_its_posteriors(profile, inflation):
+    """A normal one: mean, std beside half a row's doubt, and width sqrt(2 pi) std."""
+    of, asked = profile
+    t, best, std = 30.0 + 0.01 * np.arange(900), 33.613, 0.08
+    problem = of(lambda s: -0.5 * ((s - best) / std) ** 2 - 700.0, t, 33.3)
+    found = onset.moment_of(problem, Fit((), {}, NOISE_OF_ALL), "wind", inflation)
+    wide = math.sqrt(inflation) * std
+    assert found.moment == Moment("b", pytest.approx(33.61)) and found.effect == "wind"
+    assert found.t == pytest.approx(best, abs=0.003)
+    assert found.std == pytest.approx(math.hypot(wide, 0.01), rel=0.01)
+    assert found.width == pytest.approx(math.sqrt(2.0 * math.pi) * wide, rel=0.01)
+    assert min(asked) >= 32.3 - 1e-9 and max(asked) <= 34.3 + 1e-9
+    assert found.entry() == {"run": "b", "t": found.t, "std": found.std}
+
+
+def test_a_moments_likelihood_is_asked_where_it_has_a_share(profile):
+    """Every tenth row at first, then only where it is within ten nats of the best."""
+    of, asked = profile
+    t = 0.01 * np.arange(1000)
+    problem = of(lambda s: -50.0 * abs(s - 5.037) / 0.1, t, 5.0)
+    records = problem.engine.records[1:]
+    near = t[400:601]
+    found = onset._profile(problem, Fit((), {}, NOISE_OF_ALL), "wind", records, near)
+    exact = -50.0 * np.abs(near - 5.037) / 0.1
+    close = exact > -9.0
+    np.testing.assert_allclose(found[close], exact[close], atol=1e-9)
+    assert int(np.argmax(found)) == int(np.argmax(exact))
+    far = [s for s in asked if abs(s - 5.037) > 0.15]
+    assert len(far) <= 20 and len(asked) < 45
+
+
+def test_where_runs_are_short_all_of_the_flown_time_is_asked_for():
+    records = [
+        SimpleNamespace(t=np.array([4.0, 5.0, 9.0])),
+        SimpleNamespace(t=np.array([1.0, 3.5])),
+    ]
+    assert onset._seconds(SimpleNamespace(engine=SimpleNamespace(records=records))) == 7.5
+
+
+def test_a_models_cost_is_its_objective_and_occams_factor():
+    _, q, _ = table({}, SLOPES)
+    model = HeliModel(load_vehicle("lama400d"))
+    mass = next(f for f in model.base_parameters() if f.name == "mass")
+    own = {e: tuple(model.effect_parameters(e)) for e in ("gyro_bias", "yaw_damping")}
+    problem = Problem(model, None, (mass,), own)
+    fit = Fit(("yaw_damping",), {}, NOISE_OF_ALL, objective=80.0)
+    expected = 80.0 + q.occam(["yaw_damping.coefficient"], ["mass"])
+    assert onset._cost(problem, fit, q) == pytest.approx(expected)
+    assert onset._cost(problem, replace(fit, active=()), q) == 80.0

@@ -24,7 +24,7 @@ from coax_env.estimation.helicopter_noise import (
 )
 from coax_env.estimation.noise_levels import fit_noise, level_slopes
 from coax_env.estimation.rotor_jitter import JITTER, N_JITTERY, REACTION, JitteryModel, with_jitter
-from coax_env.estimation.state_space import Noise
+from coax_env.estimation.state_space import Noise, Record
 from coax_env.model import dynamics
 from coax_env.model import state as S
 from coax_env.model.layout import CHANNELS, N_CHANNELS, N_FULL, RPM_PER_RAD_S
@@ -123,6 +123,30 @@ def test_jitter_is_stationary_at_its_level():
     assert np.array_equal(np.delete(q, [N_FULL, N_FULL + 1]), plain.intensity)
     places = MODEL.noise_places
     assert places.shape == (q.size, 2) and np.array_equal(places[JITTER], [[29, 29], [30, 30]])
+
+
+def test_jitter_begins_at_a_thousandth_of_the_hover_speeds():
+    """And may be from a hundredth to fifty times of that; its memory from 15 ms to 2 s."""
+    noise = with_jitter(Noise({"force_xy": 1.0}, {"p": 0.1}), PLAIN)
+    bare = LAMA.with_values({"fuselage_drag_coefficient": 0.0})
+    first = 1e-3 * dynamics.hover_trim(bare)[1][:2].mean()
+    assert noise.process == pytest.approx(
+        {"force_xy": 1.0, JITTER_LEVEL: first, JITTER_MEMORY: 0.05}
+    )
+    assert noise.floor == pytest.approx({JITTER_LEVEL: 0.01 * first, JITTER_MEMORY: 0.015})
+    assert noise.ceiling == pytest.approx({JITTER_LEVEL: 50.0 * first, JITTER_MEMORY: 2.0})
+    assert noise.prior == {JITTER_MEMORY: (0.05, 1.0)} and noise.reading == {"p": 0.1}
+
+
+def test_a_record_starts_without_jitter_but_with_its_spread():
+    """Mean nothing, and of the covariance nothing but what the level adds."""
+    t = 0.01 * np.arange(80)
+    record = Record("a", t, np.tile(COMMAND, (80, 1)), np.zeros((80, N_CHANNELS)))
+    x, P = MODEL.start(record)
+    plain_x, plain_P = PLAIN.start(record)
+    np.testing.assert_array_equal(x, [*plain_x, 0.0, 0.0])
+    np.testing.assert_array_equal(P[:N_FULL, :N_FULL], plain_P)
+    assert not P[N_FULL:].any() and not P[:, N_FULL:].any()
 
 
 @pytest.fixture(scope="module")

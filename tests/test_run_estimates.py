@@ -170,3 +170,65 @@ def test_what_is_said_where_flights_contradict_the_file(
     assert found.widened == believed
     assert words in found.remark and bool(found.remark) == bool(words)
     assert len(asked) == (2 if believed < widened else 1)
+
+
+class Stubborn:
+    """An engine whose fits end so many prior std from the file, with given objectives, one by one."""
+
+    def __init__(
+        self, moves: list[float], objectives: list[float], determined: float = 1.0
+    ) -> None:
+        self.moves, self.objectives, self.determined = list(moves), list(objectives), determined
+        self.stds: list[float] = []
+
+    def fit(self, free, values, noise, steps, tolerance, progress):
+        (f,) = free
+        self.stds.append(f.std)
+        value = f.value + self.moves.pop(0)
+        return SimpleNamespace(
+            values={f.name: value}, objective=self.objectives.pop(0),
+            covariance=np.array([[(1.0 - self.determined) * f.std**2]]),
+        )  # fmt: skip
+
+
+def by_turns(engine: Stubborn, monkeypatch, most: float = 30.0) -> tuple[OwnNumbers, int]:
+    """The numbers, and how often the noise was fitted."""
+    fits = []
+    monkeypatch.setattr(maximum_likelihood, "fitted_levels", lambda noise: ())
+    monkeypatch.setattr(
+        maximum_likelihood, "fit_noise", lambda engine, values, noise, *rest: fits.append(1) or noise
+    )  # fmt: skip
+    free = [FreeParameter("mass", 0.5, 0.01)]
+    found = maximum_likelihood._by_turns(
+        engine, free, {"mass": 0.5}, Noise({}), lambda text: None, most
+    )  # fmt: skip
+    return found, len(fits)
+
+
+def test_numbers_and_noise_take_turns_until_a_turn_gains_less_than_a_nat(monkeypatch):
+    engine = Stubborn([0.01, 0.012, 0.012, 0.0], [90.0, 88.9, 88.0, 0.0])
+    found, noise_fits = by_turns(engine, monkeypatch)
+    assert found.widened == 1.0 and found.estimate.objective == 88.0 and noise_fits == 2
+
+
+def test_priors_are_widened_to_twice_what_the_moves_are(monkeypatch):
+    """A move of three std where one is expected: six times as wide, and the turns begin anew."""
+    engine = Stubborn([0.03, 0.03, 0.03], [90.0, 200.0, 199.5])
+    found, _ = by_turns(engine, monkeypatch)
+    assert found.widened == pytest.approx(6.0)
+    assert engine.stds == pytest.approx([0.01, 0.06, 0.06])
+    assert found.free[0].std == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize(("move", "widened"), [(0.0199, 1.0), (0.0201, 4.02)])
+def test_twice_the_expected_move_is_still_believed(monkeypatch, move, widened):
+    """A square of four: from there on the file's std count as too small."""
+    found, _ = by_turns(Stubborn([move] * 4, [9.0] * 4), monkeypatch)
+    assert found.widened == pytest.approx(widened)
+
+
+def test_priors_are_widened_no_farther_than_allowed(monkeypatch):
+    found, _ = by_turns(Stubborn([0.5] * 8, [9.0] * 8), monkeypatch, most=5.0)
+    assert found.widened == pytest.approx(5.0)
+    believed, _ = by_turns(Stubborn([0.5] * 8, [9.0] * 8), monkeypatch, most=1.0)
+    assert believed.widened == 1.0

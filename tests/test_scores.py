@@ -24,6 +24,7 @@ from coax_env.diagnosis.scores import (
     inflation,
     is_large,
     loss,
+    most_gains,
     score,
     scores,
     swap,
@@ -164,6 +165,20 @@ def test_exchanges_are_all_swaps_that_gain_more_than_a_tie(seed):
     }
     tie = PROBLEM.settings.tie
     assert found == {pair: pytest.approx(c) for pair, c in every.items() if c < -tie}
+
+
+@pytest.mark.parametrize("active", [(), ("swash_offset",)])
+def test_the_most_that_an_effect_could_gain_is_its_evidence_where_nothing_bounds_it(active):
+    """All at once, and the least value without any of them; a file's number is not gone back to."""
+    q = quadratic(11, size=5.0)
+    free = [*BASE, *(n for e in active for n in own(e))]
+    value, gains = most_gains(PROBLEM, q, active, {})
+    assert value == pytest.approx(q.best(free)[0])
+    assert set(gains) == set(EFFECTS) - set(active)
+    for effect in set(SIMPLE) - set(active):
+        assert gains[effect] == pytest.approx(score(PROBLEM, q, active, effect).nats, abs=1e-9)
+    beside = q.best(free)[0] - q.best(free + own("yaw_inertia"))[0]
+    assert gains["yaw_inertia"] == pytest.approx(beside)
 
 
 def test_only_what_may_be_added_and_gains_something_that_matters_is_listed():

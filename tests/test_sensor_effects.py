@@ -52,6 +52,27 @@ def test_a_compass_is_judged_where_the_heading_turns():
         assert ("magnetic_field" in found) == may, turn
 
 
+def test_headings_on_both_sides_of_north_are_not_a_turn():
+    """The quarter turn is that of all runs together, wherever around the circle they lie."""
+    t = np.arange(0.0, 3.0, 0.01)
+
+    def may(*spans: tuple[float, float]) -> bool:
+        runs = tuple(
+            Run(
+                f"r{k}", t, np.zeros((t.size, 4)), {"p": 0.0 * t, "psi": np.linspace(*span, t.size)}
+            )
+            for k, span in enumerate(spans)
+        )
+        return "magnetic_field" in namable((), LAMA, Flight("lama400d", runs))
+
+    assert not may((-0.7, 0.7)) and may((-0.8, 0.8))
+    assert not may((6.0, 6.5), (-0.2, 1.1)) and may((6.0, 6.5), (-0.2, 1.4))
+    assert not may((3.0, 3.5)) and may((3.0, 3.5), (0.0, 0.1))
+    nan = {"p": 0.0 * t, "psi": np.full(t.size, np.nan)}
+    blind = Flight("lama400d", (Run("r", t, np.zeros((t.size, 4)), nan),))
+    assert "magnetic_field" not in namable((), LAMA, blind)
+
+
 # --- recovered --------------------------------------------------------------------------------------
 
 TRACKED = Sensors(NOISE | POSE, formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"))

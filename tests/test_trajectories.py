@@ -65,6 +65,15 @@ def test_one_model_alone_has_its_error_and_a_lost_one_none(flown):
     )
 
 
+def test_long_flights_have_fewer_frames_a_second(monkeypatch):
+    """So many of all runs together; and put onto the path by the caller's time."""
+    monkeypatch.setattr(paths, "MOST_FRAMES", 20)
+    (found,) = trajectories(flight(8.0, 3.0), LAMA, {"right": LAMA}, restart=2.0)
+    np.testing.assert_allclose(np.diff(found.t), 0.4, atol=0.011)
+    assert found.t[0] == pytest.approx(3.0 + SETTLED, abs=0.011)
+    np.testing.assert_array_equal(np.flatnonzero(found.begins), [0, 5, 10, 15])
+
+
 def test_rows_of_frames_are_the_first_at_or_after_each():
     t = 2.0 + np.array([0.0, 0.4, 1.0, 1.5, 1.55, 1.61, 1.69, 1.7, 1.78, 1.9])
     assert list(paths._rows(t, 0.1)) == [3, 5, 7, 9]

@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import binom, norm
 
 from coax_env.diagnosis import moves
+from coax_env.diagnosis import trust as trust_module
 from coax_env.diagnosis.hold_out import fair_part
 from coax_env.diagnosis.moves import Proposal, accepted
 from coax_env.diagnosis.problem import Fit, Problem
@@ -254,6 +255,67 @@ def test_beside_a_large_axis_the_others_are_as_wide():
     values["gyro_bias.x"] = 2.0 * usual["gyro_bias.x"]
     same = beside_large_axes(problem, Fit(tuple(own), values, Noise({})))
     assert same.own == problem.own
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        (2.45, ""),
+        (-2.6, "2.6 usual sizes"),
+        (4.9, "4.9 usual sizes"),
+        (4.97, "limit"),
+        (-5.0, "limit"),
+    ],
+)
+def test_a_size_is_unusual_from_two_and_a_half_on_and_a_limit_at_five(size, words):
+    """Usual sizes are the vehicle's, however wide a prior has been made since."""
+    model = HeliModel(LAMA)
+    own = {
+        "gyro_bias": tuple(
+            replace(f, std=9.0 * f.std) for f in model.effect_parameters("gyro_bias")
+        )
+    }
+    problem = replace(problem_of(1), model=model, own=own)
+    usual = model.effect_parameters("gyro_bias")[1].std
+    values = {"gyro_bias.x": 0.0, "gyro_bias.y": size * usual, "gyro_bias.z": 0.0}
+    found = list(trust_module._sizes(problem, Fit(("gyro_bias",), values, Noise({})), "gyro_bias"))
+    assert bool(found) == bool(words) and all(words in text for text in found)
+
+
+def test_a_size_is_that_beyond_the_off_value():
+    """A decay of the ground effect of 2 per radius is what it is when nothing is known of it."""
+    model = HeliModel(LAMA)
+    own = {"ground_effect": tuple(model.effect_parameters("ground_effect"))}
+    problem = replace(problem_of(1), model=model, own=own)
+    usual = {f.name: f.std for f in own["ground_effect"]}
+    for sizes, words in ((0.0, ""), (3.0, "3.0 usual sizes"), (-2.6, "")):
+        decay = 2.0 + sizes * usual["ground_effect.decay"]
+        values = {"ground_effect.gain": 0.1, "ground_effect.decay": decay}
+        fit = Fit(("ground_effect",), values, Noise({}))
+        found = " ".join(trust_module._sizes(problem, fit, "ground_effect"))
+        assert words in found and (sizes != 0.0 or not found)
+
+
+def test_doubts_name_three_variations_and_count_the_rest():
+    one, many = ["twice force xy"], [f"half level {k}" for k in range(5)]
+    assert list(trust_module._under_noise([])) == []
+    assert list(trust_module._under_noise(one)) == ["it does not hold at twice force xy"]
+    (text,) = trust_module._under_noise(many)
+    assert "half level 2" in text and "half level 3" not in text
+    assert text.endswith("2 more changes of the noise")
+    (three,) = trust_module._under_noise(many[:3])
+    assert "more" not in three
+
+
+@pytest.mark.parametrize(
+    ("runs", "kept", "of", "words"),
+    [(0.75, 0.8, 4, []), (0.74, 0.8, 4, ["gone without a or without b"]), (0.75, 0.79, 4, ["79 %"]),
+     (0.75, None, 4, ["no half"]), (0.0, 1.0, 1, ["one run alone"])],
+)  # fmt: skip
+def test_shares_of_runs_and_halves_that_a_name_needs(runs, kept, of, words):
+    found = list(on_parts(Replication(runs, kept, ("a", "b")), of, SETTINGS))
+    assert len(found) == len(words)
+    assert all(word in text for word, text in zip(words, found, strict=True))
 
 
 # --- the hold-out -----------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from scipy.signal import welch
 
 from coax_env.env.period import DT
@@ -17,7 +18,7 @@ from coax_env.env.turbulence import (
     wind_at_6m,
 )
 from coax_env.errors import InputError
-from coax_env.kernel.random_streams import stream_key
+from coax_env.kernel.random_streams import stream_key, two_normals
 
 
 def turbulence_of(seed: int, rows: int, height: float, wind: float) -> np.ndarray:
@@ -64,6 +65,63 @@ def test_turbulence_has_drydens_spectrum():
             )
     area = np.trapezoid(spectrum(f := np.linspace(0.0, 400.0, 400_000), 1.0, 0.5, False), f)
     assert area == pytest.approx(1.0, abs=0.01)
+
+
+def moved_on(
+    filters: np.ndarray, seed: int, height: float, wind: float, dt: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The filters and the air a step later, and the five normal numbers that were drawn for it."""
+    stream = np.array([stream_key(np.uint64(seed)), 0], dtype=np.uint64)
+    own = stream.copy()
+    pairs = [two_normals(own) for _ in range(3)]
+    state, air = filters.copy(), np.zeros(3)
+    turbulence_step(stream, state, height, wind, dt, air)
+    assert np.array_equal(stream, own)
+    return state, air, np.array([pairs[0][0], *pairs[1], *pairs[2]])
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.4])
+def test_a_step_keeps_the_filters_covariance_to_the_last_digit(dt):
+    """z' = F z + L n: F the exponential of the filters' own equations, F P F' + L L' = P."""
+    height, wind = 4.0, 6.0
+    sigma, sigma_w, tau, tau_w = dryden(height, wind)
+    still = [moved_on(np.zeros(5), seed, height, wind, dt) for seed in range(12)]
+    N = np.array([drawn for *_, drawn in still])
+    L = np.linalg.lstsq(N, np.array([z for z, *_ in still]), rcond=None)[0].T
+    np.testing.assert_allclose(N @ L.T, [z for z, *_ in still], atol=1e-12)
+    F = np.array([moved_on(e, 3, height, wind, dt)[0] - still[3][0] for e in np.eye(5)]).T
+    rates = np.zeros((5, 5))
+    for first, memory, pair in ((0, tau, False), (1, tau, True), (3, tau_w, True)):
+        rates[first, first] = -1.0 / memory
+        if pair:
+            rates[first + 1, first : first + 2] = 1.0 / memory, -1.0 / memory
+    np.testing.assert_allclose(F, expm(rates * dt), atol=1e-12)
+    P = np.zeros((5, 5))
+    P[0, 0] = 1.0
+    for k in (1, 3):
+        P[k : k + 2, k : k + 2] = [[1.0, 0.5], [0.5, 0.5]]
+    np.testing.assert_allclose(F @ P @ F.T + L @ L.T, P, atol=1e-12)
+    # and of that covariance the air has the standard's std
+    M = np.linalg.lstsq(np.array([z for z, *_ in still]), np.array([a for _, a, _ in still]),
+                        rcond=None)[0].T  # fmt: skip
+    np.testing.assert_allclose(M @ P @ M.T, np.diag([sigma**2, sigma**2, sigma_w**2]), atol=1e-9)
+
+
+def test_filters_are_drawn_with_their_stationary_covariance():
+    drawn, normals = [], []
+    for seed in range(8):
+        stream = np.array([stream_key(np.uint64(seed)), 0], dtype=np.uint64)
+        own, state = stream.copy(), np.zeros(5)
+        pairs = [two_normals(own) for _ in range(3)]
+        draw_filters(stream, state)
+        drawn.append(state)
+        normals.append([pairs[0][0], *pairs[1], *pairs[2]])
+    L = np.linalg.lstsq(np.array(normals), np.array(drawn), rcond=None)[0].T
+    P = np.zeros((5, 5))
+    P[0, 0] = 1.0
+    for k in (1, 3):
+        P[k : k + 2, k : k + 2] = [[1.0, 0.5], [0.5, 0.5]]
+    np.testing.assert_allclose(L @ L.T, P, atol=1e-12)
 
 
 def test_the_wind_at_six_metres_is_a_severity_or_a_speed():

@@ -22,7 +22,15 @@ from coax_env import identify, load_vehicle, simulate
 from coax_env.errors import InputError
 from coax_env.files import write_text
 from coax_env.identification.two_step import method, modes
-from coax_env.identification.two_step.columns import DRAWS, IMU, Rows, columns_of, joined, rows_of
+from coax_env.identification.two_step.columns import (
+    DRAWS,
+    IMU,
+    Rows,
+    _noise,
+    columns_of,
+    joined,
+    rows_of,
+)
 from coax_env.identification.two_step.loads import coefficients, loads
 from coax_env.identification.two_step.modes import MODES, PHYSICS, fit_mode, fit_physics
 from coax_env.identification.two_step.processing import (
@@ -51,6 +59,7 @@ from coax_env.identification.two_step.reconstruction import (
 from coax_env.identification.two_step.regression import (
     Regression,
     _autocovariance,
+    _finished,
     _from_draws,
     _gusts,
     _memory,
@@ -688,6 +697,108 @@ def test_a_weak_direction_says_how_little_it_moves():
     assert weak.share == pytest.approx(share, rel=0.02)
 
 
+def test_a_column_counts_as_moving_by_its_own_size():
+    """Rounding of a large constant is none; a small number that varies by itself is."""
+    rng = np.random.default_rng(21)
+    a, b, c = rng.standard_normal((3, 500))
+    X = np.column_stack([a, 1e6 + 1e-8 * b, 1e-14 * c])
+    assert set(collinearity(X, ("a", "still", "small")).inflation) == {"a", "small"}
+
+
+def test_a_tenth_of_a_direction_is_worth_naming():
+    """Of columns of one length: a part of 0.13 of the largest is in the words, one of 0.07 is not."""
+    a, b, c, left = np.random.default_rng(22).standard_normal((4, 4000))
+    for part, count in ((0.13, 3), (0.07, 2)):
+        X = np.column_stack([a, a + part * c + 0.002 * left, c, b])
+        (weak,) = collinearity(X, ("a", "sum", "c", "b")).directions
+        assert len(weak.names) == len(weak.weights) == count and "b" not in weak.names
+
+
+def test_with_hardly_any_independent_rows_one_degree_is_left():
+    """Student's t of one degree reaches 12.7 std; the covariance is as large as rows make it."""
+    fit = Regression(
+        ("1", "a"), np.zeros(2), np.eye(2), np.zeros(9), 2.5, math.inf, "least squares"
+    )
+    np.testing.assert_allclose(fit.interval(), [[-12.706, 12.706]] * 2, rtol=1e-4)
+    n = 12
+    residual = np.cos(np.pi * np.arange(n) / n)
+    meat = np.eye(4) + 0.5
+    made = _finished(
+        np.ones((n, 4)),
+        residual,
+        np.zeros(4),
+        2.0 * np.eye(4),
+        "abcd",
+        (),
+        3.0,
+        "made",
+        meat.copy(),
+    )
+    rows = n / _memory(residual, [n])
+    assert 3.0 < rows < 5.0, "fewer than numbers and a degree"
+    np.testing.assert_allclose(made.covariance, 0.25 * rows * meat, rtol=1e-9)
+    assert made.rows == pytest.approx(rows)
+    assert made.weakest == pytest.approx(3.0 * math.sqrt(rows / 2.0))
+
+
+def test_where_strangers_make_all_of_the_scores_a_tenth_is_left():
+    """Exact instruments of nothing: a draw's own errors do no more than another draw's."""
+    rng = np.random.default_rng(23)
+    draws = rng.standard_normal((4000, 50, 2))
+    off = rng.standard_normal((4000, 50))
+    found = _from_draws(draws, off, np.zeros((50, 1)), np.array([0]), np.zeros(2))
+    own = np.einsum("dn,dn->d", draws[:, :, 0], off)
+    assert found[0, 0] == pytest.approx(0.1 * own.var(ddof=1), rel=1e-9)
+
+
+def test_a_slow_sensors_noise_is_read_at_its_own_rate():
+    """Straight lines between its readings, as its values have; a sensor on nearly every row is new."""
+    t = 0.01 * np.arange(400)
+    slow, fast = np.full(400, np.nan), np.zeros(400)
+    slow[::5] = 0.0
+    fast[::10] = np.nan
+    run = Run("r", t, np.zeros((400, 4)), {"ax": slow, "q": fast})
+    rng = np.random.default_rng(24)
+    read = _noise(run, "ax", t, {"ax": 0.4}, rng)
+    assert read.shape == (400, DRAWS) and read[::5].std() == pytest.approx(0.4, rel=0.05)
+    np.testing.assert_allclose(read[2], 0.6 * read[0] + 0.4 * read[5], atol=1e-12)
+    every = _noise(run, "q", t, {"q": 0.4}, rng)
+    assert every.shape == (400, DRAWS) and every.std() == pytest.approx(0.4, rel=0.05)
+    assert abs(np.mean(every[1:] * every[:-1])) < 0.02 * 0.16
+
+
+def test_two_numbers_of_one_regression_are_joined_by_their_joint_covariance():
+    """Correlated factors under independent priors: the posterior of logs; an exact number stays."""
+    physics = next(p for p in PHYSICS if len(p.parameters) == 2)
+    old = [LAMA[n] for n in physics.parameters]
+    factors = np.array([1.1, 0.92])
+    C = np.array([[0.04**2, 0.6 * 0.04 * 0.05], [0.6 * 0.04 * 0.05, 0.05**2]])
+    names = ("1", *physics.regressors)
+    whole = np.zeros((3, 3))
+    whole[1:, 1:] = C
+    fit = Regression(
+        names, np.array([0.0, *factors]), whole, np.zeros(9), 9.0, math.inf, "least squares"
+    )
+    found = method._parameters(physics, fit, LAMA, "made")
+    power = np.broadcast_to(physics.power, 2)
+    W = np.linalg.inv(C / np.outer(factors, factors))
+    prior = np.array([p.std / p.value for p in old])
+    spread = np.linalg.inv(W + np.diag(prior**-2))
+    logs = spread @ W @ (power * np.log(factors))
+    for new, file, log, std in zip(found, old, logs, np.sqrt(np.diag(spread)), strict=True):
+        assert new.value == pytest.approx(file.value * math.exp(log))
+        assert new.std == pytest.approx(new.value * std)
+    exact = LAMA.with_parameters({physics.parameters[0]: replace(old[0], std=0.0)})
+    held, moved = method._parameters(physics, fit, exact, "made")
+    assert held == replace(old[0], std=0.0)
+    # held at 1, the other is what the regression says of it then
+    alone = (W[1, 0] * power[0] * np.log(factors[0]) + W[1, 1] * power[1] * np.log(factors[1])) / (
+        W[1, 1] + prior[1] ** -2
+    )
+    assert moved.value == pytest.approx(old[1].value * math.exp(alone))
+    assert moved.std == pytest.approx(moved.value / math.sqrt(W[1, 1] + prior[1] ** -2))
+
+
 def test_collinearity_is_named_in_words():
     rng = np.random.default_rng(5)
     a, b, c = rng.standard_normal((3, 1000))
@@ -851,6 +962,21 @@ def test_errors_of_a_row_are_what_the_sensors_noise_does(clean_runs):
         assert ratio == pytest.approx(1.0, abs=0.15), name
         assert rows.errors[name].shape == (len(rows.t), DRAWS)
     assert rows.t[0] == pytest.approx(0.5, abs=0.01) and rows.lengths == (len(rows.t),)
+
+
+def test_rows_are_timed_from_their_runs_start(clean_runs):
+    """Half a second is left out at either end, whenever the clock began."""
+    run = clean_runs[0]
+    first, late = (rows_of(r, LAMA, NOISE, 5.0) for r in (run, replace(run, t=run.t + 64.0)))
+    n = min(len(first.t), len(late.t))
+    np.testing.assert_allclose(late.t[:n], first.t[:n], atol=1e-9)
+    assert first.t[0] == pytest.approx(0.5, abs=1e-9)
+    assert first.t[-1] == pytest.approx(run.t[-1] - run.t[0] - 0.5, abs=0.011)
+    inside = slice(100, n - 100)
+    for name in ("delta_lon", "C_X", "alpha_l"):
+        np.testing.assert_allclose(
+            late.columns[name][inside], first.columns[name][inside], atol=1e-6, err_msg=name
+        )
 
 
 def test_a_number_is_joined_with_the_files_own_by_precision():

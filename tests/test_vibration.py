@@ -105,6 +105,13 @@ def test_the_std_is_the_scatter():
     assert np.mean([line.amplitude for line in lines]) == pytest.approx(0.25, rel=0.01)
 
 
+def test_noise_adds_nothing_to_a_weak_lines_amplitude():
+    """What white noise makes at the rotor's frequency it makes beside it too: squares are unbiased."""
+    weak = dict.fromkeys(ALL, 0.04)
+    lines = [vibration._line(shaken(weak, seed=seed, seconds=20), "upper") for seed in range(30)]
+    assert np.mean([line.amplitude**2 for line in lines]) == pytest.approx(0.04**2, rel=0.1)
+
+
 @pytest.mark.parametrize("off", [1.0, -2.5, 4.0])
 def test_what_shakes_beside_the_rotor_is_no_line_of_it(off):
     assert vibration.find(shaken(ALL, off=off)) == ()

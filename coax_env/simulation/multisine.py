@@ -69,8 +69,7 @@ def multisines(inputs: int, duration: float, seed: int = 0) -> np.ndarray:
 
 def relative_peak_factor(wave: np.ndarray) -> float:
     """Range over rms, scaled so that a single sine has 1."""
-    centred = wave - wave.mean()
-    return float((wave.max() - wave.min()) / (2.0 * math.sqrt(2.0) * centred.std()))
+    return float((wave.max() - wave.min()) / (2.0 * math.sqrt(2.0) * wave.std()))
 
 
 def steps(wave: np.ndarray, size: float, start: float) -> Sequence[tuple[float, float]]:

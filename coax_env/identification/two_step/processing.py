@@ -123,7 +123,6 @@ def integrated(
         gravity: [m/s2]. height: at the start [m].
     """
     theta = cumulative_trapezoid(q, dx=dt, initial=0.0)
-    theta -= theta[0]
     u, w = np.zeros(len(q)), np.zeros(len(q))
     gx, gz = -gravity * np.sin(theta), gravity * np.cos(theta)
     for k in range(len(q) - 1):

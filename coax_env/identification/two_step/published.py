@@ -17,6 +17,8 @@ from coax_env.model.vehicle import Vehicle
 PATH = Path(__file__).with_name("published.toml")
 RPM = (2000.0, 2143.0)
 """Rotor speeds of the flight, Table VII [rev/min]."""
+SPREAD = 0.01
+"""Std of rotor speeds over their mean, small enough for a straight line to fit; ours."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +82,8 @@ def lift_artefact(vehicle: Vehicle) -> dict[str, float]:
     The published C_Z row without any flight: dividing by omega_u^2 makes it.
     """
     rng = np.random.default_rng(0)
-    omega_u = RPM[0] * np.pi / 30.0 * (1.0 + 0.01 * rng.standard_normal(400))
-    omega_l = RPM[1] * np.pi / 30.0 * (1.0 + 0.01 * rng.standard_normal(400))
+    drawn = 1.0 + SPREAD * rng.standard_normal((2, 400))
+    omega_u, omega_l = (rpm * np.pi / 30.0 * share for rpm, share in zip(RPM, drawn, strict=True))
     T_u, T_l, *_ = loads(vehicle, omega_u, omega_l)
     force, _ = scales(vehicle, omega_u)
     weight = vehicle["mass"].value * vehicle["gravity"].value

@@ -1,0 +1,295 @@
+"""Moves of the search, and the refit on everything, where scores and likelihoods are given."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coax_env import load_vehicle
+from coax_env.diagnosis import black_box as black_box_module
+from coax_env.diagnosis import confounding, corrected_vehicle, moves
+from coax_env.diagnosis.black_box import PRIOR_WIDTHS, black_box
+from coax_env.diagnosis.moves import Proposal
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.scores import Score
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.quadratic import Linearised, Quadratic
+from coax_env.estimation.state_space import FreeParameter, Noise
+from coax_env.model.generic_terms import AXES, TERMS
+
+MODEL = HeliModel(load_vehicle("lama400d"))
+NOISE = Noise({})
+
+
+def problem(*effects: str) -> Problem:
+    own = {e: tuple(MODEL.effect_parameters(e)) for e in effects}
+    mass = next(f for f in MODEL.base_parameters() if f.name == "mass")
+    engine = SimpleNamespace(threads=1, records=[])
+    return Problem(MODEL, engine, (mass,), own)  # type: ignore[arg-type]
+
+
+PROBLEM = problem("gyro_bias", "wind", "yaw_damping", "servo_lag")
+OCCAM = SimpleNamespace(occam=lambda own, rest: 3.0)
+FIT = Fit(
+    ("gyro_bias", "wind"), {f.name: f.value for f in PROBLEM.parameters}, NOISE, objective=500.0
+)
+
+
+# --- a proposal, fitted -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("fallen", "taken"), [(17.1, True), (16.9, False)])
+def test_a_proposal_must_gain_what_is_needed_beyond_occam(monkeypatch, fallen, taken):
+    monkeypatch.setattr(
+        moves, "fitted", lambda problem, fit: replace(fit, objective=500.0 - fallen)
+    )
+    for large in (True, False):
+        monkeypatch.setattr(moves, "is_large", lambda *given, large=large: large)
+        said: list[str] = []
+        proposal = Proposal("+ wind", "wind", FIT, 3.0, 14.0, "added wind: {:.1f} nats")
+        found = moves.accepted(replace(PROBLEM, progress=said.append), FIT, proposal)
+        assert (found is not None) == (taken and large)
+        if found is not None:
+            assert found.history[-1] == ("+ wind", pytest.approx(fallen - 3.0))
+            assert said == [f"added wind: {fallen - 3.0:.1f} nats"]
+
+
+def test_trials_are_those_nearly_strong_and_dampings_with_half_the_evidence(monkeypatch):
+    """From 7 to 14 nats; those that take a number's place are none, nor what was tried."""
+    monkeypatch.setattr(
+        moves, "at_optimum", lambda problem, fit, q, active, at: replace(fit, active=active)
+    )
+    gains = {"yaw_damping": (7.1, {"yaw_damping.coefficient": 0.1})}
+    monkeypatch.setattr(
+        moves, "damping_gain", lambda problem, fit, q, e: gains.get(e, (-math.inf, {}))
+    )
+    made = problem("gyro_bias", "wind", "yaw_damping", "servo_lag", "added_mass", "swash_offset")
+    fit = replace(FIT, active=("gyro_bias",))
+
+    def tried(nats: dict[str, float], known: set[Any] = frozenset(), banned: Any = ()) -> Any:
+        candidates = [Score(e, n, n, True) for e, n in nats.items()]
+        found, dampings = moves.trials(made, fit, OCCAM, candidates, banned, known)
+        assert all(p.occam == 3.0 and p.needed == 14.0 for p in found)
+        return [p.effect for p in found], dampings
+
+    weak = {"wind": 7.1, "servo_lag": 6.9, "added_mass": 10.0, "swash_offset": 14.0}
+    assert tried(weak) == (["wind", "swash_offset", "yaw_damping"], ["yaw_damping"])
+    assert tried({"wind": 14.1}) == (["yaw_damping"], ["yaw_damping"])
+    assert tried(weak, {("gyro_bias", "wind")})[0] == ["swash_offset", "yaw_damping"]
+    assert tried({}, banned=("yaw_damping",)) == ([], [])
+    gains["yaw_damping"] = (6.9, {})
+    assert tried({}) == ([], ["yaw_damping"])
+
+
+def test_no_more_causes_than_are_allowed(monkeypatch):
+    strong = [Score("yaw_damping", 30.0, 30.0, True)]
+    monkeypatch.setattr(moves, "stepped", lambda problem, fit, passes, q: fit)
+    most = replace(PROBLEM, settings=replace(SETTINGS, most_causes=3))
+    added = moves.add(most, FIT, [], None, strong)  # type: ignore[arg-type]
+    assert added is not None and added.active == ("gyro_bias", "wind", "yaw_damping")
+    assert added.history == (("+ yaw_damping", 30.0),)
+    full = replace(PROBLEM, settings=replace(SETTINGS, most_causes=2))
+    assert moves.add(full, FIT, [], None, strong) is None  # type: ignore[arg-type]
+    assert moves.add(most, FIT, [], None, []) is None  # type: ignore[arg-type]
+
+
+# --- a cause dropped ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("worth", "large", "confirmed", "gone"),
+    [
+        ({"gyro_bias": 13.9, "wind": 50.0}, True, True, "gyro_bias"),
+        ({"gyro_bias": 13.9, "wind": 50.0}, True, False, None),
+        ({"gyro_bias": 14.1, "wind": 50.0}, True, True, None),
+        ({"gyro_bias": 13.0, "wind": -4.0}, True, True, "wind"),
+        ({"gyro_bias": 90.0, "wind": 50.0}, False, False, "gyro_bias"),
+    ],
+)
+def test_the_cause_worth_least_is_dropped_where_a_refit_confirms_it(
+    monkeypatch, worth, large, confirmed, gone
+):
+    """One too small to matter goes whatever it is worth."""
+    monkeypatch.setattr(moves, "inflation", lambda *given: 2.0)
+    monkeypatch.setattr(
+        moves, "loss", lambda problem, q, active, e, by: worth[e] + (0.0 if by == 2.0 else 1e3)
+    )
+    monkeypatch.setattr(
+        moves, "is_large", lambda problem, e, values: large or e != "gyro_bias"
+    )  # fmt: skip
+    monkeypatch.setattr(moves, "_is_worthless", lambda *given: confirmed)
+    monkeypatch.setattr(
+        moves, "at_optimum", lambda problem, fit, q, active, at: replace(fit, active=active)
+    )
+    found = moves.drop(PROBLEM, FIT, None, coloured=True)  # type: ignore[arg-type]
+    assert (found is None) == (gone is None)
+    if found is not None:
+        assert set(found.active) == {"gyro_bias", "wind"} - {gone}
+        nats = 0.0 if not large else max(worth[gone], 0.0)
+        assert found.history == ((f"- {gone}", nats),)
+    if large and confirmed:
+        assert moves.drop(PROBLEM, FIT, None, coloured=False) is None, "white ones are not inflated"
+
+
+@pytest.mark.parametrize(("risen", "gone"), [(33.9, True), (34.1, False)])
+def test_a_refit_says_what_a_cause_is_worth(monkeypatch, risen, gone):
+    """What the objective rises without it, half as much by its inflation, less Occam's 3 nats."""
+    monkeypatch.setattr(moves, "without", lambda problem, fit, q, e: fit)
+    monkeypatch.setattr(
+        moves, "fitted", lambda problem, fit, held: replace(fit, objective=500.0 + risen)
+    )
+    assert moves._is_worthless(PROBLEM, FIT, OCCAM, "wind", 2.0) == gone  # type: ignore[arg-type]
+
+
+# --- what would do as well ----------------------------------------------------------------------------
+
+
+def test_what_is_near_does_something_in_a_causes_place(monkeypatch):
+    """Of the 40 nats that the cause gains, more than half; and within what is asked, best first."""
+    changes = {"yaw_damping": 19.0, "servo_lag": 21.0}
+    monkeypatch.setattr(
+        confounding, "swap", lambda problem, q, active, old, new: (changes[new], np.zeros(1))
+    )
+    q = SimpleNamespace(best=lambda free, fixed=None: (-60.0 if fixed is None else -20.0, None))
+
+    def near(most: float) -> list[str]:
+        found = confounding._near(PROBLEM, FIT, q, "wind", most)  # type: ignore[arg-type]
+        return [other for other, _ in found]
+
+    assert near(30.0) == ["yaw_damping"] and near(18.0) == []
+    changes.update(servo_lag=-5.0)
+    assert near(30.0) == ["servo_lag", "yaw_damping"]
+
+
+# --- all runs together --------------------------------------------------------------------------------
+
+NAMES = ("mass", "yaw_damping.coefficient")
+
+
+class Runs:
+    """An engine over runs each of whose likelihoods is a parabola: its curvature and its best."""
+
+    def __init__(self, model: Any, records: Any, threads: int = 1) -> None:
+        self.model, self.records, self.threads = model, tuple(records), threads
+
+    def filter(self, values: dict[str, float], noise: Noise) -> list[Any]:
+        x = np.array([values[n] for n in NAMES])
+        return [
+            SimpleNamespace(log_likelihood=-0.5 * (x - r.best) @ r.G @ (x - r.best))
+            for r in self.records
+        ]
+
+    def linearise(self, values: dict[str, float], noise: Noise, free: Any) -> Any:
+        x = np.array([values[n] for n in NAMES])
+        slope = np.array([r.G @ (x - r.best) for r in self.records])
+        G = np.array([r.G for r in self.records])
+        lin = Linearised(NAMES, G, slope, np.ones((len(G), 2, 1)), slope)
+        return self.filter(values, noise), lin
+
+
+def run(seed: int) -> Any:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((4, 2)) * [40.0, 900.0]
+    return SimpleNamespace(G=A.T @ A, best=np.array([0.42, 0.004]) + rng.normal(0, [0.01, 5e-4]))
+
+
+def test_with_the_held_out_runs_it_is_the_posterior_of_all(monkeypatch):
+    """Two runs were fitted; two more are taken in: best and covariance of all four and the prior."""
+    monkeypatch.setattr(corrected_vehicle, "Engine", Runs)
+    made = problem("yaw_damping")
+    free = made.free(("yaw_damping",))
+    runs = [run(k) for k in range(4)]
+    prior = np.diag([f.std**-2.0 for f in free])
+    mean = np.array([f.value for f in free])
+
+    def best(some: list[Any]) -> tuple[np.ndarray, np.ndarray]:
+        A = sum(r.G for r in some) + prior
+        return np.linalg.solve(A, sum(r.G @ r.best for r in some) + prior @ mean), np.linalg.inv(A)
+
+    made = replace(made, engine=Runs(MODEL, runs[:2]))
+    at, _ = best(runs[:2])
+    values = dict(zip(NAMES, at.tolist(), strict=True))
+    passes, lin = made.engine.linearise(values, NOISE, free)
+    away = 0.5 * float((at - mean) @ prior @ (at - mean))
+    cost = away - sum(p.log_likelihood for p in passes)
+    fit = Fit(("yaw_damping",), values, NOISE, objective=cost)
+    quadratic = Quadratic.of(lin, free, values)
+    found, covariance = corrected_vehicle.with_held_out(made, fit, quadratic, runs[2:])  # type: ignore
+    expected, spread = best(runs)
+    np.testing.assert_allclose([found[n] for n in NAMES], expected, rtol=1e-6)
+    np.testing.assert_allclose(covariance, spread, rtol=1e-9)
+    alone, own = corrected_vehicle.with_held_out(made, fit, quadratic, [])
+    assert alone == values
+    np.testing.assert_allclose(own, best(runs[:2])[1], rtol=1e-9)
+
+
+def test_what_is_left_of_a_slope_where_it_is_fitted_is_what_signatures_lack():
+    """But at a bound, where a slope is left whatever they show."""
+    at = np.array([1.0, 2.0, 0.0])
+    lower, upper = np.array([-9.0, -9.0, 0.0]), np.array([9.0, 2.0, 9.0])
+    g, mean, precision = np.array([3.0, 5.0, 7.0]), np.array([0.5, 0.0, 0.0]), np.full(3, 4.0)
+    q = Quadratic(("a", "b", "c"), np.eye(3), g, at, mean, precision, lower, upper,
+                  np.zeros((1, 3)), np.ones((3, 1)))  # fmt: skip
+    found = corrected_vehicle._beyond_signatures(q, np.array([0, 1, 2]))
+    np.testing.assert_allclose(found, [-(3.0 + 4.0 * 0.5), 0.0, 0.0])
+
+
+@pytest.mark.parametrize(("far", "share"), [(1.5, 1.0), (3.0, 0.5), (6.0, 0.25), (12.0, 0.0)])
+def test_a_step_on_all_runs_is_shortened_until_it_gains(far, share):
+    """On a parabola what is less than twice too long gains."""
+    one = SimpleNamespace(G=np.diag([100.0, 1e4]), best=np.array([0.5, 0.002]))
+    engine = Runs(MODEL, [one])
+    free = [FreeParameter(n, 0.0, 1e9) for n in NAMES]
+    values = {"mass": 0.4, NAMES[1]: 0.002}
+    cost = -engine.filter(values, NOISE)[0].log_likelihood
+    fit = Fit((), values, NOISE, objective=cost)
+    _, lin = engine.linearise(values, NOISE, free)
+    q = Quadratic.of(lin, free, values)
+    there, gained = corrected_vehicle._moved(engine, fit, q, free, np.array([0.1 * far, 0.0]))  # type: ignore
+    assert there.values["mass"] == pytest.approx(0.4 + 0.1 * far * share)
+    after = -engine.filter(there.values, NOISE)[0].log_likelihood
+    assert gained == pytest.approx(cost - after) and (gained > 0.0) == (share > 0.0)
+    assert there.objective == pytest.approx(after)
+
+
+# --- every term at once -------------------------------------------------------------------------------
+
+
+def test_a_black_box_shrinks_each_axis_by_its_own_evidence(monkeypatch):
+    """Independent coefficients: the width of largest evidence axis by axis, values shrunk by it."""
+    known = [t for t in TERMS if t.key in ("u", "v")]
+    monkeypatch.setattr(black_box_module, "measured_terms", lambda problem: known)
+    sizes = dict(zip(AXES, (0.0, 0.02, 0.08, 0.25, 1.0, 3.0), strict=True))  # in usual sizes
+
+    def linearise(box: Problem, fit: Fit) -> Any:
+        free = box.parameters
+        std = np.array([f.std for f in free])
+        own = np.array([sizes.get(f.name.partition(".")[0], 0.0) for f in free])
+        G = np.diag(4e4 / std**2)
+        at = np.array([fit.values[f.name] for f in free])
+        q = Quadratic(tuple(f.name for f in free), G, -G @ (own * std), at,
+                      np.array([f.value for f in free]), std**-2.0, np.full(len(free), -np.inf),
+                      np.full(len(free), np.inf), np.zeros((1, len(free))),
+                      np.ones((len(free), 18)))  # fmt: skip
+        return fit, [], q
+
+    monkeypatch.setattr(black_box_module, "linearise", linearise)
+    made = problem("gyro_bias")
+    refitted = Fit(("gyro_bias",), {f.name: f.value for f in made.parameters}, NOISE)
+    found = black_box(made, refitted)
+    assert found.active == ()
+    for axis, size in sizes.items():
+
+        def evidence(width: float, size: float = size) -> float:
+            spread = width**2 + 1.0 / 4e4
+            return -0.5 * size**2 / spread - 0.5 * math.log(spread)
+
+        width = max(PRIOR_WIDTHS, key=evidence)
+        shrunk = size * width**2 / (width**2 + 1.0 / 4e4)
+        for t in known:
+            (f,) = black_box_module.parameters(MODEL, axis, [t])
+            assert found.values[f.name] == pytest.approx(shrunk * f.std, rel=1e-6, abs=1e-15)

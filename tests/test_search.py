@@ -1,0 +1,148 @@
+"""In which order a search moves: what it fits, adds, drops and tries, its moves given by hand."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from coax_env.diagnosis import search as module
+from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.scores import Score
+from coax_env.diagnosis.search import _forward, _Memory, search
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.state_space import Noise
+
+PROBLEM: Any = SimpleNamespace(settings=SETTINGS, free_names=lambda active: [])
+FIT = Fit((), {}, Noise({}), objective=100.0)
+
+
+@pytest.fixture
+def moves(monkeypatch):
+    """What a search does, in words; gains of a step and scores are given, moves end by themselves."""
+    done: list[str] = []
+    given: dict[str, Any] = {"gains": [], "scores": [], "add": [], "drop": [], "latent": []}
+
+    def linearise(problem: Any, fit: Fit) -> Any:
+        gain = given["gains"].pop(0) if given["gains"] else 0.0
+        return fit, [], SimpleNamespace(best=lambda names: (-gain, None))
+
+    def step(problem: Any, fit: Fit, passes: Any, quadratic: Any) -> Fit:
+        done.append("step")
+        return fit
+
+    def fitted(problem: Any, fit: Fit, steps: int, tolerance: float) -> Fit:
+        assert (steps, tolerance) == (SETTINGS.most_steps, SETTINGS.step_gain)
+        done.append("fit")
+        return fit
+
+    def add(problem: Any, fit: Fit, passes: Any, quadratic: Any, strong: Any) -> Fit | None:
+        if not strong or not given["add"]:
+            return None
+        done.append(f"add {strong[0].effect}")
+        return replace(fit, active=(*fit.active, given["add"].pop(0)))
+
+    def drop(problem: Any, fit: Fit, quadratic: Any, coloured: bool) -> Fit | None:
+        done.append("drop, coloured" if coloured else "drop?")
+        gone = given["drop"].pop(0) if given["drop"] else None
+        return None if gone is None else replace(fit, active=fit.rest(gone))
+
+    def latent(problem: Any, fit: Fit) -> Fit | None:
+        done.append("latent?")
+        return fit if given["latent"] and given["latent"].pop(0) else None
+
+    def noise_fitted(problem: Any, fit: Fit) -> Fit:
+        done.append("noise")
+        return fit
+
+    monkeypatch.setattr(module, "linearise", linearise)
+    monkeypatch.setattr(module, "stepped", step)
+    monkeypatch.setattr(module, "fitted", fitted)
+    monkeypatch.setattr(module, "add", add)
+    monkeypatch.setattr(module, "drop", drop)
+    monkeypatch.setattr(module, "with_latent_noise", latent)
+    monkeypatch.setattr(module, "noise_fitted", noise_fitted)
+    monkeypatch.setattr(module, "swaps", lambda *given: iter(()))
+    monkeypatch.setattr(module, "trials", lambda *given: ([], []))
+    monkeypatch.setattr(module, "scores", lambda p, fit, q, banned: [
+        c for c in (given["scores"].pop(0) if given["scores"] else []) if c.effect not in banned
+    ])  # fmt: skip
+    return given, done
+
+
+def score(effect: str, nats: float) -> Score:
+    return Score(effect, nats, nats, True)
+
+
+END = ["drop?", "latent?", "drop, coloured"]
+
+
+def test_where_nothing_is_to_be_found_it_asks_once_and_ends(moves):
+    _, done = moves
+    fit, _ = search(PROBLEM, FIT)
+    assert done == END and fit.active == ()
+
+
+@pytest.mark.parametrize(("gain", "fits"), [(1.9, False), (2.1, True)])
+def test_what_a_step_would_gain_two_nats_of_is_fitted_first(moves, gain, fits):
+    given, done = moves
+    given["gains"] = [gain]
+    search(PROBLEM, FIT)
+    assert done == (["step", "fit", *END] if fits else END)
+
+
+@pytest.mark.parametrize(("nats", "at_once"), [(51.0, True), (49.0, False)])
+def test_ten_times_what_a_step_gains_is_added_before_it(moves, nats, at_once):
+    given, done = moves
+    given["gains"] = [5.0]
+    given["scores"] = [[score("wind", nats)]] * (1 if at_once else 2)
+    given["add"] = ["wind"]
+    fit, _ = search(PROBLEM, FIT)
+    first = ["add wind"] if at_once else ["step", "fit", "drop?", "add wind"]
+    assert done == [*first, "noise", *END] and fit.active == ("wind",)
+    assert fit.strongest == (nats, "wind")
+
+
+@pytest.mark.parametrize(("nats", "added"), [(14.1, True), (13.9, False)])
+def test_what_has_evidence_is_added(moves, nats, added):
+    given, _ = moves
+    given["scores"], given["add"] = [[score("wind", nats)]], ["wind"]
+    fit, _ = search(PROBLEM, FIT)
+    assert (fit.active == ("wind",)) == added and fit.strongest == (nats, "wind")
+
+
+def test_what_was_dropped_is_not_added_at_once_again(moves):
+    """But once another has been added and has held."""
+    given, done = moves
+    wind, drag = score("wind", 30.0), score("rotor_drag", 40.0)
+    given["scores"] = [[wind], [wind], [wind, drag]]
+    given["add"], given["drop"] = ["wind", "rotor_drag"], [None, "wind"]
+    fit, _ = search(PROBLEM, FIT)
+    assert done[:5] == ["drop?", "add wind", "noise", "drop?", "noise"]
+    assert done[5:7] == ["drop?", "add rotor_drag"] and fit.active == ("rotor_drag",)
+
+
+def test_a_coloured_drop_ends_the_additions(moves):
+    given, done = moves
+    begin = replace(FIT, active=("wind",))
+    given["drop"] = [None, "wind"]
+    given["scores"] = [[], [score("rotor_drag", 90.0)]]
+    given["add"] = ["rotor_drag"]
+    fit, _ = search(PROBLEM, begin)
+    assert done == [*END, "noise", "drop, coloured"] and fit.active == ()
+
+
+def test_after_three_additions_that_did_not_hold_no_more_are_made(moves):
+    """One that holds, with more beside it than ever held, begins the count anew."""
+    given, _ = moves
+    memory = _Memory(failures=2)
+    strong = [score("wind", 30.0)]
+    given["add"] = ["wind", "rotor_drag", "gyro_bias"]
+    one = _forward(PROBLEM, FIT, [], None, strong, memory)  # type: ignore[arg-type]
+    assert one is not None and memory.failures == 2 and memory.most == 0
+    memory.banned, memory.drops = {"a", "b"}, module.Counter({"a": 2, "b": 1})
+    two = _forward(PROBLEM, one, [], None, strong, memory)  # type: ignore[arg-type]
+    assert two is not None and memory.failures == 0 and memory.most == 1
+    assert memory.banned == {"a"}, "what was dropped twice stays banned"
+    memory.failures = 3
+    assert _forward(PROBLEM, two, [], None, strong, memory) is None  # type: ignore[arg-type]

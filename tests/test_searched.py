@@ -1,0 +1,73 @@
+"""When a search is done again: with readings believed less, as long as that flies better."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from coax_env.diagnosis import searched
+from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.helicopter_noise import LEAST_READING_STD
+from coax_env.estimation.state_space import Noise
+
+
+def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
+    """Twice as fine and more; those that are coarser already are left alone."""
+    reading = {"phi": 0.0029, "theta": 0.0031, "h": 0.0024, "q": 0.5}
+    found = searched._coarser(Noise({}, reading))
+    assert found == {"phi": LEAST_READING_STD["phi"], "h": LEAST_READING_STD["h"]}
+
+
+@pytest.mark.parametrize(
+    ("ours", "better"),
+    [({"h": 0.5, "q": 1.9}, True), ({"h": 0.5, "q": 2.1}, False), ({"h": 1.1, "q": 0.9}, True),
+     ({"h": 1.0, "q": 1.0}, False), ({"h": 0.9, "ax": 9.0}, True), ({"ax": 0.1}, False)],
+)  # fmt: skip
+def test_errors_are_compared_by_their_geometric_mean(monkeypatch, ours, better):
+    """Half of one error and twice another is no better; channels that the other lacks do not count."""
+    theirs = {"h": 1.0, "q": 1.0, "ax": 0.0}
+    monkeypatch.setattr(
+        searched, "replay_runs", lambda engine, values, noise, horizon: values["rms"]
+    )
+    monkeypatch.setattr(searched, "pooled_rms", lambda rms: rms)
+    fit, other = (Fit((), {"rms": rms}, Noise({})) for rms in (ours, theirs))  # type: ignore
+    problem = SimpleNamespace(settings=SETTINGS, engine=None)
+    assert searched._flies_better(problem, fit, other) == better  # type: ignore[arg-type]
+
+
+FINE = Noise({}, {"phi": 0.001})
+
+
+@pytest.mark.parametrize(
+    ("white", "flies", "stds", "coarse"),
+    [
+        (True, [], [0.001], False),
+        (False, [False], [0.001, 0.006], False),
+        (False, [True, False], [0.001, 0.006, 0.018], True),
+        (False, [True, True], [0.001, 0.006, 0.018], True),
+    ],
+)
+def test_readings_are_believed_less_as_long_as_that_flies_better(
+    monkeypatch, white, flies, stds, coarse
+):
+    """At most what a rigid body is, then three times that; white innovations need nothing."""
+    asked, answers = [], list(flies)
+
+    def one(problem: Any, noise: Noise, coarse: bool = False) -> Any:
+        asked.append(noise.reading["phi"])
+        fit = Fit((), {}, noise)
+        return SimpleNamespace(fit=fit, coarse=coarse)
+
+    monkeypatch.setattr(searched, "_searched", one)
+    monkeypatch.setattr(searched, "_with_jitter", lambda problem, fit: None)
+    monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
+    monkeypatch.setattr(searched, "_flies_better", lambda *fits: answers.pop(0))
+    engine = SimpleNamespace(filter=lambda values, noise: [])
+    problem = SimpleNamespace(
+        engine=engine, model=SimpleNamespace(channels=()), report=lambda text: None
+    )
+    found = searched.searched(problem, FINE)  # type: ignore[arg-type]
+    assert asked == pytest.approx(stds) and found.coarse == coarse
+    kept = sum(flies)
+    assert found.fit.noise.reading["phi"] == pytest.approx(stds[kept])
