@@ -1,16 +1,19 @@
 """Pruning, on causes whose worth is written down here: which leave, in which order, and what is asked.
+A cause must be worth the threshold by the readings alone, and with what commands show of the gusts.
 
 The refits are stand-ins: the objective of a set of causes is the worth of those that are missing, plus
 what its noise levels have not converged by.
 """
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from coax_env.diagnosis import evidence
-from coax_env.diagnosis.evidence import prune
+from coax_env.diagnosis.evidence import Evidence, prune, weighed
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.state_space import Noise
@@ -18,6 +21,7 @@ from coax_env.estimation.state_space import Noise
 GOOD, POOR = Noise({"force": 1.0}), Noise({"force": 2.0})
 THRESHOLD = SETTINGS.evidence
 CLEAR = 100.0 * SETTINGS.clear_evidence * THRESHOLD
+PLAIN = 10.0 * THRESHOLD
 
 
 class Flights:
@@ -97,3 +101,80 @@ def test_a_cause_is_not_charged_with_noise_that_has_not_converged(monkeypatch, w
     assert ("swash_offset" in fit.active) == (worth > THRESHOLD)
     if worth > THRESHOLD:
         assert found["swash_offset"].nats == pytest.approx(worth)
+
+
+# --- by the readings alone, and with the commands' gains ---
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Nats of each effect by set of names, with gains of the commands or not; stands for a problem."""
+
+    alone: dict[frozenset[str], dict[str, float]]
+    joint: dict[frozenset[str], dict[str, float]]
+    worth_it: bool = True
+    gains: bool = False
+    settings: Any = SETTINGS
+    asked: list[bool] = field(default_factory=list)
+
+    def off_values(self, effect: str) -> dict[str, float]:
+        return {}
+
+    file_values = off_values
+
+    def report(self, text: str) -> None:
+        """Nobody listens."""
+
+    def worth(self, active: tuple[str, ...]) -> dict[str, Evidence]:
+        table = self.joint if self.gains else self.alone
+        of_set = table[frozenset(active)] if active else {}
+        return {e: Evidence(of_set[e], 1.0) for e in active}
+
+
+def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tuple[str, ...]:
+    def gained(problem: Tables, fit: Fit) -> tuple[Tables, Fit]:
+        wider = Tables(problem.alone, problem.joint, gains=True) if problem.worth_it else problem
+        return wider, fit
+
+    def removals(
+        problem: Tables, fit: Fit, _: object, which: Sequence[str]
+    ) -> dict[str, evidence.Removal]:
+        worth = problem.worth(fit.active)
+        return {e: evidence.Removal(worth[e], replace(fit, active=fit.rest(e))) for e in which}
+
+    nothing = SimpleNamespace()
+    monkeypatch.setattr(evidence, "with_command_gains", gained)
+    monkeypatch.setattr(evidence, "has_command_gains", lambda problem: problem.gains)
+    monkeypatch.setattr(evidence, "converged", lambda problem, fit: fit)
+    monkeypatch.setattr(evidence, "refined", lambda problem, fit: fit)
+    monkeypatch.setattr(evidence, "linearise", lambda problem, fit: (fit, [], nothing))
+    monkeypatch.setattr(evidence, "_is_doubtful", lambda problem, fit, quadratic, effect: True)
+    monkeypatch.setattr(evidence, "weigh", removals)
+    problem, fit, _, found = weighed(tables, Fit(active, {}, Noise({})))
+    assert problem.gains == tables.worth_it and set(found) == set(fit.active)
+    return fit.active
+
+
+def of(**nats: float) -> dict[frozenset[str], dict[str, float]]:
+    return {frozenset(nats): nats}
+
+
+def test_a_cause_stands_by_both_likelihoods_or_is_not_named(monkeypatch):
+    for alone, joint, stands in (
+        (PLAIN, PLAIN, True), (PLAIN, 2.0, False), (-3.0, PLAIN, False), (2.0, 3.0, False),
+    ):  # fmt: skip
+        found = named(monkeypatch, Tables(of(damping=alone), of(damping=joint)), "damping")
+        assert found == (("damping",) if stands else ()), (alone, joint)
+
+
+def test_where_commands_show_nothing_the_readings_decide(monkeypatch):
+    tables = Tables(of(damping=PLAIN), of(damping=0.0), worth_it=False)
+    assert named(monkeypatch, tables, "damping") == ("damping",)
+
+
+def test_what_stood_beside_a_cause_that_fell_is_asked_again_without_it(monkeypatch):
+    """As a damping was that, alone, was worth 25 nats beside a false delay and nothing without it."""
+    alone = of(delay=50.0, damping=25.0, drag=60.0) | of(damping=-3.0, drag=60.0) | of(drag=60.0)
+    joint = of(delay=2.0, damping=40.0, drag=70.0) | of(damping=37.0, drag=70.0) | of(drag=70.0)
+    found = named(monkeypatch, Tables(alone, joint), "delay", "damping", "drag")
+    assert found == ("drag",)

@@ -26,12 +26,11 @@ from coax_env.diagnosis import confounding, findings, unlisted, vibration
 from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
-from coax_env.diagnosis.evidence import prune
+from coax_env.diagnosis.evidence import weighed
 from coax_env.diagnosis.gain import gain_of
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.input_innovations import (
     has_command_gains,
-    with_command_gains,
     with_input_innovations,
 )
 from coax_env.diagnosis.model_check import model_check
@@ -164,8 +163,7 @@ def diagnose(
     state = with_onsets(problem, first.fit, first.quadratic, refitted, flight.run_names)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
     report("weighing the causes against their confounded alternatives")
-    problem, fit = with_command_gains(beside_large_axes(problem, fit), fit)
-    fit, quadratic, evidence = prune(problem, fit)
+    problem, fit, quadratic, evidence = weighed(beside_large_axes(problem, fit), fit)
     passes_after = problem.engine.filter(fit.values, fit.noise)
     white = {
         "before": whiteness(passes_before, CHANNELS),
