@@ -330,9 +330,26 @@ def _fitted(
     problem, found = _moved(problem, trial, effect, runs)
     trial = fitted(problem, noise_fitted(problem, trial), steps=2)
     problem, found = _moved(problem, trial, effect, runs)
+    trial = _with_noise_of(problem, trial, state.fit)
     trial, _, quadratic = linearise(problem, trial)
     onset = _worth(state, problem, trial, quadratic, found)
     return Changing(problem, trial, quadratic, {**state.onsets, effect: onset}), onset
+
+
+def _with_noise_of(problem: Problem, trial: Fit, fit: Fit) -> Fit:
+    """A change beside the noise of the fit without it, drifts too, where that is likelier.
+
+    A machine whose trims do drift would else lose more by their absence than any change can gain.
+
+    Args:
+        problem, trial: with the change, fitted in steady noise.
+        fit: without it.
+    """
+    if trial.noise.process == fit.noise.process:
+        return trial
+    other = fitted(problem, replace(trial, noise=fit.noise, levels=fit.levels), steps=2)
+    other = fitted(problem, noise_fitted(problem, other), steps=1)
+    return other if other.objective < trial.objective else trial
 
 
 def _worth(
