@@ -115,8 +115,10 @@ def with_onsets(
         problem.report(f"{onset.effect} since {onset.t:.2f} s of {onset.moment.run}:"
                        f" {onset.nats:.1f} nats")  # fmt: skip
         after = _searched_again(trial, bare, {**state.onsets, onset.effect: onset})
-        if not set(after.onsets) >= {*state.onsets, onset.effect}:
+        if onset.effect not in after.onsets:
             break  # it was another cause's work
+        if not set(after.onsets) >= set(state.onsets) and _cost_of(state) < _cost_of(after):
+            break  # it would stand in an earlier one's place, and do worse
         state = after
     return state
 
@@ -204,7 +206,10 @@ class _Table:
 
     later: information (k, k) and slope_later: slope (k,) of all records behind each one. rest: places
     of what is free beside a change, known: its Cholesky factor, pull: (r,) its slope. groups: places of
-    each effect's numbers, smallest: sizes that matter of these, inflation: its variances'.
+    each effect's numbers, smallest: sizes that matter of these.
+
+    Variances are not inflated by the colour of the innovations: what changed and is not in the model
+    yet colours them itself, and most of all the scores of its own numbers.
     """
 
     quadratic: Quadratic
@@ -215,7 +220,6 @@ class _Table:
     pull: np.ndarray
     groups: Sequence[np.ndarray]
     smallest: Sequence[np.ndarray]
-    inflation: Sequence[float]
 
     @classmethod
     def of(cls, state: Changing, names: Mapping[str, Sequence[str]]) -> "_Table":
@@ -238,10 +242,6 @@ class _Table:
             pull[rest],
             [quadratic.index(own) for own in names.values()],
             [np.array([sizes[n] for n in own]) for own in names.values()],
-            [
-                quadratic.variance_inflation(own, [*free, *(n for n in own if n not in free)])
-                for own in names.values()
-            ],
         )
 
     def row_of(self, b: Beginning) -> list[tuple[float, np.ndarray]]:
@@ -253,7 +253,7 @@ class _Table:
         weights = cho_solve(self.known, across.T)
         slope = slope - weights.T @ self.pull
         result = []
-        for c, smallest, inflation in zip(self.groups, self.smallest, self.inflation, strict=True):
+        for c, smallest in zip(self.groups, self.smallest, strict=True):
             prior = q.precision[c]
             A = own[np.ix_(c, c)] - across[c] @ weights[:, c] + np.diag(prior)
             x = np.linalg.solve(A, -slope[c])
@@ -263,7 +263,7 @@ class _Table:
             gained = -float(slope[c] @ x) - 0.5 * float(x @ A @ x)
             occam = 0.5 * float(np.linalg.slogdet(A / np.sqrt(np.outer(prior, prior)))[1])
             large = bool(np.any(np.abs(x) >= smallest))
-            result.append((gained / inflation - occam if large else -math.inf, x))
+            result.append((gained - occam if large else -math.inf, x))
         return result
 
 
@@ -524,6 +524,10 @@ def _searched_again(trial: Changing, bare: Fit, onsets: Mapping[str, Onset]) -> 
     fit, quadratic = min(ended, key=lambda e: _cost(problem, *e))
     kept = {e: onset for e, onset in onsets.items() if e in fit.active}
     return Changing(problem, fit, quadratic, kept)
+
+
+def _cost_of(state: Changing) -> float:
+    return _cost(state.problem, state.fit, state.quadratic)
 
 
 def _cost(problem: Problem, fit: Fit, quadratic: Quadratic) -> float:
