@@ -27,6 +27,7 @@ from coax_env.estimation.state_space import FreeParameter
 from coax_env.logs.edits import edited
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
 from coax_env.model.vehicle_file import load_vehicle
+from coax_env.report import change_headline
 
 BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
 
@@ -67,6 +68,7 @@ def test_what_one_log_says_differently_is_found_from_its_row_on(tmp_path):
     assert change["effect"] == "attitude_bias" and abs(p["change"] - 0.01) < 2.0 * p["std"] < 2e-3
     assert found["since"]["run"] == "lat_3211" and abs(found["since"]["t"] - 6.0) < 0.05
     assert "two logs of one flight" in found["remarks"][0]
+    assert change_headline(found) == "Two logs of one flight differ by attitude bias"
 
 
 # --- one likelihood of two flights ------------------------------------------------------------------

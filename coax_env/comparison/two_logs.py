@@ -5,7 +5,6 @@ flew as it flew, so that noise and all that the model lacks are the same in both
 Compared as two flights would be, each with noise of its own, most of that would be lost.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -63,7 +62,7 @@ def difference(
     report("searching for what the logs say differently")
     found = changes(before, [record_of(run) for run in after.runs], report)
     noise = before.fit.noise
-    each: Mapping[str, Any] = {"own": {}, "gusts": {n: float(noise.process[n]) for n in GUSTS}}
+    each = {"own": {}, "gusts": {n: float(noise.process[n]) for n in GUSTS}}
     when = (
         ""
         if found.since is None
@@ -71,13 +70,14 @@ def difference(
     )
     return {
         **found.as_json(),
+        "of_one_flight": True,
         "unexplained": [],
         "circumstances": {"A": each, "B": each},
         "shared": list(before.fit.active),
         "bounds": {},
         "remarks": [
-            f"these are two logs of one flight{when}: their noise is the same, and they are compared"
-            " row by row"
+            f"These are two logs of one flight{when}: their noise is the same, and they are compared"
+            " row by row."
         ],
     }
 
