@@ -1,4 +1,7 @@
-"""Diagnose edits of a flight's log: each must be found at its size, and nothing else have changed."""
+"""Diagnose edits of a flight's log: each must be found at its size, and nothing else have changed.
+
+With --since each holds from a moment on, which must be found too.
+"""
 
 import argparse
 import math
@@ -36,9 +39,12 @@ def main() -> None:
     options = arguments()
     log = read_flight(options.flight)
     with command_line.progress("edits") as report_progress:
-        rows = check(log, options.vehicle, dict(options.edit), report_progress)
+        rows = check(log, options.vehicle, dict(options.edit), report_progress, options.since)
     write_json(options.out / "edits.json", rows)
     show(rows)
+    if options.since is not None:
+        in_time = sum(row["in_time"] for row in rows)
+        print(f"{in_time} of {len(rows)} since the row of {options.since[0]}:{options.since[1]:g}")
     right = sum(row["found"] and not row["else"] for row in rows)
     print(f"{right} of {len(rows)} found at their size with nothing else; "
           f"{options.out / 'edits.json'}")  # fmt: skip
@@ -53,6 +59,7 @@ def arguments() -> argparse.Namespace:
         "--edit", action="append", type=_edit, metavar="NAME=SIZE",
         help=f"may be repeated (default: {usual})",
     )  # fmt: skip
+    command_line.add_since(parser)
     options = parser.parse_args()
     options.edit = options.edit or list(STANDARD.items())
     return options
@@ -75,6 +82,7 @@ def check(
     vehicle: str | None,
     edits: Mapping[str, float],
     report_progress: Callable[[str], None],
+    since: tuple[str, float] | None = None,
 ) -> list[dict[str, Any]]:
     """Every edit of a flight, one at a time, and what the difference says.
 
@@ -83,6 +91,7 @@ def check(
         vehicle: shipped name or path; None: the card's.
         edits: name -> size.
         report_progress: called with a line of text.
+        since: run and time [s] from which on each edit holds; None: in the whole flight.
     """
     from coax_env import load_vehicle
     from coax_env.diagnosis.changes import Before, calm, changes, fitted_model
@@ -95,10 +104,25 @@ def check(
     rows = []
     for name, size in edits.items():
         report_progress(f"{name} {size:g}")
-        records = [record_of(run) for run in edited(flight, {name: size}).runs]
+        records = [record_of(run) for run in edited(flight, {name: size}, since).runs]
         found = changes(before, records, report_progress)
-        rows.append(judged(name, size, PLANTED[name](size, before), found))
+        row = judged(name, size, PLANTED[name](size, before), found)
+        if since is not None:
+            row |= timed(since, found)
+        rows.append(row)
     return rows
+
+
+def timed(planted: tuple[str, float], found: "Changes") -> dict[str, Any]:
+    """Whether the moment that was found is the planted one: within the rows that it lies between."""
+    if found.since is None:
+        return {"since": None, "in_time": False}
+    run, t = planted
+    half = (
+        math.sqrt(3.0) * found.since.std + 1e-9
+    )  # of the interval, in each part of which it may lie
+    right = found.since.moment.run == run and abs(found.since.t - t) <= half
+    return {"since": found.since.entry(), "in_time": right}
 
 
 def judged(name: str, size: float, planted: Planted, found: "Changes") -> dict[str, Any]:

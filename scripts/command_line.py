@@ -63,6 +63,22 @@ def add_waive(parser: Parser) -> None:
     )  # fmt: skip
 
 
+def add_since(parser: Parser) -> None:
+    """``--since``, of an edit of a log."""
+    parser.add_argument(
+        "--since", type=_moment, metavar="RUN:T",
+        help="from this moment on [s]: earlier runs and earlier rows stay",
+    )  # fmt: skip
+
+
+def _moment(text: str) -> tuple[str, float]:
+    run, _, t = text.rpartition(":")
+    try:
+        return run, float(t)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"should be RUN:T, found {text!r}") from None
+
+
 class Waived(argparse.Action):
     """Names parted by commas; the option may be given several times."""
 

@@ -27,10 +27,7 @@ def arguments() -> argparse.Namespace:
         "--edit", action="append", required=True, type=_edit, metavar="NAME=SIZE",
         help=f"may be repeated. {known}",
     )  # fmt: skip
-    parser.add_argument(
-        "--since", type=_moment, metavar="RUN:T",
-        help="from this moment on [s]: earlier runs and earlier rows stay",
-    )  # fmt: skip
+    command_line.add_since(parser)
     return parser.parse_args()
 
 
@@ -40,14 +37,6 @@ def _edit(text: str) -> tuple[str, float]:
         return name, float(size)
     except ValueError:
         raise argparse.ArgumentTypeError(f"should be NAME=SIZE, found {text!r}") from None
-
-
-def _moment(text: str) -> tuple[str, float]:
-    run, _, t = text.rpartition(":")
-    try:
-        return run, float(t)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"should be RUN:T, found {text!r}") from None
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ SENSORS = {
     ),
     "fast": Sensors(  # the inertial sensors in each of 500 rows a second, as noisy in 10 ms as above
         {c: std * (math.sqrt(5.0) if c in FAST else 1.0) for c, std in NOISE.items()},
-        {c: 5 for c in NOISE if c not in FAST}, step=0.002,
+        {c: 5 for c in NOISE if c not in FAST}, step=0.002, formats={"t": "%.3f"},
     ),
     "pose": Sensors(
         POSE, step=1.0 / 150.0, unrest=0.2, lost=0.01, outliers=0.002,

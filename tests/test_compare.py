@@ -15,6 +15,7 @@ from coax_env.comparison.compare import compare
 from coax_env.comparison.information import Information
 from coax_env.comparison.logbook import logbook, over_time
 from coax_env.comparison.two_flights import ROTOR_SPEED, MachineModel, read_two
+from coax_env.comparison.two_logs import of_one_flight
 from coax_env.diagnosis.problem import Problem
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine
@@ -26,6 +27,7 @@ from coax_env.estimation.state_space import FreeParameter
 from coax_env.logs.edits import edited
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
 from coax_env.model.vehicle_file import load_vehicle
+from coax_env.report import change_headline
 
 BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
 
@@ -39,6 +41,34 @@ def flight() -> Flight:
         measured = {c: values[rows] for c, values in run.measured.items()}
         runs.append(replace(run, t=run.t[rows], command=run.command[rows], measured=measured))
     return replace(read_flight(BUNDLED), runs=tuple(runs))
+
+
+# --- two logs of one flight -------------------------------------------------------------------------
+
+
+def test_two_logs_of_one_flight_are_told_from_two_flights():
+    log = flight()
+    (first, second), rng = log.runs, np.random.default_rng(1)
+    noisy = {c: v + 0.01 * rng.standard_normal(v.size) for c, v in first.measured.items()}
+    assert of_one_flight(log, edited(log, {"theta": 0.03, "gain": 1.25}))
+    assert not of_one_flight(log, replace(log, runs=(replace(first, measured=noisy), second)))
+    assert not of_one_flight(log, replace(log, runs=(replace(first, t=first.t + 0.001), second)))
+    assert not of_one_flight(log, replace(log, runs=log.runs[:1]))
+
+
+@pytest.mark.slow
+def test_what_one_log_says_differently_is_found_from_its_row_on(tmp_path):
+    """Too little for two flights with noise of their own: 0.01 rad, in half of a run."""
+    log = read_flight(BUNDLED).select(("lon_3211", "lat_3211"))
+    logs = (log, edited(log, {"theta": 0.01}, ("lat_3211", 6.0)))
+    folders = [write_flight(one, tmp_path / name) for one, name in zip(logs, "ab", strict=True)]
+    found = compare(*folders).changes
+    (change,) = found["changes"]
+    p = change["parameters"]["attitude_bias.y"]
+    assert change["effect"] == "attitude_bias" and abs(p["change"] - 0.01) < 2.0 * p["std"] < 2e-3
+    assert found["since"]["run"] == "lat_3211" and abs(found["since"]["t"] - 6.0) < 0.05
+    assert "two logs of one flight" in found["remarks"][0]
+    assert change_headline(found) == "Two logs of one flight differ by attitude bias"
 
 
 # --- one likelihood of two flights ------------------------------------------------------------------

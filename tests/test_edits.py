@@ -1,6 +1,7 @@
 """Edits of logs, whose truth is known: what they do to a log, and that a difference finds just that."""
 
 import importlib
+import math
 from functools import cache
 from pathlib import Path
 
@@ -9,11 +10,19 @@ import pytest
 from shared_flights import shared_flight
 
 import coax_env
-from coax_env.diagnosis.changes import Before, changes, coordinates, effective, moved
+from coax_env.diagnosis.changes import (
+    Before,
+    _with_rotors,
+    changes,
+    coordinates,
+    effective,
+    first_difference,
+    moved,
+)
 from coax_env.diagnosis.fits import start
 from coax_env.diagnosis.problem import Problem
 from coax_env.errors import InputError
-from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter import HeliModel, Moment, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.logs.edits import EDITS, LAT, LON, edited
 from coax_env.logs.flight import Flight, read_flight, write_flight
@@ -135,6 +144,45 @@ def test_an_edit_is_found_at_its_size_by_a_model_that_lacks_much():
     assert abs(change - (1.0 / 1.25 - 1.0)) < 2.0 * std < 0.02
 
 
+@pytest.mark.parametrize(
+    ("edit", "number", "size"),
+    [("gain", "swash_gain.scale", 1.0 / 1.25 - 1.0), ("theta", "attitude_bias.y", 0.03)],
+)
+def test_an_edit_from_a_moment_on_is_found_at_its_size_and_moment(edit, number, size):
+    """In the second of two runs: half a row before its first edited row, known to that row."""
+    log = edited(flight(), {edit: 1.25 if edit == "gain" else 0.03}, (RUNS[1], 6.0))
+    found = changes(before(), [record_of(run) for run in log.runs])
+    (change,) = found.changes
+    p = change.parameters[number]
+    assert abs(p.change - size) < 2.0 * p.std < 0.1
+    assert found.since is not None and found.since.moment.run == RUNS[1]
+    assert abs(found.since.t - 6.0) < math.sqrt(3.0) * found.since.std + 1e-9 < 0.02
+
+
+def test_what_differs_from_the_first_row_on_has_no_moment():
+    log = edited(flight(), {"gain": 1.25})
+    records = [[record_of(run) for run in f.runs] for f in (flight(), log)]
+    assert first_difference(*records) is None
+    assert first_difference(records[0], records[0]) is None
+
+
+def test_what_differs_from_a_run_on_does_so_from_its_first_row_on():
+    log = edited(flight(), {"gain": 1.25}, (RUNS[1], 0.0))
+    since = first_difference(*([record_of(run) for run in f.runs] for f in (flight(), log)))
+    assert since is not None and since.moment.run == RUNS[1]
+    assert since.t == flight().runs[1].t[0] and since.std == 0.0
+
+
+def test_rotors_turn_faster_from_the_moment_on():
+    """Of the commands, rows before the moment and the swash plate's stay."""
+    late = before().since(Moment(RUNS[1], 6.0))
+    faster = _with_rotors(late.problem.engine, 1.04)
+    for was, now in zip(late.problem.engine.records, faster.records, strict=True):
+        after = (was.whole == RUNS[1]) & (was.t >= 6.0)
+        expected = np.where(after[:, None], [1.04, 1.04, 1.0, 1.0], 1.0)
+        np.testing.assert_allclose(now.command, was.command * expected)
+
+
 def test_two_edits_are_two_changes():
     found = difference({"phase": 0.15, "theta": 0.03})
     assert set(found) == {"swash_phase", "attitude_bias"}
@@ -169,20 +217,27 @@ def test_a_number_moves_within_what_physics_gives():
 @pytest.mark.slow
 @pytest.mark.needs_shared_flights
 @pytest.mark.parametrize(
-    ("name", "runs"), [("skybotix_coax", ["circles"]), ("skybotix_second", None)]
+    ("name", "runs", "since"),
+    [
+        ("skybotix_coax", ["circles"], None),
+        ("skybotix_coax", ["hover", "circles"], ("circles", 20.0)),
+        ("skybotix_second", None, None),
+        ("skybotix_second", None, ("4x5ft_2", 20.0)),
+    ],
 )
-def test_edits_of_real_logs(name, runs):
+def test_edits_of_real_logs(name, runs, since):
     """Six edits of each: all at their size, by the effect's own name, and nothing else changed.
 
-    Of the first set one run of three, for time; `scripts/check_edits.py` takes them all.
+    Of the first set not all runs, for time; `scripts/check_edits.py` takes them all.
     """
     script = importlib.import_module("check_edits")
     log = read_flight(shared_flight(name))
     log = log.select(runs or log.run_names)
-    rows = script.check(log, None, script.STANDARD, lambda text: None)
+    rows = script.check(log, None, script.STANDARD, lambda text: None, since)
     assert [row["edit"] for row in rows] == list(script.STANDARD)
     for row in rows:
         assert row["found"] and row["named"] == row["effect"], row
         assert not row["else"], row
+        assert since is None or row["in_time"], row
         largest = max(abs(p["planted"]) for p in row["parameters"].values())
         assert all(p["std"] < 0.5 * largest for p in row["parameters"].values()), row

@@ -15,7 +15,7 @@ from test_estimation import NOISE, TRUTH, Pendulum, prior, swing
 
 from coax_env.diagnosis import onset
 from coax_env.diagnosis.diagnose import diagnose
-from coax_env.diagnosis.onset import Changing, rows_of
+from coax_env.diagnosis.onset import Changing, _Table, rows_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.beginnings import Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
@@ -125,6 +125,41 @@ def test_what_begins_and_what_always_was_share_the_rows_from_there_on(short):
     unit = np.outer(np.diag(information[:k, :k]) ** -0.5, np.diag(whole) ** -0.5)
     assert b.across * unit == pytest.approx(across * unit, abs=0.02)
     assert np.abs(information[:k, k:] * unit).max() > 0.05, "and the past is felt"
+
+
+@pytest.mark.parametrize("least", [-np.inf, -0.01])
+def test_a_changes_worth_is_what_the_joint_quadratic_gains(least):
+    """Beside three numbers that are free, two that begin; their least move bounds them."""
+    rng = np.random.default_rng(5)
+    always, begins = rng.standard_normal((2, 5, 40))
+    e, prior, rest, own = 3.0 * rng.standard_normal(40), np.full(5, 0.7), [0, 1, 2], [3, 4]
+    quadratic = Quadratic(
+        tuple("abcde"), np.zeros((5, 5)), np.zeros(5), np.zeros(5), np.zeros(5), prior,
+        np.full(5, least), np.full(5, np.inf), np.zeros((1, 5)), np.zeros((5, 1)),
+    )  # fmt: skip
+    both = np.vstack([always[rest], begins[own]])
+    H, h = both @ both.T + 0.7 * np.eye(5), both @ e
+    alone, pull = H[:3, :3], h[:3]
+    table = _Table(
+        quadratic, [np.zeros((5, 5))], [np.zeros(5)], np.array(rest), np.linalg.inv(alone), pull,
+        [np.array(own)], [np.zeros(2)], (np.array([3, 3, 4, 4]), np.array([3, 4, 3, 4])),
+    )  # fmt: skip
+    row = table.row_of(Beginning(0, 7, begins @ e, begins @ always.T, begins @ begins.T))
+    (nats,), (move,) = table.worth(0, *(np.array([part]) for part in row))
+    gained = 0.5 * (h @ np.linalg.solve(H, h) - pull @ np.linalg.solve(alone, pull))
+    occam = 0.5 * (np.linalg.slogdet(H)[1] - np.linalg.slogdet(alone)[1] - 2.0 * np.log(0.7))
+    if np.isinf(least):
+        assert nats == pytest.approx(gained - occam)
+        assert move == pytest.approx(-np.linalg.solve(H, h)[3:])
+    else:
+        assert np.all(move >= least) and nats < gained - occam
+
+
+def test_every_row_of_a_log_at_100_hz_is_a_moment(short):
+    """A jump of a reading shows at its own row, and a row beside it no more."""
+    _, records, _ = short
+    of_second = rows_of(records)[1]
+    assert np.all(np.diff(of_second[1:]) == 1)
 
 
 def test_nothing_begins_at_the_ends_of_a_flight(short):
@@ -245,6 +280,23 @@ def test_what_begins_in_flight_is_named_with_its_moment(tmp_path, later):
             assert abs(cause["since"]["t"] - 6.0) <= max(3.0 * cause["since"]["std"], 0.05)
         else:
             assert cause["since"] is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "later",
+    [{"swash_offset": {"lon": -0.02, "lat": -0.016}}, {"cg_offset": {"x": -6e-4, "y": -1.2e-3}},
+     {"thrust_scale": {"scale": 0.1}}],
+    ids=lambda later: next(iter(later)),
+)  # fmt: skip
+def test_what_stands_in_its_place_is_not_named(tmp_path, later):
+    """A cause found first as one that was always there; thrust in gusts that hide all but its jump."""
+    injector.fly(tmp_path, {}, gusts="thrust_scale" in later, seed=21, runs=RUNS, later=later,
+                 since=("lat_3211", 4.0), longest=12.0)  # fmt: skip
+    (cause,) = diagnose(tmp_path, hold_out=[]).findings["causes"]
+    assert cause["effect"] in later
+    assert cause["since"]["run"] == "lat_3211"
+    assert abs(cause["since"]["t"] - 4.0) <= max(3.0 * cause["since"]["std"], 0.05)
 
 
 @pytest.mark.slow

@@ -27,7 +27,8 @@ from coax_env.comparison.shared import (
     with_drifts,
     with_pilots,
 )
-from coax_env.comparison.two_flights import ROTOR_SPEED, A, B, OneFlight, read_two
+from coax_env.comparison.two_flights import ROTOR_SPEED, A, B, OneFlight, read, read_two
+from coax_env.comparison.two_logs import difference, of_one_flight
 from coax_env.diagnosis.changes import effective
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
@@ -39,6 +40,7 @@ from coax_env.logs.flight import Flight
 from coax_env.model import effects
 from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
 from coax_env.progress import Progress, reporter, shows_progress
 
 ROUNDS = 2
@@ -53,13 +55,13 @@ class Comparison:
         changes: what changes.json holds.
         flights: both, as they were flown.
         white: flight -> channel -> whiteness of what the model leaves.
-        state: the model of both.
+        state: the model of both; None of two logs of one flight (two_logs.py).
     """
 
     changes: dict[str, Any]
     flights: tuple[OneFlight, OneFlight]
     white: Mapping[str, Mapping[str, Whiteness]]
-    state: Changed
+    state: Changed | None
 
 
 @shows_progress("comparison")
@@ -85,6 +87,25 @@ def compare(
     """
     report = reporter(progress)
     flights = read_two(a, b, vehicle, waive)
+    if b is not None and of_one_flight(*(raw := (read(a), read(b)))):
+        machine = load_vehicle(vehicle or raw[0].vehicle)
+        return Comparison(difference(*raw, machine, settings, report), flights, {}, None)
+    return of_two_flights(flights, settings, report)
+
+
+def of_two_flights(
+    flights: tuple[OneFlight, OneFlight],
+    settings: Settings = SETTINGS,
+    report: Progress | None = None,
+) -> Comparison:
+    """As `compare`, each flight with noise of its own, whatever it is; its `state` is there.
+
+    Args:
+        flights: `read_two`.
+        settings: thresholds and limits.
+        report: called with a line of text at every step.
+    """
+    report = report or (lambda text: None)
     problem = joint_problem(flights, settings, report)
     report("estimating gusts and noise of each flight")
     fit = joint_start(problem, flights)

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from coax_env import workers
-from coax_env.comparison.compare import compare
+from coax_env.comparison.compare import of_two_flights
 from coax_env.comparison.information import Information, information_of
 from coax_env.comparison.shared import parts_of
-from coax_env.comparison.two_flights import ROTOR_SPEED
+from coax_env.comparison.two_flights import ROTOR_SPEED, read_two
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
 from coax_env.estimation.flown import flown_parts
@@ -127,7 +127,8 @@ def _refuse(entry: Entry, vehicle: str | None, waive: Collection[str]) -> None:
 def _link(vehicle: str | None, waive: Collection[str], pair: tuple[Entry, Entry]) -> Content:
     """Two neighbours compared, and what each of them says."""
     a, b = pair
-    result = compare(a.folder, b.folder, vehicle, waive=waive)
+    result = of_two_flights(read_two(a.folder, b.folder, vehicle, waive))
+    assert result.state is not None
     says = [
         information_of(result.state, part, flight).as_json()
         for part, flight in zip(parts_of(result.state.problem), result.flights, strict=True)

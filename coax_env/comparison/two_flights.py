@@ -88,11 +88,7 @@ def read_two(
     Raises:
         InputError: no such parts, flights of two vehicles, or a log that contradicts itself.
     """
-    first = a if isinstance(a, Flight) else read_flight(a)
-    if b is None:
-        first, second = parts_of(first)
-    else:
-        second = b if isinstance(b, Flight) else read_flight(b)
+    first, second = (read(a), read(b)) if b is not None else parts_of(read(a))
     if vehicle is None and first.vehicle != second.vehicle:
         raise InputError(
             f"these are flights of two vehicles, {first.vehicle} and {second.vehicle}: say with"
@@ -100,6 +96,11 @@ def read_two(
         )
     machine = load_vehicle(vehicle or first.vehicle)
     return one_flight(A, first, machine, waive), one_flight(B, second, machine, waive)
+
+
+def read(flight: Flight | str | Path) -> Flight:
+    """A flight, read where it is a folder."""
+    return flight if isinstance(flight, Flight) else read_flight(flight)
 
 
 def parts_of(flight: Flight) -> tuple[Flight, Flight]:

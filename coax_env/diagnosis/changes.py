@@ -17,6 +17,10 @@ residual of unknown variance; Schwarz 1978 for the numbers that it takes), FORM_
 counted. The std of a change is that of the residual's scores, block by block (sandwich; Huber 1967):
 far smaller than the std of either diagnosis. What a change would be worth in a flight with noise of its
 own is stated beside it, as its evidence.
+
+Where the logs are the same up to a row, the change begins there: the model then changes at that moment
+(estimation/changing_model.py), and only what is behind it counts. No fit finds the moment; it lies
+between the last row that is the same and the first that is not.
 """
 
 import math
@@ -33,11 +37,19 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.errors import InputError
+from coax_env.estimation.changing_model import BEFORE, ChangingModel
 from coax_env.estimation.engine import BLOCK, Engine
 from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.flown import flown_parts
-from coax_env.estimation.helicopter import MOST_USUAL_SIZES, ROTORS, HeliModel, record_of
+from coax_env.estimation.helicopter import (
+    MOST_USUAL_SIZES,
+    ROTORS,
+    HeliModel,
+    Moment,
+    record_of,
+)
 from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.estimation.parted_engine import of_part
 from coax_env.estimation.prediction import WARM_UP
 from coax_env.estimation.quadratic import bounded_solve
 from coax_env.estimation.state_space import Record
@@ -117,21 +129,38 @@ class Change:
 
 
 @dataclass(frozen=True)
+class Since:
+    """From when on two logs of a flight differ. moment: the first row that does; t, std: of the time
+    between the last row that is the same and that one [s]."""
+
+    moment: Moment
+    t: float
+    std: float
+
+    def entry(self) -> dict[str, str | float]:
+        """As findings.json has a moment."""
+        return {"run": self.moment.run, "t": self.t, "std": self.std}
+
+
+@dataclass(frozen=True)
 class Changes:
     """All that changed, strongest first.
 
     different: nats by which the logs differ under the model of the one before.
     left: nats of that which no change explains.
+    since: from when on they differ; None: from the start.
     """
 
     changes: tuple[Change, ...]
     different: float
     left: float
+    since: Since | None = None
 
     def as_json(self) -> dict[str, Any]:
         """As changes.json has it."""
         return {
             "verdict": "changed" if self.changes else "same",
+            "since": self.since.entry() if self.since else None,
             "changes": [
                 {
                     "effect": c.effect,
@@ -232,6 +261,31 @@ class Before:
         slopes = {e: own.slopes(fit.values, coordinates) for e, coordinates in known.items()}
         return cls(problem, fit, here, there, known, slopes)
 
+    def since(self, moment: Moment) -> "Before":
+        """Of numbers that change at a moment of the flight, not in all of it.
+
+        Args:
+            moment: its run may be one that was cut into parts.
+        """
+        runs = list(dict.fromkeys(record.whole for record in self.problem.engine.records))
+        known = [e for e in self.known if e != ROTOR_SPEED]
+        model = ChangingModel(self.problem.model, dict.fromkeys(known, moment), runs)
+        was = {
+            of_part(name, BEFORE): self.fit.values.get(name, p.off)
+            for e in known
+            for name, p in zip(
+                effects.CATALOGUE[e].names(), effects.CATALOGUE[e].parameters, strict=True
+            )
+        }
+        problem, fit = self.problem.with_model(model), self.fit.at(was)
+        there = [
+            mask & (model.stretches(record) == 0.0)[:, None]
+            for mask, record in zip(self.there, problem.engine.records, strict=True)
+        ]
+        own = _Logs(problem.engine, fit, self.innovations, there)
+        slopes = {e: own.slopes(fit.values, group) for e, group in self.known.items()}
+        return replace(self, problem=problem, fit=fit, there=there, slopes=slopes)
+
 
 # --- the search for what changed ------------------------------------------------------------------
 
@@ -278,11 +332,17 @@ class _Logs:
 
 
 def _with_rotors(engine: Engine, factor: float) -> Engine:
-    """Over the same records, their rotor commands times a factor."""
+    """Over the same records, their rotor commands times a factor; from the model's moment on."""
     times = np.ones(N_COMMANDS)
     times[list(ROTORS)] = factor
-    records = [replace(record, command=record.command * times) for record in engine.records]
-    return Engine(engine.model, records, engine.threads)
+    model, records = engine.model, []
+    for record in engine.records:
+        late = np.ones(record.t.size, bool)
+        if isinstance(model, ChangingModel):
+            late = model.stretches(record) == 0.0
+        command = np.where(late[:, None], record.command * times, record.command)
+        records.append(replace(record, command=command))
+    return Engine(model, records, engine.threads)
 
 
 @dataclass(frozen=True)
@@ -307,8 +367,11 @@ def changes(before: Before, after: Sequence[Record], progress: Progress | None =
     Raises:
         InputError: the logs are not of the same flight.
     """
+    _check_same_rows(before.problem.engine.records, after)
+    since = first_difference(before.problem.engine.records, after)
+    if since is not None:
+        before = before.since(since.moment)
     problem, fit, chosen = before.problem, before.fit, before.problem.settings
-    _check_same_rows(problem.engine.records, after)
     report = progress or (lambda text: None)
     there = [mask & np.isfinite(record.z) for mask, record in zip(before.there, after, strict=True)]
     logs = _Logs(
@@ -329,7 +392,28 @@ def changes(before: Before, after: Sequence[Record], progress: Progress | None =
         )
         report(f"{new} changed: {trials[0].nats - best.nats:.1f} nats")
         best = _without_worthless(logs, before.known, trials[0], nothing, chosen)
-    return _stated(problem, logs, before.known, best, alternatives, nothing)
+    found = _stated(problem, logs, before.known, best, alternatives, nothing)
+    return replace(found, since=since)
+
+
+def first_difference(before: Sequence[Record], after: Sequence[Record]) -> Since | None:
+    """From when on two logs of a flight differ; None where they do from the start, or nowhere.
+
+    Args:
+        before, after: their records, in the order in which they were flown, with the same rows.
+    """
+    for k, (one, other) in enumerate(zip(before, after, strict=True)):
+        same = np.all(one.command == other.command, axis=1)
+        same &= np.all((one.z == other.z) | (np.isnan(one.z) & np.isnan(other.z)), axis=1)
+        if same.all():
+            continue
+        row = int(np.argmin(same))
+        if row == 0:
+            return Since(Moment(one.whole, float(one.t[0])), float(one.t[0]), 0.0) if k else None
+        gap = float(one.t[row] - one.t[row - 1])
+        moment = Moment(one.whole, float(one.t[row]))
+        return Since(moment, moment.t - 0.5 * gap, gap / math.sqrt(12.0))
+    return None
 
 
 def _of_readings(before: Before, there: Sequence[np.ndarray]) -> dict[str, np.ndarray]:

@@ -30,7 +30,7 @@ from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
 from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.parted_engine import of_part
-from coax_env.estimation.quadratic import Quadratic, bounded_solve
+from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
 from coax_env.estimation.whiteness import Whiteness, whiteness
 
@@ -39,9 +39,10 @@ NEVER_BEGINS = frozenset(
      "gyroscopic_coupling", "spin_up_reaction", "dynamic_inflow", "sonar_tilt", "thrust_exponent"}
 )  # fmt: skip
 """What belongs to air, ground and battery, and laws of motion and flow that no damage changes."""
-SPACING = 0.1
-"""s between the moments that are scored at once; ours."""
-MOST_MOMENTS = 600
+SPACING = 0.01
+"""s between the moments that are scored at once: every row of a log at 100 Hz. What jumps in a reading,
+as thrust does in specific force, shows at its own row and is gone 0.02 s beside it; ours."""
+MOST_MOMENTS = 6000
 """On long flights they are farther apart than that; ours, a bound on time."""
 MARGIN = 1.5
 """s from the first row of all, and to the last, in which nothing begins: the filter settles in one, and
@@ -51,7 +52,9 @@ SETTLED = 1.0
 MOST_ONSETS = 2
 """Changes that are looked for, one after the other; ours, a bound on time."""
 NEAR = 1.0
-"""s to both sides of a moment in which the likelihood is asked for a better one; ours."""
+"""s to both sides of a moment in which the likelihood is asked for a better one first; ours."""
+AFAR = 20
+"""Other moments of its run that it is asked for, evenly spaced; ours, a bound on time."""
 FADED = 10.0
 """nats under the best moment's from which on another has no share in the interval; ours."""
 SMOOTH = 0.5
@@ -115,8 +118,10 @@ def with_onsets(
         problem.report(f"{onset.effect} since {onset.t:.2f} s of {onset.moment.run}:"
                        f" {onset.nats:.1f} nats")  # fmt: skip
         after = _searched_again(trial, bare, {**state.onsets, onset.effect: onset})
-        if not set(after.onsets) >= {*state.onsets, onset.effect}:
+        if onset.effect not in after.onsets:
             break  # it was another cause's work
+        if not set(after.onsets) >= set(state.onsets) and _cost_of(state) < _cost_of(after):
+            break  # it would stand in an earlier one's place, and do worse
         state = after
     return state
 
@@ -154,14 +159,17 @@ def scored(state: Changing) -> list[Scored]:
         for record, of_run, results in zip(records, rows, found, strict=True)
         for row, result in zip(of_run, results, strict=False)  # none where the filter diverged
     ]
+    if not every:
+        return []
+    slopes, information = (np.array(part) for part in zip(*(r for _, r in every), strict=True))
     best = []
-    for j, effect in enumerate(names):
-        nats = np.array([result[j][0] for _, result in every])
+    for k, (effect, own) in enumerate(names.items()):
+        nats, moves = table.worth(k, slopes, information)
         if np.isfinite(nats).any():
-            moment, result = every[int(np.argmax(nats))]
+            at = int(np.argmax(nats))
             total = float(logsumexp(nats)) - math.log(len(every))  # each as likely as any other
-            move = dict(zip(names[effect], result[j][1].tolist(), strict=True))
-            best.append(Scored(effect, total, moment, move))
+            move = dict(zip(own, moves[at].tolist(), strict=True))
+            best.append(Scored(effect, total, every[at][0], move))
     return sorted(best, key=lambda s: -s.nats)
 
 
@@ -203,19 +211,23 @@ class _Table:
     """What the score of a change takes that does not depend on its moment.
 
     later: information (k, k) and slope_later: slope (k,) of all records behind each one. rest: places
-    of what is free beside a change, known: its Cholesky factor, pull: (r,) its slope. groups: places of
-    each effect's numbers, smallest: sizes that matter of these, inflation: its variances'.
+    of what is free beside a change, inverse: (r, r) of its information and prior, pull: (r,) its slope.
+    groups: places of each effect's numbers, smallest: sizes that matter of these, pairs: places of the
+    groups' matrices.
+
+    Variances are not inflated by the colour of the innovations: what changed and is not in the model
+    yet colours them itself, and most of all the scores of its own numbers.
     """
 
     quadratic: Quadratic
     later: Sequence[np.ndarray]
     slope_later: Sequence[np.ndarray]
     rest: np.ndarray
-    known: tuple[np.ndarray, bool]
+    inverse: np.ndarray
     pull: np.ndarray
     groups: Sequence[np.ndarray]
     smallest: Sequence[np.ndarray]
-    inflation: Sequence[float]
+    pairs: tuple[np.ndarray, np.ndarray]
 
     @classmethod
     def of(cls, state: Changing, names: Mapping[str, Sequence[str]]) -> "_Table":
@@ -226,6 +238,7 @@ class _Table:
         rest = quadratic.index(free)
         pull = quadratic.g + quadratic.precision * (quadratic.at - quadratic.mean)
         known = quadratic.G[np.ix_(rest, rest)] + np.diag(quadratic.precision[rest])
+        groups = [quadratic.index(own) for own in names.values()]
         sizes = {
             f"{e}.{p.name}": max(p.smallest, 1e-12) for e in names for p in problem.model.sized(e)
         }
@@ -234,37 +247,48 @@ class _Table:
             _behind(quadratic.parts.information),
             _behind(quadratic.parts.slope),
             rest,
-            cho_factor(known),
+            cho_solve(cho_factor(known), np.eye(rest.size)),
             pull[rest],
-            [quadratic.index(own) for own in names.values()],
+            groups,
             [np.array([sizes[n] for n in own]) for own in names.values()],
-            [
-                quadratic.variance_inflation(own, [*free, *(n for n in own if n not in free)])
-                for own in names.values()
-            ],
+            (
+                np.concatenate([np.repeat(c, c.size) for c in groups]),
+                np.concatenate([np.tile(c, c.size) for c in groups]),
+            ),
         )
 
-    def row_of(self, b: Beginning) -> list[tuple[float, np.ndarray]]:
-        """What each effect is worth that changes there, and by what its numbers do."""
-        q = self.quadratic
-        slope = b.slope + self.slope_later[b.record]
+    def row_of(self, b: Beginning) -> tuple[np.ndarray, np.ndarray]:
+        """Slope and information of every effect's numbers that move from there on, what is free beside
+        them projected out: (k,) of all numbers, and the groups' matrices, row by row.
+        """
         across = b.across[:, self.rest] + self.later[b.record][:, self.rest]
-        own = b.own + self.later[b.record]
-        weights = cho_solve(self.known, across.T)
-        slope = slope - weights.T @ self.pull
-        result = []
-        for c, smallest, inflation in zip(self.groups, self.smallest, self.inflation, strict=True):
-            prior = q.precision[c]
-            A = own[np.ix_(c, c)] - across[c] @ weights[:, c] + np.diag(prior)
-            x = np.linalg.solve(A, -slope[c])
-            low, high = (q.lower - q.at)[c], (q.upper - q.at)[c]
-            if np.any(x < low) or np.any(x > high):
-                x = bounded_solve(A, -slope[c], low, high)
-            gained = -float(slope[c] @ x) - 0.5 * float(x @ A @ x)
-            occam = 0.5 * float(np.linalg.slogdet(A / np.sqrt(np.outer(prior, prior)))[1])
-            large = bool(np.any(np.abs(x) >= smallest))
-            result.append((gained / inflation - occam if large else -math.inf, x))
-        return result
+        weights = across @ self.inverse
+        slope = b.slope + self.slope_later[b.record] - weights @ self.pull
+        i, j = self.pairs
+        own = b.own[i, j] + self.later[b.record][i, j]
+        return slope, own - np.einsum("pr,pr->p", across[i], weights[j])
+
+    def worth(
+        self, k: int, slopes: np.ndarray, information: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What a change of one effect is worth from each row on [nats], and how its numbers move.
+
+        Where bounds are met the move is cut off there: it is worth that at least.
+
+        Args:
+            k: the effect's place. slopes, information: `row_of` all rows, stacked.
+        """
+        q, c = self.quadratic, self.groups[k]
+        first = sum(group.size**2 for group in self.groups[:k])
+        prior = q.precision[c]
+        A = information[:, first : first + c.size**2].reshape(-1, c.size, c.size) + np.diag(prior)
+        slope = slopes[:, c]
+        x = np.linalg.solve(A, -slope[:, :, None])[:, :, 0]
+        x = np.clip(x, (q.lower - q.at)[c], (q.upper - q.at)[c])
+        gained = -np.sum((slope + 0.5 * np.einsum("nij,nj->ni", A, x)) * x, axis=1)
+        occam = 0.5 * np.linalg.slogdet(A / np.sqrt(np.outer(prior, prior)))[1]
+        large = np.any(np.abs(x) >= self.smallest[k], axis=1)
+        return np.where(large, gained - occam, -math.inf), x
 
 
 def _behind(parts: np.ndarray) -> list[np.ndarray]:
@@ -330,9 +354,26 @@ def _fitted(
     problem, found = _moved(problem, trial, effect, runs)
     trial = fitted(problem, noise_fitted(problem, trial), steps=2)
     problem, found = _moved(problem, trial, effect, runs)
+    trial = _with_noise_of(problem, trial, state.fit)
     trial, _, quadratic = linearise(problem, trial)
     onset = _worth(state, problem, trial, quadratic, found)
     return Changing(problem, trial, quadratic, {**state.onsets, effect: onset}), onset
+
+
+def _with_noise_of(problem: Problem, trial: Fit, fit: Fit) -> Fit:
+    """A change beside the noise of the fit without it, drifts too, where that is likelier.
+
+    A machine whose trims do drift would else lose more by their absence than any change can gain.
+
+    Args:
+        problem, trial: with the change, fitted in steady noise.
+        fit: without it.
+    """
+    if trial.noise.process == fit.noise.process:
+        return trial
+    other = fitted(problem, replace(trial, noise=fit.noise, levels=fit.levels), steps=2)
+    other = fitted(problem, noise_fitted(problem, other), steps=1)
+    return other if other.objective < trial.objective else trial
 
 
 def _worth(
@@ -417,7 +458,7 @@ def _moved(problem: Problem, fit: Fit, effect: str, runs: Sequence[str]) -> tupl
 
 
 def moment_of(problem: Problem, fit: Fit, effect: str, inflation: float = 1.0) -> Onset:
-    """The best moment of a change near where it stands, with mean, std and width of its posterior.
+    """The best moment of a change in its run, with mean, std and width of its posterior.
 
     From the likelihood of its run with the change at each row, all else as it is.
 
@@ -429,14 +470,13 @@ def moment_of(problem: Problem, fit: Fit, effect: str, inflation: float = 1.0) -
     moment = problem.model.moments[effect]
     records = [r for r in problem.engine.records if r.whole == moment.run]
     t = np.concatenate([r.t for r in records])
-    near = t[np.abs(t - moment.t) <= NEAR]
-    nats = _profile(problem, fit, effect, records, near) / inflation
+    nats = _profile(problem, fit, effect, records, t) / inflation
     share = np.exp(nats - nats.max())
-    step = np.gradient(near) if near.size > 1 else np.ones(1)
+    step = np.gradient(t) if t.size > 1 else np.ones(1)
     weight = share * step / float(share @ step)
-    mean = float(weight @ near)
-    spread = math.hypot(math.sqrt(float(weight @ (near - mean) ** 2)), float(np.median(step)))
-    best = Moment(moment.run, float(near[int(np.argmax(nats))]))
+    mean = float(weight @ t)
+    spread = math.hypot(math.sqrt(float(weight @ (t - mean) ** 2)), float(np.median(step)))
+    best = Moment(moment.run, float(t[int(np.argmax(nats))]))
     return Onset(effect, best, mean, spread, float(share @ step), 0.0)
 
 
@@ -445,8 +485,8 @@ def _profile(
 ) -> np.ndarray:
     """Log-likelihood of records with an effect's moment at each of these times (n,).
 
-    At every tenth first, then between any two of which one has a share in the interval and that differ,
-    and by a line between the others.
+    At every tenth near where it stands and at some others first, then between any two of which one has
+    a share in the interval and that differ, and by a line between the others.
     """
     model = problem.model
     assert isinstance(model, ChangingModel)
@@ -457,7 +497,9 @@ def _profile(
         return Engine(other, records, problem.engine.threads).log_likelihood(fit.values, fit.noise)
 
     known: dict[int, float] = {}
-    asked = {*range(0, times.size, 10), times.size - 1}
+    near = np.flatnonzero(np.abs(times - model.moments[effect].t) <= NEAR)
+    afar = np.linspace(0, times.size - 1, AFAR).astype(int)
+    asked = {*near[::10].tolist(), *near[-1:].tolist(), *afar.tolist()}
     while asked:
         known |= {k: nats_at(k) for k in asked}
         best = max(known.values())
@@ -507,6 +549,10 @@ def _searched_again(trial: Changing, bare: Fit, onsets: Mapping[str, Onset]) -> 
     fit, quadratic = min(ended, key=lambda e: _cost(problem, *e))
     kept = {e: onset for e, onset in onsets.items() if e in fit.active}
     return Changing(problem, fit, quadratic, kept)
+
+
+def _cost_of(state: Changing) -> float:
+    return _cost(state.problem, state.fit, state.quadratic)
 
 
 def _cost(problem: Problem, fit: Fit, quadratic: Quadratic) -> float:

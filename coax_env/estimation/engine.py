@@ -461,12 +461,12 @@ class Engine:
         J[:, wild] = 0.0
         e = run.innovations[there]
         answers, slope, own = Answers(nx, k), np.zeros(k), np.zeros((k, k))
-        found = []
+        found, asked = [], set(rows.tolist())
         for portion, s in zip(portions[::-1], states[::-1], strict=True):
             here = slice(portion.reading, before[portion.last])
             answers.back(_trace(run, at), self._refresh[i], portion, J[here])
             slope, own = slope + e[here] @ J[here], own + J[here].T @ J[here]
-            if portion.first in rows:
+            if portion.first in asked:
                 s[:, wild] = 0.0
                 found.append(work(Beginning(i, portion.first, *answers.since(s, slope, own))))
         return found

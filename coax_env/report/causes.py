@@ -9,6 +9,7 @@ from coax_env.model.usual_sizes import sized_for
 from coax_env.model.vehicle import Vehicle
 from coax_env.plain_words import (
     and_list,
+    bounds,
     capital,
     channel_name,
     number,
@@ -100,11 +101,10 @@ def _robust_row(cause: Mapping[str, Any]) -> list[str]:
 
 def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicle) -> str:
     effect, doubts = cause["effect"], cause["doubts"]
-    lines = [f"**{capital(doubt)}.**" for doubt in doubts] or [
+    lines = [f"**{capital(since(cause))}.** {_was(cause)}"] if cause.get("since") else []
+    lines += [f"**{capital(doubt)}.**" for doubt in doubts] or [
         "Within the catalogue and this class of noise no other effect fits these flights equally well."
     ]
-    if cause.get("since"):
-        lines.append(capital(f"{since(cause)}."))
     if cause["channels"]:
         lines.append(f"Seen in {and_list([channel_name(c) for c in cause['channels']])}.")
     evidence = cause["evidence"]
@@ -121,15 +121,19 @@ def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicl
 
 
 def since(cause: Mapping[str, Any]) -> str:
-    """When a cause began or changed, and what it was before, in words."""
+    """When a cause began or changed, in words, with its 95 % interval."""
     moment = cause["since"]
-    words = f"since {moment['t']:.2f} ± {number(moment['std'], 2)} s of run {moment['run']}"
+    return f"since {bounds(moment['t'], NORMAL_95 * moment['std'], 's')} of run {moment['run']}"
+
+
+def _was(cause: Mapping[str, Any]) -> str:
+    """What it was before that."""
     earlier = [
         f"{plain(name)} {number(p['value'])} ± {number(p['std'], 2)}"
         for name, p in cause["before"].items()
     ]
-    was = f"before it was {and_list(earlier)}" if earlier else "before it was not there"
-    return f"{words}; {was}. The numbers, and the corrected vehicle, are as after that moment"
+    was = f"Before it was {and_list(earlier)}" if earlier else "Before, it was not there"
+    return f"{was}; the numbers, and the corrected vehicle, are as after that moment."
 
 
 def _plain_list(names: list[str]) -> str:

@@ -64,7 +64,7 @@ def comparison_page(result: "Comparison", command_line: str = "") -> str:
         Section("What changed", _changed(changes)),
         Section("What did not change, and how well that is known", _unchanged(changes)),
         Section("Air, battery and gusts", _circumstances(changes)),
-        Section("What both flights share", _shared(changes)),
+        Section("What both share", _shared(changes)),
         Section("Unexplained", _unexplained(changes)),
         Section("The flights", _flights(result)),
         Section("How this was computed", [command(command_line)] if command_line else []),
@@ -82,21 +82,27 @@ def comparison_page(result: "Comparison", command_line: str = "") -> str:
 def change_headline(changes: Changes) -> str:
     """The verdict in one sentence."""
     names = [plain(c["effect"]) for c in changes["changes"]]
+    if changes.get("of_one_flight"):
+        said = and_list(names) if names else "nothing that an effect explains"
+        return f"Two logs of one flight differ by {said}"
     if not names:
         return "The machine is the same in both flights"
     return f"Between the flights changed: {and_list(names)}"
 
 
 def _lead(changes: Changes) -> list[str]:
+    if changes.get("of_one_flight"):
+        return [*changes["remarks"], *(f"{_change(c)}." for c in changes["changes"])]
     if not changes["changes"]:
         return [
             "Nothing that these flights can show has changed. Wind, gusts, air density, the battery's "
             "state and the pilot may differ; they are fitted for each flight and are never a change."
         ]
-    return [
-        f"{capital(plain(c['effect']))}: {_sizes(c)}; {number(c['evidence'])} nats."
-        for c in changes["changes"]
-    ]
+    return [f"{_change(c)}; {number(c['evidence'])} nats." for c in changes["changes"]]
+
+
+def _change(change: Mapping[str, Any]) -> str:
+    return f"{capital(plain(change['effect']))}: {_sizes(change)}"
 
 
 def _sizes(change: Mapping[str, Any]) -> str:
@@ -140,11 +146,21 @@ def _changed(changes: Changes) -> list[str]:
     return [
         cards(shown),
         table(["number", "before", "after", "change", "std"], rows),
-        prose(
-            "In brackets: 95 % intervals of the difference. Evidence is a log Bayes factor in nats: "
-            "5 nats are odds of 150 to 1, and 14 are needed for a name."
-        ),
+        prose(f"In brackets: 95 % intervals of the difference. {_evidence(changes)}"),
     ]
+
+
+def _evidence(changes: Changes) -> str:
+    """What the nats are."""
+    if changes.get("of_one_flight"):
+        return (
+            "The nats are what the change would be worth in a flight with noise of its own. Here the "
+            "noise is the same in both logs, and what is worth less is seen too."
+        )
+    return (
+        "Evidence is a log Bayes factor in nats: 5 nats are odds of 150 to 1, and 14 are needed for a "
+        "name."
+    )
 
 
 _SHOWN = ("before", "after", "change", "std")
@@ -210,6 +226,8 @@ def _bounds_figure(known: Mapping[str, Mapping[str, Any]], named: set[str]) -> F
 
 def _circumstances(changes: Changes) -> list[str]:
     """What each flight has of its own, side by side."""
+    if changes.get("of_one_flight"):
+        return []
     a, b = (changes["circumstances"][name] for name in "AB")
     rows = []
     for name, (words, unit) in CIRCUMSTANCES.items():
@@ -232,6 +250,14 @@ def _own(entry: Mapping[str, float] | None, unit: str) -> str:
 
 def _shared(changes: Changes) -> list[str]:
     names = [plain(n) for n in changes["shared"]]
+    if changes.get("of_one_flight"):
+        return [
+            prose(
+                "The model of log A, with the effects that it shows"
+                + (f": {and_list(names)}" if names else "")
+                + ". What is wrong with it is in both logs and cancels in the difference."
+            )
+        ]
     if not names:
         return [prose("The vehicle file's own numbers, refitted to both; no effect beside them.")]
     return [

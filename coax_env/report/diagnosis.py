@@ -18,7 +18,7 @@ from coax_env.plain_words import (
     seconds,
     whole_percent,
 )
-from coax_env.report.causes import cause_sections, confounding_blocks
+from coax_env.report.causes import cause_sections, confounding_blocks, since
 from coax_env.report.diagnosis_details import detail_blocks
 from coax_env.report.flight_data import data_blocks, ordered
 from coax_env.report.flight_view import flight_view
@@ -100,7 +100,11 @@ def headline(findings: Findings) -> str:
 
 def lead(findings: Findings) -> list[str]:
     """The result in a few sentences."""
-    sentences = []
+    sentences = [
+        f"{capital(plain(c['effect']))} {'changed' if c['before'] else 'is there'} {since(c)}."
+        for c in findings["causes"]
+        if c.get("since")
+    ]
     gain = findings.get("gain")
     if findings["verdict"] == "consistent":
         sentences.append("The residual is sensor noise and gusts: no effect is worth adding.")
