@@ -192,7 +192,9 @@ def test_changes_are_found_one_by_one_until_none_holds(monkeypatch, true, found)
     monkeypatch.setattr(changes, "_Logs", lambda *given: quiet)
     monkeypatch.setattr(changes, "_of_readings", lambda before, there: slopes)
     monkeypatch.setattr(
-        changes, "_stated", lambda problem, logs, known, best, alike, nothing: (best, alike)
+        changes,
+        "_stated",
+        lambda problem, logs, known, best, alike, nothing: changes.Changes((best, alike), 0.0, 0.0),
     )
     one = record("a", 2.0, 0.0)
     made = SimpleNamespace(
@@ -200,7 +202,7 @@ def test_changes_are_found_one_by_one_until_none_holds(monkeypatch, true, found)
     )
     monkeypatch.setattr(changes, "Engine", Echo)
     before = changes.Before(made, FIT, [], [np.ones((4, 18), bool)], known, slopes)  # type: ignore
-    best, alike = changes.changes(before, [one])  # type: ignore[misc]
+    best, alike = changes.changes(before, [one]).changes  # type: ignore[misc]
     names = {"wind" if e == "twin" else e for e in best.effects}
     assert names == found
     for effect, others in alike.items():

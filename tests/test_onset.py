@@ -312,24 +312,24 @@ def test_nothing_begins_where_a_cause_is_constant(tmp_path):
 
 
 def test_on_long_flights_moments_are_farther_apart():
-    """A thousand seconds in two runs: some six hundred moments, from a second after a start on."""
-    t = np.arange(0.0, 500.005, 0.01)
+    """Eight hundred seconds in two runs: some six thousand moments, from a second after a start on."""
+    t = np.arange(0.0, 400.005, 0.01)
     none = np.zeros((t.size, 4))
     first, last = rows_of([Record(name, t + 7.0, none, none) for name in "ab"])
-    spacing = 1000.0 / 600.0
+    spacing = 800.0 / 6000.0
     np.testing.assert_allclose(np.diff(first), 100.0 * spacing, atol=1.01)
-    assert t[first[0]] == pytest.approx(1.0 + spacing, abs=0.011)
+    assert t[first[0]] == pytest.approx(1.0 + 4.0 * spacing, abs=0.011)  # past 1.5 s
     np.testing.assert_allclose(np.diff(last[1:]), 100.0 * spacing, atol=1.01)
     assert t[last[1]] == pytest.approx(1.0, abs=0.011) and last[0] == 0
-    assert t[last[-1]] < 498.5 < t[last[-1]] + spacing + 0.01
+    assert t[last[-1]] < 398.5 < t[last[-1]] + spacing + 0.01
     short = rows_of([Record("a", t[:1001], none[:1001], none[:1001])])[0]
-    assert 1.49 < t[short[0]] < 1.61 and set(np.diff(short)) == {10}
+    assert 1.49 < t[short[0]] < 1.53 and set(np.diff(short)) == {1}
 
 
 NAMES = ("mass", "gyro_bias.x", "gyro_bias.y", "gyro_bias.z", "yaw_damping.coefficient")
 
 
-def table(at: dict[str, float], slope: np.ndarray, inflation: float = 1.0):
+def table(at: dict[str, float], slope: np.ndarray):
     """The table of two effects at a fit whose slopes are these, of three runs, and its quadratic."""
     model = HeliModel(load_vehicle("lama400d"))
     own = {e: tuple(model.effect_parameters(e)) for e in ("gyro_bias", "yaw_damping")}
@@ -347,8 +347,14 @@ def table(at: dict[str, float], slope: np.ndarray, inflation: float = 1.0):
     values = {f.name: f.value + at.get(f.name, 0.0) * f.std for f in free}
     quadratic = Quadratic.of(lin, free, values)
     state = Changing(problem, Fit((), values, NOISE_OF_ALL), quadratic, {})
-    found = onset._Table.of(state, {e: [f.name for f in own[e]] for e in own})
-    return replace(found, inflation=[inflation] * 2), quadratic, std
+    found = _Table.of(state, {e: [f.name for f in own[e]] for e in own})
+    return found, quadratic, std
+
+
+def worths(found: _Table, there: Beginning) -> list[tuple[float, np.ndarray]]:
+    """What a change of each effect there is worth, and how its numbers move."""
+    rows = [np.array([part]) for part in found.row_of(there)]
+    return [(nats[0], moves[0]) for nats, moves in (found.worth(k, *rows) for k in range(2))]
 
 
 NOISE_OF_ALL = Noise({})
@@ -373,7 +379,7 @@ def test_a_changes_score_is_the_log_of_the_ratio_of_two_evidences(row):
     share = (0.7, 0.2)[row]
     here = Beginning(1, 10, share * parts.slope[1], share * parts.information[1],
                      share * parts.information[1])  # fmt: skip
-    for (nats, x), names in zip(found.row_of(here), (NAMES[1:4], NAMES[4:]), strict=True):
+    for (nats, x), names in zip(worths(found, here), (NAMES[1:4], NAMES[4:]), strict=True):
         c = q.index(names)
         later_G = (here.own + parts.information[2])[np.ix_(c, c)]
         later_g = (here.slope + parts.slope[2])[c]
@@ -388,25 +394,12 @@ def test_a_changes_score_is_the_log_of_the_ratio_of_two_evidences(row):
         assert nats == pytest.approx(log_evidence(G, g, precision, away) - alone, rel=1e-9)
 
 
-def test_a_changes_score_is_less_where_innovations_are_coloured_and_none_where_it_is_small():
-    here = Beginning(2, 5, SLOPES[2], np.zeros((5, 5)), np.zeros((5, 5)))
-    one, q, std = table({}, SLOPES)
+def test_a_change_that_is_too_small_to_matter_is_worth_nothing():
+    found, q, _ = table({}, 1e-6 * SLOPES)
     parts = q.parts
     assert parts is not None
-    here = replace(
-        here, slope=parts.slope[2], own=parts.information[2], across=parts.information[2]
-    )
-    thrice = replace(one, inflation=[3.0, 3.0])
-    first, coloured = one.row_of(here)[0][0], thrice.row_of(here)[0][0]
-    G = parts.information[2][1:4, 1:4]
-    occam = 0.5 * np.linalg.slogdet(
-        (G - np.outer(parts.information[2][1:4, 0], parts.information[2][0, 1:4])
-         / (q.G[0, 0] + q.precision[0])) * np.outer(std[1:4], std[1:4]) + np.eye(3)
-    )[1]  # fmt: skip
-    assert coloured + occam == pytest.approx((first + occam) / 3.0)
-    small = replace(here, slope=1e-6 * here.slope)
-    none = table({}, 1e-6 * SLOPES)[0]
-    assert [nats for nats, _ in none.row_of(small)] == [-math.inf, -math.inf]
+    here = Beginning(2, 5, parts.slope[2], parts.information[2], parts.information[2])
+    assert [nats for nats, _ in worths(found, here)] == [-math.inf, -math.inf]
 
 
 def test_a_change_stays_within_what_physics_gives():
@@ -415,7 +408,7 @@ def test_a_change_stays_within_what_physics_gives():
     parts = q.parts
     assert parts is not None
     here = Beginning(0, 0, parts.slope[0], parts.information[0], parts.information[0])
-    nats, x = found.row_of(here)[1]
+    nats, x = worths(found, here)[1]
     assert x == pytest.approx([0.0], abs=1e-12) and nats == -math.inf
 
 
@@ -499,12 +492,12 @@ def test_the_interval_of_a_moment_is_its_posteriors(profile, inflation):
     assert found.t == pytest.approx(best, abs=0.003)
     assert found.std == pytest.approx(math.hypot(wide, 0.01), rel=0.01)
     assert found.width == pytest.approx(math.sqrt(2.0 * math.pi) * wide, rel=0.01)
-    assert min(asked) >= 32.3 - 1e-9 and max(asked) <= 34.3 + 1e-9
+    assert len([s for s in asked if abs(s - 33.3) > 1.0 + 1e-9]) <= onset.AFAR
     assert found.entry() == {"run": "b", "t": found.t, "std": found.std}
 
 
 def test_a_moments_likelihood_is_asked_where_it_has_a_share(profile):
-    """Every tenth row at first, then only where it is within ten nats of the best."""
+    """Every tenth row and some others at first, then only within ten nats of the best."""
     of, asked = profile
     t = 0.01 * np.arange(1000)
     problem = of(lambda s: -50.0 * abs(s - 5.037) / 0.1, t, 5.0)
@@ -516,7 +509,7 @@ def test_a_moments_likelihood_is_asked_where_it_has_a_share(profile):
     np.testing.assert_allclose(found[close], exact[close], atol=1e-9)
     assert int(np.argmax(found)) == int(np.argmax(exact))
     far = [s for s in asked if abs(s - 5.037) > 0.15]
-    assert len(far) <= 20 and len(asked) < 45
+    assert len(far) <= 20 + onset.AFAR and len(asked) < 45 + onset.AFAR
 
 
 def test_where_runs_are_short_all_of_the_flown_time_is_asked_for():
