@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import toeplitz
 from scipy.optimize import minimize
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import binom
@@ -22,6 +23,7 @@ from coax_env import identify, load_vehicle, simulate
 from coax_env.errors import InputError
 from coax_env.files import write_text
 from coax_env.identification.two_step import method, modes
+from coax_env.identification.two_step import regression as regressions
 from coax_env.identification.two_step.columns import (
     DRAWS,
     IMU,
@@ -646,6 +648,28 @@ def test_gusts_are_those_of_largest_restricted_likelihood(size, memory):
     assert np.trace(found) == pytest.approx(np.trace(expected), rel=0.35)
     np.testing.assert_allclose(found / np.trace(found), expected / np.trace(expected), atol=0.05)
     assert (np.linalg.eigvalsh(found) >= -1e-9).all()
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.8])
+def test_gusts_are_looked_for_in_rows_that_the_filter_no_longer_ties(monkeypatch, pole):
+    """1.3 times what the errors remember: every other row, or some four to ten apart."""
+    rng = np.random.default_rng(25)
+    runs, n = [240, 200], 440
+    off = lfilter([1.0], [1.0, -pole], rng.standard_normal((300, n + 200)))[:, 200:]
+    step = math.ceil(1.3 * _memory(off[0], runs))
+    assert step == 2 if pole == 0.0 else 4 <= step <= 10
+    sizes = []
+
+    def seen(row: np.ndarray) -> np.ndarray:
+        sizes.append(len(row))
+        return toeplitz(row)
+
+    monkeypatch.setattr(regressions, "toeplitz", seen)
+    X = np.ones((n, 1))
+    found = _gusts(off[1] - off[1].mean(), X, off, runs)
+    assert set(sizes) == {math.ceil(k / step) for k in runs}
+    # there are none: far less than what the errors themselves do to the scores
+    assert 0.0 <= found[0, 0] < 0.5 * n * off.var() * (1.0 + pole) / (1.0 - pole)
 
 
 def test_draws_of_the_errors_make_the_scores_covariance():
