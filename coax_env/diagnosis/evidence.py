@@ -77,19 +77,26 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         problem, fit: after the search, without such gains.
 
     Returns:
-        the problem, with the gains where they are worth it, and what `prune` has of it.
+        the problem, with the gains where they are worth it and innovations white, and what `prune` has
+        of it.
     """
     while True:
         wider, trial = with_command_gains(problem, fit)
-        result = prune(wider, trial)
-        standing = result[0].active
-        if not standing or not has_command_gains(wider):
-            return wider, *result
+        if not fit.active:
+            return wider, *prune(wider, trial)
+        stated = has_command_gains(wider)
+        if not stated:  # colour spoils them for a model, not for the question
+            wider, trial = with_command_gains(problem, fit, coloured=True)
+        joint = prune(wider, trial)
+        standing = joint[0].active
+        if not has_command_gains(wider) or (stated and not standing):
+            return wider, *joint
         for effect in set(fit.active) - set(standing):
             fit = _dropped(problem, fit, effect)
-        fit, _, _ = prune(problem, fit)
+        alone = prune(problem, fit)
+        fit = alone[0]
         if fit.active == standing:
-            return wider, *result
+            return (wider, *joint) if stated else (problem, *alone)
 
 
 def _dropped(problem: Problem, fit: Fit, effect: str) -> Fit:
