@@ -113,6 +113,7 @@ class Tables:
     alone: dict[frozenset[str], dict[str, float]]
     joint: dict[frozenset[str], dict[str, float]]
     worth_it: bool = True
+    white: bool = True
     gains: bool = False
     settings: Any = SETTINGS
     asked: list[bool] = field(default_factory=list)
@@ -132,9 +133,10 @@ class Tables:
 
 
 def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tuple[str, ...]:
-    def gained(problem: Tables, fit: Fit) -> tuple[Tables, Fit]:
-        wider = Tables(problem.alone, problem.joint, gains=True) if problem.worth_it else problem
-        return wider, fit
+    def gained(problem: Tables, fit: Fit, coloured: bool = False) -> tuple[Tables, Fit]:
+        if not problem.worth_it or not (problem.white or coloured):
+            return problem, fit
+        return Tables(problem.alone, problem.joint, gains=True), fit
 
     def removals(
         problem: Tables, fit: Fit, _: object, which: Sequence[str]
@@ -151,7 +153,7 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "_is_doubtful", lambda problem, fit, quadratic, effect: True)
     monkeypatch.setattr(evidence, "weigh", removals)
     problem, fit, _, found = weighed(tables, Fit(active, {}, Noise({})))
-    assert problem.gains == tables.worth_it and set(found) == set(fit.active)
+    assert problem.gains == (tables.worth_it and tables.white) and set(found) == set(fit.active)
     return fit.active
 
 
@@ -165,6 +167,12 @@ def test_a_cause_stands_by_both_likelihoods_or_is_not_named(monkeypatch):
     ):  # fmt: skip
         found = named(monkeypatch, Tables(of(damping=alone), of(damping=joint)), "damping")
         assert found == (("damping",) if stands else ()), (alone, joint)
+
+
+def test_names_are_asked_so_where_colour_keeps_the_gains_out_of_the_model(monkeypatch):
+    for joint, stands in ((CLEAR, True), (2.0, False)):
+        tables = Tables(of(play=CLEAR), of(play=joint), white=False)
+        assert named(monkeypatch, tables, "play") == (("play",) if stands else ())
 
 
 def test_where_commands_show_nothing_the_readings_decide(monkeypatch):

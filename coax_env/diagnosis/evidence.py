@@ -101,20 +101,28 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         problem, fit: after the search, without such gains.
 
     Returns:
-        the problem, with the gains where they are worth it, and what `prune` has of it.
+        the problem, with the gains where they are worth it and innovations white, and what `prune` has
+        of it.
     """
     while True:
         wider, trial = with_command_gains(problem, fit)
-        result = prune(wider, trial)
-        standing = result[0].active
-        if not standing or not has_command_gains(wider):
-            return wider, *result
+        if not fit.active:
+            return wider, *prune(wider, trial)
+        stated = has_command_gains(wider)
+        if not stated:  # colour spoils them for a model, not for the question
+            wider, trial = with_command_gains(problem, fit, coloured=True)
+        asked = has_command_gains(wider)
+        joint = prune(wider, trial, clear=stated or not asked)
+        standing = joint[0].active
+        if not asked or (stated and not standing):
+            return wider, *joint
         for effect in set(fit.active) - set(standing):
             off = problem.off_values(effect) | problem.file_values(effect)
             fit = replace(fit.at(off), active=fit.rest(effect))
-        fit, _, _ = prune(problem, fit, clear=False)
+        alone = prune(problem, fit, clear=not stated)
+        fit = alone[0]
         if fit.active == standing:
-            return wider, *result
+            return (wider, *joint) if stated else (problem, *alone)
 
 
 def _is_doubtful(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:

@@ -50,7 +50,7 @@ _LIFT = np.array([[1.0, 1.0, 0.0, 0.0]])
 _TAKEN = (_TILTS, _TILTS, _TILTS, _TURN, _TURN, _LIFT, _LIFT)
 
 
-def with_command_gains(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+def with_command_gains(problem: Problem, fit: Fit, coloured: bool = False) -> tuple[Problem, Fit]:
     """Fit the gains of the input innovations, where that gains more than a tie.
 
     Only where the innovations of the readings are white: what a model gets wrong follows the commands
@@ -58,13 +58,14 @@ def with_command_gains(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
 
     Args:
         problem, fit: after the search.
+        coloured: fit them where innovations are not white, too: to ask names, not to be stated.
 
     Returns:
         the problem with input innovations in its records and the gains free, and the fit with them;
         both as they were where that gains nothing.
     """
     passes = _passes(problem.engine, fit)
-    if not is_white(passes, problem.model.channels):
+    if not coloured and not is_white(passes, problem.model.channels):
         return problem, fit
     found = _innovations(passes)
     wider = problem.with_records(_with(problem.engine.records, found)).with_free(
