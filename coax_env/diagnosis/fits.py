@@ -8,7 +8,14 @@ import numpy as np
 
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import NoiseScore, RunPass, objective
-from coax_env.estimation.helicopter_noise import LATENT_START, MEMORIES, TRIM_LEVELS, fitted_levels
+from coax_env.estimation.helicopter_noise import (
+    JITTER_LEVEL,
+    JITTER_MEMORY,
+    LATENT_START,
+    MEMORIES,
+    TRIM_LEVELS,
+    fitted_levels,
+)
 from coax_env.estimation.noise_levels import fit_noise, level_slopes
 from coax_env.estimation.parted_engine import AT, PartedEngine, joint_noise, of_part
 from coax_env.estimation.quadratic import Quadratic
@@ -220,13 +227,14 @@ def short_memories(noise: Noise) -> Noise:
 
 
 def without_drifts(fit: Fit) -> Fit:
-    """With noise that cannot take up what changes: no trims that drift, and gusts of short memory.
+    """With noise that cannot take up what changes: no drifting trims or jitter, gusts of short memory.
 
-    Values stay.
+    Rotors that jitter take up a motor that slows down. Values stay.
     """
-    drifts = [n for n in fit.levels if n in TRIM_LEVELS]
-    noise = short_memories(fit.noise.with_levels({n: fit.noise.floor[n] for n in drifts}))
-    return replace(fit, noise=noise, levels=tuple(n for n in fit.levels if n not in drifts))
+    least = {n: fit.noise.floor[n] for n in fit.levels if n in (*TRIM_LEVELS, JITTER_LEVEL)}
+    gone = {*least, JITTER_MEMORY}
+    noise = short_memories(fit.noise.with_levels(least))
+    return replace(fit, noise=noise, levels=tuple(n for n in fit.levels if n not in gone))
 
 
 def _score(problem: Problem, fit: Fit, score: NoiseScore, name: str) -> float:

@@ -145,6 +145,8 @@ def _flights(result: "Diagnosis") -> list[str]:
         if "pn" in flight.channels
         else "as estimated from the readings: no sensor measures it"
     )
+    begun = any(c.get("since") for c in result.findings["causes"])
+    later = " The corrected model is the machine as it is last: before a cause began, it is not."
     view = flight_view(
         paths,
         dict(zip(models, (BEFORE, AFTER), strict=False)),
@@ -152,7 +154,7 @@ def _flights(result: "Diagnosis") -> list[str]:
         {run.name for run in result.replay_before},
         f"Grey: the machine, its position {source}. Every {seconds(RESTART)} the simulations are "
         "set to it; from there they fly with the recorded commands, and the curves show how far "
-        "off they get.",
+        f"off they get.{later if begun else ''}",
     )
     sensors = and_list([channel_name(c) for c in ordered(flight.channels)])
     data = data_blocks(flight, result.remarks, result.noise)
