@@ -1,8 +1,9 @@
 """Pruning, on causes whose worth is written down here: which leave, in which order, and what is asked.
-A cause must be worth the threshold by the readings alone, and with what commands show of the gusts.
 
+A cause must be worth the threshold by the readings alone, and with what commands show of the gusts.
 The refits are stand-ins: the objective of a set of causes is the worth of those that are missing, plus
 what its noise levels have not converged by.
+Two clean flights of the study had names that stood by one of the two likelihoods alone.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from study import arms, one_flight
 
+from coax_env import diagnose
 from coax_env.diagnosis import evidence
 from coax_env.diagnosis.evidence import Evidence, prune, weighed
 from coax_env.diagnosis.problem import Fit, Problem
@@ -186,3 +189,13 @@ def test_what_stood_beside_a_cause_that_fell_is_asked_again_without_it(monkeypat
     joint = of(delay=2.0, damping=40.0, drag=70.0) | of(damping=37.0, drag=70.0) | of(drag=70.0)
     found = named(monkeypatch, Tables(alone, joint), "delay", "damping", "drag")
     assert found == ("drag",)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arm", "number", "seed"), [("telemetry", 1, 17), ("one_minus_cosine", 2, 0)]
+)
+def test_nothing_is_named_that_one_of_them_alone_carries(tmp_path, arm, number, seed):
+    """Before, a rate damping (37 nats), and a servo's play that was sure (15) beside one (18)."""
+    one_flight.hide(arms.planned(arm, "clean", number, seed), tmp_path)
+    assert [c["effect"] for c in diagnose(tmp_path).findings["causes"]] == []
