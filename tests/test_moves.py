@@ -293,3 +293,43 @@ def test_a_black_box_shrinks_each_axis_by_its_own_evidence(monkeypatch):
         for t in known:
             (f,) = black_box_module.parameters(MODEL, axis, [t])
             assert found.values[f.name] == pytest.approx(shrunk * f.std, rel=1e-6, abs=1e-15)
+
+
+def test_a_black_boxs_widths_stand_beside_the_vehicles_own_numbers(monkeypatch):
+    """A coefficient that shares most of its column with the mass, which stands off its prior's mean."""
+    known = [t for t in TERMS if t.key == "u"]
+    monkeypatch.setattr(black_box_module, "measured_terms", lambda problem: known)
+    size, shared = 0.3, 0.999
+
+    def linearise(box: Problem, fit: Fit) -> Any:
+        free = box.parameters
+        std = np.array([f.std for f in free])
+        names = [f.name for f in free]
+        mean = np.array([f.value for f in free])
+        at = np.array([fit.values[n] for n in names])
+        at[0] = mean[0] + 0.5 * std[0]
+        G = 4e4 * np.eye(len(free))
+        k = names.index("unlisted_Z.u")
+        G[0, k] = G[k, 0] = 4e4 * shared
+        g = np.zeros(len(free))
+        g[k] = -4e4 * (1.0 - shared**2) * size
+        g[0] = -0.5  # where it is fitted, data and prior pull as much
+        none = np.full(len(free), np.inf)
+        q = Quadratic(tuple(names), G / np.outer(std, std), g / std, at, mean, std**-2.0, -none, none,
+                      np.zeros((1, len(free))), np.ones((len(free), 18)))  # fmt: skip
+        return fit.at(dict(zip(names, at.tolist(), strict=True))), [], q
+
+    monkeypatch.setattr(black_box_module, "linearise", linearise)
+    made = problem("gyro_bias")
+    refitted = Fit(("gyro_bias",), {f.name: f.value for f in made.parameters}, NOISE)
+    found = black_box(made, refitted)
+    left = 4e4 - (4e4 * shared) ** 2 / (4e4 + 1.0)  # information beside the mass
+    slope = 4e4 * (1.0 - shared**2) * size
+
+    def evidence(width: float) -> float:
+        return 0.5 * slope**2 / (left + width**-2) - 0.5 * math.log(1.0 + left * width**2)
+
+    width = max(PRIOR_WIDTHS, key=evidence)
+    assert PRIOR_WIDTHS[0] > width > PRIOR_WIDTHS[-1], "neither end"
+    (f,) = black_box_module.parameters(MODEL, "unlisted_Z", known)
+    assert found.values[f.name] == pytest.approx(slope / (left + width**-2) * f.std, rel=1e-6)

@@ -17,6 +17,7 @@ from coax_env.diagnosis import onset
 from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.onset import Changing, _Table, rows_of
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.beginnings import Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
 from coax_env.estimation.engine import Engine
@@ -530,3 +531,73 @@ def test_a_models_cost_is_its_objective_and_occams_factor():
     expected = 80.0 + q.occam(["yaw_damping.coefficient"], ["mass"])
     assert onset._cost(problem, fit, q) == pytest.approx(expected)
     assert onset._cost(problem, replace(fit, active=()), q) == 80.0
+
+
+@pytest.mark.parametrize(
+    ("was_there", "inflation", "expected"),
+    [
+        # beside no change: 60 nats less 5 for its numbers and log(100 s / 2 s) for its moment
+        (True, 1.0, 60.0 - 5.0 - math.log(50.0)),
+        (True, 2.0, 30.0 - 5.0 - math.log(50.0)),
+        # and where it was not there, beside what was always there: 20 nats less the moment's price
+        (False, 1.0, 20.0 - math.log(50.0)),
+        (False, 2.0, 10.0 - math.log(50.0)),
+    ],
+)
+def test_a_change_pays_for_its_numbers_and_for_its_moment(
+    monkeypatch, was_there, inflation, expected
+):
+    """None is worth anything that a gust made, that is small, or where innovations stay coloured."""
+    made = {"lasting": 12.1, "matters": True, "white": True}
+
+    def fitted(problem: Any, fit: Fit, steps: int) -> Fit:
+        same = fit.active == active
+        return replace(fit, objective=160.0 if same else 120.0)
+
+    active = ("gyro_bias",) if was_there else ()
+    monkeypatch.setattr(onset, "fitted", fitted)
+    monkeypatch.setattr(onset, "noise_fitted", lambda problem, fit: fit)
+    monkeypatch.setattr(onset, "_lasting", lambda without, with_it, moment: made["lasting"])
+    monkeypatch.setattr(onset, "_matters", lambda problem, fit, effect: made["matters"])
+    monkeypatch.setattr(onset, "channels_of", lambda *given: ["p"])
+    monkeypatch.setattr(
+        onset, "whiteness", lambda passes, channels: {
+            "p": SimpleNamespace(white=made["white"]), "q": SimpleNamespace(white=False)}
+    )  # fmt: skip
+    t = np.array([3.0, 53.0])
+    engine = SimpleNamespace(
+        records=[SimpleNamespace(t=t), SimpleNamespace(t=t + 9.0)], filter=lambda values, noise: []
+    )
+    names = ["gyro_bias.x", *([of_part("gyro_bias.x", BEFORE)] if was_there else [])]
+    problem = SimpleNamespace(
+        engine=engine, model=SimpleNamespace(channels=("p", "q")), settings=SETTINGS,
+        acting_names=lambda effect: names, free_names=lambda active: ["mass", *names],
+    )  # fmt: skip
+    extra = names[-1:]
+
+    def variance_inflation(own: Any, free: Any) -> float:
+        assert own == extra and set(free) == {"mass", *names}
+        return inflation
+
+    quadratic = SimpleNamespace(
+        variance_inflation=variance_inflation, occam=lambda own, rest: 5.0 if own == extra else 0.0
+    )
+    fit = Fit(active, {"gyro_bias.x": 0.0}, NOISE_OF_ALL, objective=170.0)
+    trial = replace(fit, active=("gyro_bias",), objective=100.0, values=dict.fromkeys(names, 0.01))
+    state = SimpleNamespace(problem=problem, fit=fit)
+    found = onset.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
+
+    def worth() -> float:
+        return onset._worth(state, problem, trial, quadratic, found).nats  # type: ignore[arg-type]
+
+    assert worth() == pytest.approx(expected)
+    state.fit = replace(fit, objective=150.0)  # better without another noise: 50 nats
+    best = min(expected, 50.0 / inflation - 5.0 - math.log(50.0))
+    assert worth() == pytest.approx(best)
+    state.fit = fit
+    for key, wrong in (("lasting", 6.0 * inflation - 0.1), ("matters", False), ("white", False)):
+        kept, made[key] = made[key], wrong
+        assert worth() == -math.inf, key
+        made[key] = kept
+    made["lasting"] = 6.0 * inflation + 0.1
+    assert worth() == pytest.approx(expected)
