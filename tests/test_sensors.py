@@ -103,6 +103,22 @@ def test_an_unbalance_turns_with_the_rotor(azimuth):
     assert not any(value for name, value in change.items() if name not in ("ax", "ay", "az"))
 
 
+def test_each_size_of_a_vibration_shakes_its_own_sensors():
+    """Of a vehicle whose four sizes differ, and of one that has the last alone."""
+    for sizes in (
+        {"amplitude": 0.3, "rate": 0.02, "tilt": 0.004, "heave": 0.006},
+        {"heave": 0.006},
+    ):
+        readings, by_hand = np.zeros(len(CHANNELS)), np.zeros(len(CHANNELS))
+        period.shake(
+            readings, 0.7, load_vehicle("lama400d").with_effect("vibration", **sizes).vector
+        )
+        four = (sizes.get(name, 0.0) for name in ("amplitude", "rate", "tilt", "heave"))
+        add_vibration(by_hand, 0.7, *four)
+        np.testing.assert_allclose(readings, by_hand, rtol=1e-12)
+        assert readings[CHANNELS.index("h")] == pytest.approx(0.006 * math.sin(0.7))
+
+
 def test_a_rotor_turns_by_its_speed_within_a_turn():
     azimuth, whole = 0.0, 0.0
     for _ in range(100):

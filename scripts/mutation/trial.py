@@ -38,6 +38,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/model/actuators.py": _ENV,
     "coax_env/model/generic_terms.py": ("tests/test_unlisted.py", *_MODEL),
     "coax_env/model/sampling.py": _ENV,
+    "coax_env/model/dynamics.py": (*_MODEL, "tests/test_actuator_effects.py"),
     "coax_env/model/*": _MODEL,
     "coax_env/env/fl*": (*_ENV, "tests/test_simd.py"),
     "coax_env/env/simd_loops.py": ("tests/test_simd.py", *_ENV),
