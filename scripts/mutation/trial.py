@@ -181,7 +181,8 @@ class Tree:
         """
         if not tests:
             return ""
-        environment = os.environ | {
+        environment = os.environ | {  # bytecode goes by seconds and bytes: it would outlive a mutation
+            "PYTHONDONTWRITEBYTECODE": "1",
             "PYTHONPATH": str(self.place), "COAX_CACHE_DIR": str(self.cache),
             "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
         }  # fmt: skip
