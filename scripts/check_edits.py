@@ -118,9 +118,7 @@ def timed(planted: tuple[str, float], found: "Changes") -> dict[str, Any]:
     if found.since is None:
         return {"since": None, "in_time": False}
     run, t = planted
-    half = (
-        math.sqrt(3.0) * found.since.std + 1e-9
-    )  # of the interval, in each part of which it may lie
+    half = math.sqrt(3.0) * found.since.std + 1e-9  # width of an even spread of that std
     right = found.since.moment.run == run and abs(found.since.t - t) <= half
     return {"since": found.since.entry(), "in_time": right}
 
