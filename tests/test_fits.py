@@ -52,7 +52,9 @@ def latent(seen: dict[str, Any], fit: Fit) -> Fit | None:
         noise_score=lambda values, noise: None,
         log_likelihood=lambda values, noise: seen["nats"] if "fitted" in noise.process else 0.0,
     )
-    problem = SimpleNamespace(engine=engine, settings=SETTINGS, report=lambda text: None)
+    problem = SimpleNamespace(
+        engine=engine, settings=SETTINGS, report=lambda text: None, noise_fit_seconds=60.0
+    )
     return fits.with_latent_noise(problem, fit)
 
 
@@ -163,6 +165,7 @@ def test_evidence_is_what_a_refit_without_it_loses_over_the_inflation(
         settings=SETTINGS, file_values=lambda effect: {},
         for_each=lambda work, of: {e: work(e) for e in of},
     )  # fmt: skip
-    (found,) = evidence.weigh(problem, Fit(("wind",), {}, noise(), objective=1000.0), None).values()
+    weighed = evidence.weigh(problem, Fit(("wind",), {}, noise(), objective=1000.0), None, ("wind",))
+    found = weighed["wind"].evidence
     assert found.lost == lost - close
     assert found.nats == pytest.approx((lost - close) / factor)
