@@ -8,7 +8,7 @@ half of it back. `rate_damping` was worth 44 and 50 nats so on clean synthetic f
 where, alone, it was worth less than nothing.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, without
@@ -65,7 +65,7 @@ def weigh(
 
 
 def prune(
-    problem: Problem, fit: Fit, clear: bool = True
+    problem: Problem, fit: Fit, clear: Collection[str] = ()
 ) -> tuple[Fit, Quadratic, dict[str, Evidence]]:
     """Remove, one at a time, causes whose evidence is gone once the noise levels are fitted too.
 
@@ -73,7 +73,7 @@ def prune(
 
     Args:
         problem, fit: what may be free, and where.
-        clear: whether those are weighed at all.
+        clear: known to be, and not weighed unless the quadratic doubts them.
 
     Returns:
         the refined fit, the quadratic at it, and the evidence of what is left and was weighed.
@@ -82,7 +82,7 @@ def prune(
         fit = refined(problem, converged(problem, fit))
         fit, _, quadratic = linearise(problem, fit)
         doubtful = [e for e in fit.active if _is_doubtful(problem, fit, quadratic, e)]
-        rest = [e for e in fit.active if e not in doubtful] if clear else []
+        rest = [e for e in fit.active if e not in doubtful and e not in clear]
         removals: dict[str, Removal] = {}
         for which in (doubtful, rest):
             removals |= weigh(problem, fit, quadratic, which)
@@ -101,28 +101,37 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         problem, fit: after the search, without such gains.
 
     Returns:
-        the problem, with the gains where they are worth it and innovations white, and what `prune` has
-        of it.
+        the problem, with the gains where they are worth it and innovations white, what `prune` has of
+        it, and the lesser evidence of the two.
     """
     while True:
         wider, trial = with_command_gains(problem, fit)
-        if not fit.active:
-            return wider, *prune(wider, trial)
         stated = has_command_gains(wider)
         if not stated:  # colour spoils them for a model, not for the question
             wider, trial = with_command_gains(problem, fit, coloured=True)
-        asked = has_command_gains(wider)
-        joint = prune(wider, trial, clear=stated or not asked)
-        standing = joint[0].active
-        if not asked or (stated and not standing):
-            return wider, *joint
-        for effect in set(fit.active) - set(standing):
-            off = problem.off_values(effect) | problem.file_values(effect)
-            fit = replace(fit.at(off), active=fit.rest(effect))
-        alone = prune(problem, fit, clear=not stated)
-        fit = alone[0]
-        if fit.active == standing:
-            return (wider, *joint) if stated else (problem, *alone)
+        joint, alone = (wider, trial), (problem, fit)
+        (first, start), (second, again) = (joint, alone) if stated else (alone, joint)
+        pruned, quadratic, evidence = prune(first, start)
+        if not has_command_gains(wider) or not pruned.active:
+            return first, pruned, quadratic, evidence
+        enough = problem.settings.clear_evidence * problem.settings.evidence
+        clear = [e for e in pruned.active if evidence[e].nats >= enough]
+        asked, _, other = prune(second, _only(second, again, pruned.active), clear)
+        if asked.active == pruned.active:
+            lesser = {
+                e: min(x, other.get(e, x), key=lambda worth: worth.nats)
+                for e, x in evidence.items()
+            }
+            return first, pruned, quadratic, lesser
+        fit = _only(problem, fit, asked.active)
+
+
+def _only(problem: Problem, fit: Fit, causes: Collection[str]) -> Fit:
+    """The fit with all other causes off."""
+    for effect in set(fit.active) - set(causes):
+        off = problem.off_values(effect) | problem.file_values(effect)
+        fit = replace(fit.at(off), active=fit.rest(effect))
+    return fit
 
 
 def _is_doubtful(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:
