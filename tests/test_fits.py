@@ -165,7 +165,9 @@ def test_evidence_is_what_a_refit_without_it_loses_over_the_inflation(
         settings=SETTINGS, file_values=lambda effect: {},
         for_each=lambda work, of: {e: work(e) for e in of},
     )  # fmt: skip
-    weighed = evidence.weigh(problem, Fit(("wind",), {}, noise(), objective=1000.0), None, ("wind",))
+    weighed = evidence.weigh(
+        problem, Fit(("wind",), {}, noise(), objective=1000.0), None, ("wind",)
+    )
     found = weighed["wind"].evidence
     assert found.lost == lost - close
     assert found.nats == pytest.approx((lost - close) / factor)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from coax_env.errors import InputError
+from coax_env.logs.clipped import clipped
 from coax_env.logs.columns import advice, time_advice
 from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
 from coax_env.logs.held import interpolated, repeats
@@ -70,6 +71,7 @@ def repaired(
         counts["rows with a repeated time stamp merged"] += repeated
     data = _without_blank_rows(data, counts)
     data = _without_broken_packets(data, counts)
+    data = _without_clipped(data, counts)
     data = _without_repeats(data, holds or {}, counts)
     t = data["t"]
     measured = _without_outliers(data, noise, counts)
@@ -194,6 +196,18 @@ def _without_broken_packets(
     return {
         c: values if c == "t" else np.where(broken, np.nan, values) for c, values in data.items()
     }
+
+
+def _without_clipped(
+    data: Mapping[str, np.ndarray], counts: Counter[str]
+) -> Mapping[str, np.ndarray]:
+    """With holes where a sensor reads an end of its range."""
+    found = dict(data)
+    for channel in CHANNELS:
+        if channel in data and (ends := clipped(data[channel])).any():
+            counts[f"readings of {channel} at an end of its range, left out"] += int(ends.sum())
+            found[channel] = np.where(ends, np.nan, data[channel])
+    return found
 
 
 def _without_repeats(

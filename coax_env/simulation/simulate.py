@@ -7,6 +7,7 @@ import numpy as np
 
 from coax_env.env import period
 from coax_env.errors import InputError
+from coax_env.logs.clipped import clipped
 from coax_env.logs.flight import Flight, Run
 from coax_env.logs.repairs import SHORTEST_RUN
 from coax_env.model import dynamics
@@ -293,12 +294,13 @@ def _seeds(seed: int, runs: int) -> list[list[np.random.SeedSequence]]:
 
 
 def _log_run(track: Track, suite: Sequence[Sensor], rng: np.random.Generator) -> Run:
-    """What the sensors of a suite write down of a track."""
+    """What the sensors of a suite write down of a track, and a reader of it takes for readings."""
+    measured = log_readings(track.readings, track.t, tuple(suite), rng)
     return Run(
         name=track.maneuver.name,
         t=track.t,
         command=track.command,
-        measured=log_readings(track.readings, track.t, tuple(suite), rng),
+        measured={c: np.where(clipped(y), np.nan, y) for c, y in measured.items()},
         maneuver=track.maneuver.name,
         note=track.ended,
     )

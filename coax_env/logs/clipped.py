@@ -1,0 +1,59 @@
+"""Readings at the end of a sensor's range: they say "at least so much", and are not readings of it.
+
+Taken for readings they pull the filter there: a gyro of 500 deg/s that clips in 56 of 1601 rows cost a
+synthetic flight 5,000 nats, and made three causes that were not there.
+"""
+
+import numpy as np
+
+from coax_env.logs.packets import stretches
+
+FEWEST = 3
+"""Equal readings in a row, at the largest or least value of a run, that are no chance; ours."""
+MOST_REPEATED = 0.05
+"""Share of readings elsewhere that are equal to the one before, up to which a channel never repeats by
+chance: a coarse sensor does; ours."""
+LEAST_STEP = 0.5
+"""Usual steps by which one of the two readings before, and of the two behind, is off the end; ours."""
+MOST = 0.5
+"""Share of the readings that may be at the ends: what shows little else moves between them; ours."""
+
+
+def clipped(values: np.ndarray) -> np.ndarray:
+    """Where a channel reads an end of its range, (n,) bool.
+
+    An end shows as a level stretch at the largest or least value that is entered and left abruptly: a
+    machine at rest leaves its place slowly.
+
+    Args:
+        values: (n,) readings, NaN where there is none.
+    """
+    found = np.zeros(values.size, bool)
+    present = np.flatnonzero(~np.isnan(values))
+    y = values[present]
+    if y.size < 2 * FEWEST:
+        return found
+    ends = (y.max(), y.min())
+    steps = np.abs(np.diff(y))
+    inside = steps[~np.isin(y[1:], ends) | (steps > 0.0)]
+    if not inside.size or np.mean(inside == 0.0) > MOST_REPEATED:
+        return found
+    abrupt = LEAST_STEP * float(np.median(inside))
+    real = [end for end in ends if _is_reached(y, end, abrupt)]
+    at_end = np.isin(y, [*real, *np.negative(real)])
+    if np.mean(at_end) <= MOST:
+        found[present] = at_end
+    return found
+
+
+def _is_reached(y: np.ndarray, end: float, abrupt: float) -> bool:
+    """Whether readings stay at a value for a while, entered and left by such steps at least."""
+    off = np.abs(y - end)
+    return any(
+        first > 0
+        and behind < y.size
+        and behind - first >= FEWEST
+        and off[max(first - 2, 0) : first].max() >= abrupt
+        and off[behind : behind + 2].max() >= abrupt
+        for first, behind in stretches(y == end)
+    )
