@@ -19,7 +19,7 @@ def main() -> None:
     options = arguments()
     make_folder(options.out)
     wanted = [
-        pairs.planned(changed, n, options.seed)
+        pairs.planned(changed, n, options.seed, options.whole)
         for changed, count in ((False, options.same), (True, options.changed))
         for n in range(count)
     ]
@@ -68,6 +68,10 @@ def arguments() -> argparse.Namespace:
     parser.set_defaults(out=Path("runs/study_changes"))
     parser.add_argument("--same", type=int, default=100, help="pairs of one and the same machine")
     parser.add_argument("--changed", type=int, default=100, help="pairs with one change")
+    parser.add_argument(
+        "--whole", action="store_true",
+        help="fly pairs of twelve whole runs each, instead of four of 8 s",
+    )  # fmt: skip
     parser.add_argument(
         "--onsets", type=int, default=0, metavar="N",
         help="flights in which something begins, and as many constant and clean ones",

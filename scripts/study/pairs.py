@@ -21,7 +21,7 @@ from study.plan import sizes_of
 
 RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
 LONGEST = 8.0
-"""s of each run: 32 s a flight, for time."""
+"""s of each run: 32 s a flight, for time; `whole` pairs fly all the injector's runs, to their ends."""
 CHANGES = (
     "added_mass", "thrust_scale", "swash_offset", "motor_lag", "servo_lag", "cg_offset",
     "swash_gain", "torque_balance", "gyro_bias", "accel_bias", "attitude_bias", "swash_phase",
@@ -46,6 +46,7 @@ class Pair:
 
     change: effect -> parameter -> size in the second flight beside the first; empty: the same machine.
     airs: gusts of each; densities [kg/m3]; pilots; faster: the second's rotor speed per command.
+    whole: whether each flight is as long as a labelled one.
     """
 
     number: int
@@ -56,14 +57,16 @@ class Pair:
     pilots: tuple[str, str]
     faster: float
     seed: int
+    whole: bool = False
 
     @property
     def name(self) -> str:
         """Of the file that it is stored in."""
-        return f"{'changed' if self.change else 'same'}-{self.number:04d}"
+        kind = "changed" if self.change else "same"
+        return f"{kind}-{self.number:04d}{'-whole' * self.whole}"
 
 
-def planned(changed: bool, number: int, seed: int) -> Pair:
+def planned(changed: bool, number: int, seed: int, whole: bool = False) -> Pair:
     """A pair, drawn from the study's seed, its kind and its number alone."""
     rng = np.random.default_rng([seed, int(changed), number])
     faults = FAULTS[number % len(FAULTS)]
@@ -86,6 +89,7 @@ def planned(changed: bool, number: int, seed: int) -> Pair:
         (pilots[0], pilots[1]),
         faster,
         int(rng.integers(2**31)),
+        whole,
     )
 
 
@@ -114,9 +118,9 @@ def fly(pair: Pair, folder: Path) -> tuple[Path, Path]:
             air["memory"] = tuple(air["memory"])
         density = pair.densities[k]
         injector.fly(
-            folder / name, effects, gusts=Air(**air), seed=pair.seed + k, runs=RUNS,
+            folder / name, effects, gusts=Air(**air), seed=pair.seed + k,
+            runs=None if pair.whole else RUNS, longest=math.inf if pair.whole else LONGEST,
             craft=LAMA._replace(density=density), known_as=LAMA, pilot=pair.pilots[k],
-            longest=LONGEST,
         )  # fmt: skip
         card = folder / name / "card.toml"
         text = card.read_text()
