@@ -244,21 +244,49 @@ def test_what_changes_has_numbers_before_and_what_begins_has_none(short):
 # --- hidden by other code ---------------------------------------------------------------------------
 
 
-def test_the_injector_changes_nothing_before_its_moment(tmp_path):
-    def log(name, **later):
-        folder = injector.fly(tmp_path / name, {}, gusts=True, seed=5, runs=RUNS[:3], longest=6.0,
-                              **later)  # fmt: skip
-        return [list(csv.DictReader((folder / f"{run}.csv").open())) for run in RUNS[:3]]
+def biased(folder, effects, **later):
+    """Logs with a gyro's bias, which the flight does not feel, in three runs of 6 s."""
+    injector.fly(folder, effects, gusts=True, seed=5, runs=RUNS[:3], longest=6.0, **later)
+    return [list(csv.DictReader((folder / f"{run}.csv").open())) for run in RUNS[:3]]
 
-    plain = log("plain")
-    changed = log("changed", later={"gyro_bias": {"x": 0.03}}, since=(RUNS[1], 2.5))
-    for run, moment in ((0, 99.0), (1, 2.5), (2, -1.0)):
-        for a, b in zip(plain[run], changed[run], strict=True):
+
+@pytest.fixture(scope="module")
+def unbiased(tmp_path_factory):
+    return biased(tmp_path_factory.mktemp("plain"), {})
+
+
+@pytest.mark.parametrize(
+    ("early", "late", "growing"), [(0.0, 0.03, 0.0), (0.03, 0.0, 0.0), (0.0, 0.03, 6.0)],
+    ids=["begins", "ends", "grows"],
+)  # fmt: skip
+def test_the_injector_changes_nothing_but_from_its_moment_on(
+    tmp_path, unbiased, early, late, growing
+):
+    changed = biased(tmp_path, {"gyro_bias": {"x": early}}, later={"gyro_bias": {"x": late}},
+                     since=(RUNS[1], 2.5), growing=growing)  # fmt: skip
+    for run in range(3):
+        for a, b in zip(unbiased[run], changed[run], strict=True):
             rest = {c: v for c, v in a.items() if c != "p"}
             assert {c: b[c] for c in rest} == rest
+            past = 6.0 * (run - 1) + float(a["t"]) - 2.5
+            share = min(max(past / growing, 0.0), 1.0) if growing else float(past >= -1e-9)
             if a["p"]:
                 jump = float(b["p"]) - float(a["p"])
-                assert jump == pytest.approx(0.03 if float(a["t"]) >= moment else 0.0, abs=1e-5)
+                assert jump == pytest.approx(early + share * (late - early), abs=2e-5)
+
+
+def test_what_grows_is_flown_with_every_size_between():
+    """All fields alike; before the log begins as at its first row."""
+    some = {"swash_lon": 0.02, "cg_x": -1e-3, "per_volt": 0.04}
+    early = injector.Hidden(swash_lon=0.01)
+    late = injector.Hidden(**{name: x for name, x in some.items() if name in early._fields})
+    middle = injector._between(early, late, 0.25)
+    expected = [a + 0.25 * (b - a) for a, b in zip(early, late, strict=True)]
+    assert list(middle) == pytest.approx(expected)
+    t = np.array([-2.0, 0.0, 1.0, 4.0, 9.0])
+    grown = injector.Course(early, late, -1.0, 4.0).shares(t)
+    assert grown.tolist() == [0.25, 0.25, 0.5, 1.0, 1.0]
+    assert injector.Course(early, late, 4.0).shares(t).tolist() == [0.0, 0.0, 0.0, 1.0, 1.0]
 
 
 @pytest.mark.slow
@@ -298,6 +326,21 @@ def test_what_stands_in_its_place_is_not_named(tmp_path, later):
     assert cause["effect"] in later
     assert cause["since"]["run"] == "lat_3211"
     assert abs(cause["since"]["t"] - 4.0) <= max(3.0 * cause["since"]["std"], 0.05)
+
+
+@pytest.mark.slow
+def test_what_ends_in_flight_is_named_with_its_moment(tmp_path):
+    """Its numbers are those at last, none; before it, what was hidden."""
+    hidden = {"swash_offset": {"lon": -0.02, "lat": 0.015}}
+    injector.fly(tmp_path, hidden, gusts=False, seed=31, runs=RUNS, longest=9.0,
+                 later={"swash_offset": {"lon": 0.0, "lat": 0.0}}, since=("lat_3211", 6.0))  # fmt: skip
+    (cause,) = diagnose(tmp_path, hold_out=[]).findings["causes"]
+    assert cause["effect"] == "swash_offset" and cause["since"]["run"] == "lat_3211"
+    assert abs(cause["since"]["t"] - 6.0) <= max(3.0 * cause["since"]["std"], 0.05)
+    for name, size in hidden["swash_offset"].items():
+        full = f"swash_offset.{name}"
+        assert cause["before"][full]["value"] == pytest.approx(size, abs=0.005)
+        assert cause["parameters"][full]["value"] == pytest.approx(0.0, abs=0.005)
 
 
 @pytest.mark.slow
@@ -533,37 +576,8 @@ def test_a_models_cost_is_its_objective_and_occams_factor():
     assert onset._cost(problem, replace(fit, active=()), q) == 80.0
 
 
-@pytest.mark.parametrize(
-    ("was_there", "inflation", "expected"),
-    [
-        # beside no change: 60 nats less 5 for its numbers and log(100 s / 2 s) for its moment
-        (True, 1.0, 60.0 - 5.0 - math.log(50.0)),
-        (True, 2.0, 30.0 - 5.0 - math.log(50.0)),
-        # and where it was not there, beside what was always there: 20 nats less the moment's price
-        (False, 1.0, 20.0 - math.log(50.0)),
-        (False, 2.0, 10.0 - math.log(50.0)),
-    ],
-)
-def test_a_change_pays_for_its_numbers_and_for_its_moment(
-    monkeypatch, was_there, inflation, expected
-):
-    """None is worth anything that a gust made, that is small, or where innovations stay coloured."""
-    made = {"lasting": 12.1, "matters": True, "white": True}
-
-    def fitted(problem: Any, fit: Fit, steps: int) -> Fit:
-        same = fit.active == active
-        return replace(fit, objective=160.0 if same else 120.0)
-
-    active = ("gyro_bias",) if was_there else ()
-    monkeypatch.setattr(onset, "fitted", fitted)
-    monkeypatch.setattr(onset, "noise_fitted", lambda problem, fit: fit)
-    monkeypatch.setattr(onset, "_lasting", lambda without, with_it, moment: made["lasting"])
-    monkeypatch.setattr(onset, "_matters", lambda problem, fit, effect: made["matters"])
-    monkeypatch.setattr(onset, "channels_of", lambda *given: ["p"])
-    monkeypatch.setattr(
-        onset, "whiteness", lambda passes, channels: {
-            "p": SimpleNamespace(white=made["white"]), "q": SimpleNamespace(white=False)}
-    )  # fmt: skip
+def weighed(was_there: bool, inflation: float):
+    """A change of 100 nats in 100 s, its state at 170: what `_worth` takes, but for the rivals."""
     t = np.array([3.0, 53.0])
     engine = SimpleNamespace(
         records=[SimpleNamespace(t=t), SimpleNamespace(t=t + 9.0)], filter=lambda values, noise: []
@@ -582,22 +596,84 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(
     quadratic = SimpleNamespace(
         variance_inflation=variance_inflation, occam=lambda own, rest: 5.0 if own == extra else 0.0
     )
+    active = ("gyro_bias",) if was_there else ()
     fit = Fit(active, {"gyro_bias.x": 0.0}, NOISE_OF_ALL, objective=170.0)
     trial = replace(fit, active=("gyro_bias",), objective=100.0, values=dict.fromkeys(names, 0.01))
-    state = SimpleNamespace(problem=problem, fit=fit)
+    return SimpleNamespace(problem=problem, fit=fit), problem, trial, quadratic
+
+
+@pytest.mark.parametrize("was_there", [True, False])
+@pytest.mark.parametrize("inflation", [1.0, 2.0])
+def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, was_there, inflation):
+    """Beside no change; and beside a cause that was always there it must be worth a tie, the moment
+    paid for. None is worth anything that a gust made, that is small, or where channels stay coloured.
+    """
+    made = {"lasting": 12.1, "matters": True, "white": True}
+    monkeypatch.setattr(onset, "_lasting", lambda without, with_it, moment: made["lasting"])
+    monkeypatch.setattr(onset, "_matters", lambda problem, fit, effect: made["matters"])
+    monkeypatch.setattr(onset, "channels_of", lambda *given: ["p"])
+    monkeypatch.setattr(
+        onset, "whiteness", lambda passes, channels: {
+            "p": SimpleNamespace(white=made["white"]), "q": SimpleNamespace(white=False)}
+    )  # fmt: skip
+    state, problem, trial, quadratic = weighed(was_there, inflation)
     found = onset.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
+    of_moment = math.log(100.0 / 2.0)
 
-    def worth() -> float:
-        return onset._worth(state, problem, trial, quadratic, found).nats  # type: ignore[arg-type]
+    def worth(always: float = 900.0, same: float = 160.0) -> float:
+        rivals = onset.Rivals(
+            replace(state.fit, objective=same),
+            None if was_there else replace(trial, objective=always),
+        )
+        return onset._worth(state, problem, trial, rivals, quadratic, found).nats  # type: ignore[arg-type]
 
+    expected = 60.0 / inflation - 5.0 - of_moment
     assert worth() == pytest.approx(expected)
-    state.fit = replace(fit, objective=150.0)  # better without another noise: 50 nats
-    best = min(expected, 50.0 / inflation - 5.0 - math.log(50.0))
-    assert worth() == pytest.approx(best)
-    state.fit = fit
+    tie = 100.0 + inflation * (SETTINGS.tie + of_moment)
+    if was_there:
+        assert worth(same=tie + 5.0 * inflation - 0.1) == -math.inf
+        assert worth(same=tie + 5.0 * inflation + 0.1) == pytest.approx(6.0 + 0.1 / inflation)
+    else:
+        assert worth(always=tie - 0.1) == -math.inf
+        assert worth(always=tie + 0.1) == pytest.approx(expected)
     for key, wrong in (("lasting", 6.0 * inflation - 0.1), ("matters", False), ("white", False)):
         kept, made[key] = made[key], wrong
         assert worth() == -math.inf, key
         made[key] = kept
     made["lasting"] = 6.0 * inflation + 0.1
     assert worth() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("same", "was_there", "closer"),
+    [(900.0, True, False), (130.0, True, True), (99.0, True, False), (900.0, False, True)],
+)
+def test_what_may_decide_is_refitted_until_nothing_is_gained(monkeypatch, same, was_there, closer):
+    """The change as well as what it is beside: 100 nats; a cause always there 131."""
+    state, problem, trial, _ = weighed(was_there, 1.0)
+    state.fit = replace(state.fit, objective=1000.0)
+
+    def fitted(of: Any, fit: Fit, steps: int) -> Fit:
+        assert of is state.problem and fit.noise is trial.noise
+        begun = not was_there and fit.active == trial.active
+        assert not begun or fit.values["gyro_bias.x"] == 0.01
+        return replace(fit, objective=131.0 if begun else same)
+
+    monkeypatch.setattr(onset, "fitted", fitted)
+    monkeypatch.setattr(onset, "noise_fitted", lambda of, fit: fit)
+    monkeypatch.setattr(
+        onset, "converged", lambda of, fit: replace(fit, objective=fit.objective - 7.0)
+    )
+    after, rivals = onset._compared(state, problem, trial, "gyro_bias")
+    less = 7.0 if closer else 0.0
+    assert after.objective == 100.0 - less and rivals.same.objective == same - less
+    assert (rivals.always is None) == was_there
+    assert was_there or rivals.always.objective == 131.0 - less
+    state.fit = replace(state.fit, objective=90.0)  # better without another noise
+    assert onset._compared(state, problem, trial, "gyro_bias")[1].same is state.fit
+
+
+def test_a_cause_that_stands_may_change_for_less_than_a_name():
+    state, *_ = weighed(True, 1.0)
+    assert onset._least(state, "gyro_bias") == SETTINGS.tie
+    assert onset._least(state, "servo_lag") == SETTINGS.evidence

@@ -4,15 +4,16 @@ A change at every moment is scored at once, at the gains of the filter without i
 likelihood ratio; Willsky and Jones 1976; Basseville and Nikiforov 1993, ch. 7; beginnings.py).
 What stands out is fitted, noise levels too, at the moment that the likelihood itself prefers, and must
 pay: for its numbers by their Occam factor, and for its moment, which could have been any, by the share
-of the flown time that the data leave for it. A cause that was always there is preferred to one that
-pays less than the evidence of a name; so is none. A gust that is over within a second is no change.
+of the flown time that the data leave for it. No change is preferred to one that pays less than the
+evidence of a name, a cause that was always there to one that pays less than a tie beside it. A gust
+that is over within a second is no change.
 
 Changes last to the end of the last run: the machine is what it is then. Where one is found, causes are
 searched for again beside it: without it, others may have stood in its place.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -22,7 +23,7 @@ from scipy.special import logsumexp
 
 from coax_env.diagnosis.confounding import alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
-from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, without_drifts
+from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, without_drifts
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.search import search
 from coax_env.estimation.beginnings import Beginning
@@ -59,6 +60,9 @@ FADED = 10.0
 """nats under the best moment's from which on another has no share in the interval; ours."""
 SMOOTH = 0.5
 """nats by which two moments may differ for a line between them to do; ours."""
+CLEAR = 3.0
+"""Thresholds by which a change is likelier than a model without it, to need no closer fit of that: a
+name's, what numbers and moment cost, and what a close fit finds; ours."""
 OVER = (0.5, 1.5)
 """s before and after a moment in which a gust may have made the evidence; ours."""
 
@@ -313,9 +317,15 @@ def _next(state: Changing, runs: Sequence[str]) -> tuple[Changing, Onset] | None
             continue
         onset = trial[1]
         state.problem.report(f"{onset.effect} since {onset.t:.2f} s: {onset.nats:.1f} nats, fitted")
-        if onset.nats > (best[1].nats if best else chosen.evidence):
+        if onset.nats > (best[1].nats if best else _least(state, onset.effect)):
             best = trial
     return best
+
+
+def _least(state: Changing, effect: str) -> float:
+    """nats that a change is worth at least: as a name, or beside one that stands already, a tie."""
+    chosen = state.problem.settings
+    return chosen.tie if effect in state.fit.active else chosen.evidence
 
 
 def beginning(
@@ -355,8 +365,9 @@ def _fitted(
     trial = fitted(problem, noise_fitted(problem, trial), steps=2)
     problem, found = _moved(problem, trial, effect, runs)
     trial = _with_noise_of(problem, trial, state.fit)
+    trial, rivals = _compared(state, problem, trial, effect)
     trial, _, quadratic = linearise(problem, trial)
-    onset = _worth(state, problem, trial, quadratic, found)
+    onset = _worth(state, problem, trial, rivals, quadratic, found)
     return Changing(problem, trial, quadratic, {**state.onsets, effect: onset}), onset
 
 
@@ -376,37 +387,77 @@ def _with_noise_of(problem: Problem, trial: Fit, fit: Fit) -> Fit:
     return other if other.objective < trial.objective else trial
 
 
+@dataclass(frozen=True)
+class Rivals:
+    """Models without a change. same: with what there was. always: with the effect always there; None
+    where it was.
+    """
+
+    same: Fit
+    always: Fit | None
+
+    def nearest(self) -> float:
+        """The lesser objective [nats]."""
+        return min(fit.objective for fit in (self.same, self.always) if fit is not None)
+
+    def by(self, work: Callable[[Fit], Fit]) -> "Rivals":
+        """Something done to both."""
+        return Rivals(work(self.same), self.always and work(self.always))
+
+
+def _compared(state: Changing, problem: Problem, trial: Fit, effect: str) -> tuple[Fit, Rivals]:
+    """A change and its rivals, refitted with noise levels of their own: until nothing is gained where
+    their difference may decide. One that had not converged would lose by it, or its rival.
+    """
+    always = None
+    if effect not in state.fit.active:
+        own = {n: trial.values[n] for n in _extra(problem, effect)}
+        always = replace(state.fit.at(own), active=trial.active, noise=trial.noise)
+
+    def refitted(fit: Fit) -> Fit:
+        return fitted(state.problem, noise_fitted(state.problem, fit), steps=2)
+
+    rivals = Rivals(replace(state.fit, noise=trial.noise), always).by(refitted)
+    if state.fit.objective < rivals.same.objective:
+        rivals = replace(rivals, same=state.fit)
+    if 0.0 < rivals.nearest() - trial.objective < CLEAR * problem.settings.evidence:
+        trial = converged(problem, trial)
+        rivals = rivals.by(lambda fit: converged(state.problem, fit))
+    return trial, rivals
+
+
 def _worth(
-    state: Changing, problem: Problem, trial: Fit, quadratic: Quadratic, found: Onset
+    state: Changing,
+    problem: Problem,
+    trial: Fit,
+    rivals: Rivals,
+    quadratic: Quadratic,
+    found: Onset,
 ) -> Onset:
     """An onset with its evidence: beside no change, its numbers and its moment paid for.
 
-    Minus infinity where a gust could have made it, where it is too small to matter, and where the
-    channels that show it stay coloured: a model that is wrong there always finds a moment.
+    Minus infinity where it is within a tie of a cause that was always there, where a gust could have
+    made it, where it is too small to matter, and where the channels that show it stay coloured: a model
+    that is wrong there always finds a moment.
     """
-    effect = found.effect
-    same = replace(state.fit, noise=trial.noise)
-    same = fitted(state.problem, noise_fitted(state.problem, same), steps=2)
-    if state.fit.objective < same.objective:
-        same = state.fit
+    effect, same = found.effect, rivals.same
     extra = _extra(problem, effect)
     others = [n for n in problem.free_names(trial.active) if n not in extra]
     inflation = quadratic.variance_inflation(extra, [*others, *extra])
-    price = quadratic.occam(extra, others) + math.log(_seconds(problem) / found.width)
-    nats = (same.objective - trial.objective) / inflation - price
-    if effect not in state.fit.active:  # one that was always there is preferred
-        own = {n: trial.values[n] for n in extra}
-        always = replace(state.fit.at(own), active=trial.active, noise=trial.noise)
-        always = fitted(state.problem, noise_fitted(state.problem, always), steps=2)
-        gained = (always.objective - trial.objective) / inflation
-        nats = min(nats, gained - math.log(_seconds(problem) / found.width))
+    of_moment = math.log(_seconds(problem) / found.width)
+    nats = (
+        (same.objective - trial.objective) / inflation - quadratic.occam(extra, others) - of_moment
+    )
+    beside_constant = nats
+    if rivals.always is not None:
+        beside_constant = (rivals.always.objective - trial.objective) / inflation - of_moment
     without = state.problem.engine.filter(same.values, trial.noise)
     with_it = problem.engine.filter(trial.values, trial.noise)
     lasting = _lasting(without, with_it, found.moment) / inflation
     white = whiteness(with_it, problem.model.channels)
     shows = channels_of(problem, trial, quadratic, effect)
     if (
-        lasting < problem.settings.tie
+        min(lasting, beside_constant) < problem.settings.tie
         or not _matters(problem, trial, effect)
         or any(c in white and not white[c].white for c in shows)
     ):
