@@ -144,9 +144,10 @@ def test_a_changes_worth_is_what_the_joint_quadratic_gains(least):
     table = _Table(
         quadratic, [np.zeros((5, 5))], [np.zeros(5)], np.array(rest), np.linalg.inv(alone), pull,
         [np.array(own)], [np.zeros(2)], (np.array([3, 3, 4, 4]), np.array([3, 4, 3, 4])),
+        np.array([0, 2, 1, 3]),
     )  # fmt: skip
     row = table.row_of(Beginning(0, 7, begins @ e, begins @ always.T, begins @ begins.T))
-    (nats,), (move,) = table.worth(0, *(np.array([part]) for part in row))
+    (nats,), (move,) = table.worth(0, *(np.array([part]) for part in row[:2]))
     gained = 0.5 * (h @ np.linalg.solve(H, h) - pull @ np.linalg.solve(alone, pull))
     occam = 0.5 * (np.linalg.slogdet(H)[1] - np.linalg.slogdet(alone)[1] - 2.0 * np.log(0.7))
     if np.isinf(least):
@@ -395,10 +396,11 @@ def table(at: dict[str, float], slope: np.ndarray):
     return found, quadratic, std
 
 
-def worths(found: _Table, there: Beginning) -> list[tuple[float, np.ndarray]]:
-    """What a change of each effect there is worth, and how its numbers move."""
+def worths(found: _Table, there: Beginning, ends: bool = False) -> list[tuple[float, np.ndarray]]:
+    """What a change of each effect there is worth, or its end, and how its numbers move."""
     rows = [np.array([part]) for part in found.row_of(there)]
-    return [(nats[0], moves[0]) for nats, moves in (found.worth(k, *rows) for k in range(2))]
+    of_form = found.ended(*rows) if ends else rows[:2]
+    return [(nats[0], moves[0]) for nats, moves in (found.worth(k, *of_form) for k in range(2))]
 
 
 NOISE_OF_ALL = Noise({})
@@ -414,22 +416,27 @@ def log_evidence(G, g, precision, away) -> float:
     return float(0.5 * pull @ np.linalg.solve(G + P, pull) + 0.5 * logs)
 
 
+@pytest.mark.parametrize("ends", [False, True])
 @pytest.mark.parametrize("row", [0, 1])
-def test_a_changes_score_is_the_log_of_the_ratio_of_two_evidences(row):
-    """A change in the second run acts on a part of it and on all of the third; all else on all runs."""
+def test_a_changes_score_is_the_log_of_the_ratio_of_two_evidences(row, ends):
+    """What begins in the second run acts on a part of it and on all of the third; what ends there on
+    the first and on the rest of the second; all else on all runs.
+    """
     found, q, _ = table({"mass": 0.3}, SLOPES)
     parts = q.parts
     assert parts is not None
     share = (0.7, 0.2)[row]
     here = Beginning(1, 10, share * parts.slope[1], share * parts.information[1],
                      share * parts.information[1])  # fmt: skip
-    for (nats, x), names in zip(worths(found, here), (NAMES[1:4], NAMES[4:]), strict=True):
+    acts = np.array([1.0, 1.0 - share, 0.0] if ends else [0.0, share, 1.0])
+    information = np.einsum("r,rij->ij", acts, parts.information)
+    slope = acts @ parts.slope
+    both = zip(worths(found, here, ends), (NAMES[1:4], NAMES[4:]), strict=True)
+    for (nats, x), names in both:
         c = q.index(names)
-        later_G = (here.own + parts.information[2])[np.ix_(c, c)]
-        later_g = (here.slope + parts.slope[2])[c]
-        across = (here.across + parts.information[2])[np.ix_(c, [0])]
-        G = np.block([[q.G[:1, :1], across.T], [across, later_G]])
-        g = np.concatenate([q.g[:1], later_g])
+        across = information[np.ix_(c, [0])]
+        G = np.block([[q.G[:1, :1], across.T], [across, information[np.ix_(c, c)]]])
+        g = np.concatenate([q.g[:1], slope[c]])
         precision = np.concatenate([q.precision[:1], q.precision[c]])
         away = np.concatenate([(q.at - q.mean)[:1], np.zeros(len(c))])
         alone = log_evidence(q.G[:1, :1], q.g[:1], q.precision[:1], away[:1])
@@ -576,35 +583,40 @@ def test_a_models_cost_is_its_objective_and_occams_factor():
     assert onset._cost(problem, replace(fit, active=()), q) == 80.0
 
 
-def weighed(was_there: bool, inflation: float):
-    """A change of 100 nats in 100 s, its state at 170: what `_worth` takes, but for the rivals."""
+def weighed(form: str, inflation: float):
+    """A change of 100 nats in 100 s, its state at 170: what `_worth` takes, but for the rivals.
+
+    Of what was there and changes, of what begins, or of what ends; Occam's factor 5 nats a number.
+    """
     t = np.array([3.0, 53.0])
     engine = SimpleNamespace(
         records=[SimpleNamespace(t=t), SimpleNamespace(t=t + 9.0)], filter=lambda values, noise: []
     )
-    names = ["gyro_bias.x", *([of_part("gyro_bias.x", BEFORE)] if was_there else [])]
+    names = ["gyro_bias.x", *([] if form == "begins" else [of_part("gyro_bias.x", BEFORE)])]
     problem = SimpleNamespace(
         engine=engine, model=SimpleNamespace(channels=("p", "q")), settings=SETTINGS,
         acting_names=lambda effect: names, free_names=lambda active: ["mass", *names],
     )  # fmt: skip
-    extra = names[-1:]
+    extra = names if form == "ends" else names[-1:]
 
     def variance_inflation(own: Any, free: Any) -> float:
         assert own == extra and set(free) == {"mass", *names}
         return inflation
 
-    quadratic = SimpleNamespace(
-        variance_inflation=variance_inflation, occam=lambda own, rest: 5.0 if own == extra else 0.0
-    )
-    active = ("gyro_bias",) if was_there else ()
+    def occam(own: Any, rest: Any) -> float:
+        assert {*own, *rest} == {"mass", *names}
+        return 5.0 * len(own)
+
+    quadratic = SimpleNamespace(variance_inflation=variance_inflation, occam=occam)
+    active = ("gyro_bias",) if form == "changes" else ()
     fit = Fit(active, {"gyro_bias.x": 0.0}, NOISE_OF_ALL, objective=170.0)
     trial = replace(fit, active=("gyro_bias",), objective=100.0, values=dict.fromkeys(names, 0.01))
     return SimpleNamespace(problem=problem, fit=fit), problem, trial, quadratic
 
 
-@pytest.mark.parametrize("was_there", [True, False])
+@pytest.mark.parametrize("form", ["changes", "begins", "ends"])
 @pytest.mark.parametrize("inflation", [1.0, 2.0])
-def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, was_there, inflation):
+def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, form, inflation):
     """Beside no change; and beside a cause that was always there it must be worth a tie, the moment
     paid for. None is worth anything that a gust made, that is small, or where channels stay coloured.
     """
@@ -616,21 +628,21 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, was_there
         onset, "whiteness", lambda passes, channels: {
             "p": SimpleNamespace(white=made["white"]), "q": SimpleNamespace(white=False)}
     )  # fmt: skip
-    state, problem, trial, quadratic = weighed(was_there, inflation)
+    state, problem, trial, quadratic = weighed(form, inflation)
     found = onset.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
     of_moment = math.log(100.0 / 2.0)
 
     def worth(always: float = 900.0, same: float = 160.0) -> float:
         rivals = onset.Rivals(
             replace(state.fit, objective=same),
-            None if was_there else replace(trial, objective=always),
+            None if form == "changes" else replace(trial, objective=always),
         )
         return onset._worth(state, problem, trial, rivals, quadratic, found).nats  # type: ignore[arg-type]
 
-    expected = 60.0 / inflation - 5.0 - of_moment
+    expected = 60.0 / inflation - (10.0 if form == "ends" else 5.0) - of_moment
     assert worth() == pytest.approx(expected)
-    tie = 100.0 + inflation * (SETTINGS.tie + of_moment)
-    if was_there:
+    tie = 100.0 + inflation * (SETTINGS.tie + of_moment + (5.0 if form == "ends" else 0.0))
+    if form == "changes":
         assert worth(same=tie + 5.0 * inflation - 0.1) == -math.inf
         assert worth(same=tie + 5.0 * inflation + 0.1) == pytest.approx(6.0 + 0.1 / inflation)
     else:
@@ -645,12 +657,19 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, was_there
 
 
 @pytest.mark.parametrize(
-    ("same", "was_there", "closer"),
-    [(900.0, True, False), (130.0, True, True), (99.0, True, False), (900.0, False, True)],
-)
-def test_what_may_decide_is_refitted_until_nothing_is_gained(monkeypatch, same, was_there, closer):
-    """The change as well as what it is beside: 100 nats; a cause always there 131."""
-    state, problem, trial, _ = weighed(was_there, 1.0)
+    ("same", "form", "closer"),
+    [(900.0, "changes", False), (130.0, "changes", True), (99.0, "changes", False),
+     (900.0, "begins", True), (900.0, "ends", True)],
+)  # fmt: skip
+def test_what_may_decide_is_refitted_until_nothing_is_gained(monkeypatch, same, form, closer):
+    """The change as well as what it is beside: 100 nats; a cause always there 131, from the size that
+    it had while it was there.
+    """
+    was_there = form == "changes"
+    state, problem, trial, _ = weighed(form, 1.0)
+    if form == "ends":
+        was = {"gyro_bias.x": 0.0, of_part("gyro_bias.x", BEFORE): 0.01}
+        trial = replace(trial, values=was)
     state.fit = replace(state.fit, objective=1000.0)
 
     def fitted(of: Any, fit: Fit, steps: int) -> Fit:
@@ -674,6 +693,6 @@ def test_what_may_decide_is_refitted_until_nothing_is_gained(monkeypatch, same, 
 
 
 def test_a_cause_that_stands_may_change_for_less_than_a_name():
-    state, *_ = weighed(True, 1.0)
+    state, *_ = weighed("changes", 1.0)
     assert onset._least(state, "gyro_bias") == SETTINGS.tie
     assert onset._least(state, "servo_lag") == SETTINGS.evidence

@@ -15,6 +15,7 @@ searched for again beside it: without it, others may have stood in its place.
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -30,7 +31,7 @@ from coax_env.estimation.beginnings import Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
 from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.helicopter import Moment
-from coax_env.estimation.parted_engine import of_part
+from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
 from coax_env.estimation.whiteness import Whiteness, whiteness
@@ -137,17 +138,18 @@ def with_onsets(
 class Scored:
     """What a change of one effect is worth, by the quadratic. nats: over all moments. moment: the best.
 
-    move: name -> what changes there.
+    move: name -> what changes there, or where it ends, what was there before.
     """
 
     effect: str
     nats: float
     moment: Moment
     move: Mapping[str, float]
+    ends: bool = False
 
 
 def scored(state: Changing) -> list[Scored]:
-    """Effects that may have begun or changed, by what that is worth over all moments, best first.
+    """Effects that may have begun, changed or ended, by what that is worth at any moment, best first.
 
     Args:
         state: a fit, and the quadratic at it.
@@ -165,15 +167,23 @@ def scored(state: Changing) -> list[Scored]:
     ]
     if not every:
         return []
-    slopes, information = (np.array(part) for part in zip(*(r for _, r in every), strict=True))
+    slopes, information, crossed = (
+        np.array(part) for part in zip(*(r for _, r in every), strict=True)
+    )
+    ended = table.ended(slopes, information, crossed)
     best = []
     for k, (effect, own) in enumerate(names.items()):
-        nats, moves = table.worth(k, slopes, information)
-        if np.isfinite(nats).any():
-            at = int(np.argmax(nats))
-            total = float(logsumexp(nats)) - math.log(len(every))  # each as likely as any other
-            move = dict(zip(own, moves[at].tolist(), strict=True))
-            best.append(Scored(effect, total, every[at][0], move))
+        forms = [(False, *table.worth(k, slopes, information))]
+        if effect not in fit.active:
+            forms.append((True, *table.worth(k, *ended)))
+        of_effect = []
+        for ends, nats, moves in forms:
+            if np.isfinite(nats).any():
+                at = int(np.argmax(nats))
+                total = float(logsumexp(nats)) - math.log(len(every))  # each as likely as any other
+                move = dict(zip(own, moves[at].tolist(), strict=True))
+                of_effect.append(Scored(effect, total, every[at][0], move, ends))
+        best += sorted(of_effect, key=lambda s: -s.nats)[:1]
     return sorted(best, key=lambda s: -s.nats)
 
 
@@ -232,6 +242,7 @@ class _Table:
     groups: Sequence[np.ndarray]
     smallest: Sequence[np.ndarray]
     pairs: tuple[np.ndarray, np.ndarray]
+    swapped: np.ndarray
 
     @classmethod
     def of(cls, state: Changing, names: Mapping[str, Sequence[str]]) -> "_Table":
@@ -243,6 +254,7 @@ class _Table:
         pull = quadratic.g + quadratic.precision * (quadratic.at - quadratic.mean)
         known = quadratic.G[np.ix_(rest, rest)] + np.diag(quadratic.precision[rest])
         groups = [quadratic.index(own) for own in names.values()]
+        firsts = np.cumsum([0, *(c.size**2 for c in groups)])
         sizes = {
             f"{e}.{p.name}": max(p.smallest, 1e-12) for e in names for p in problem.model.sized(e)
         }
@@ -259,18 +271,49 @@ class _Table:
                 np.concatenate([np.repeat(c, c.size) for c in groups]),
                 np.concatenate([np.tile(c, c.size) for c in groups]),
             ),
-        )
+            np.concatenate(
+                [first + np.arange(c.size**2).reshape(c.size, c.size).T.ravel()
+                 for first, c in zip(firsts, groups, strict=False)]
+            ),
+        )  # fmt: skip
 
-    def row_of(self, b: Beginning) -> tuple[np.ndarray, np.ndarray]:
-        """Slope and information of every effect's numbers that move from there on, what is free beside
-        them projected out: (k,) of all numbers, and the groups' matrices, row by row.
+    def row_of(self, b: Beginning) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Slope and information of every effect's numbers that move from there on, and information
+        across them and those that always were, what is free beside them projected out: (k,) of all
+        numbers, and the groups' matrices, row by row.
         """
-        across = b.across[:, self.rest] + self.later[b.record][:, self.rest]
+        later = self.later[b.record]
+        across = b.across[:, self.rest] + later[:, self.rest]
         weights = across @ self.inverse
         slope = b.slope + self.slope_later[b.record] - weights @ self.pull
         i, j = self.pairs
-        own = b.own[i, j] + self.later[b.record][i, j]
-        return slope, own - np.einsum("pr,pr->p", across[i], weights[j])
+        of_rest = across[i]
+        own = b.own[i, j] + later[i, j] - np.einsum("pr,pr->p", of_rest, weights[j])
+        crossed = b.across[i, j] + later[i, j] - np.einsum("pr,pr->p", of_rest, self.always[1][j])
+        return slope, own, crossed
+
+    @cached_property
+    def always(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Slope (k,) of numbers that always were, their weights on what is free beside them (k, r), and
+        the groups' information.
+        """
+        across = self.quadratic.G[:, self.rest]
+        weights = across @ self.inverse
+        i, j = self.pairs
+        own = self.quadratic.G[i, j] - np.einsum("pr,pr->p", across[i], weights[j])
+        return self.quadratic.g - weights @ self.pull, weights, own
+
+    def ended(
+        self, slopes: np.ndarray, information: np.ndarray, crossed: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Slopes and information of what was there up to each row: of what always was, less what moves
+        from there on.
+
+        Args:
+            slopes, information, crossed: `row_of` all rows, stacked.
+        """
+        slope, _, own = self.always
+        return slope - slopes, own - crossed - crossed[:, self.swapped] + information
 
     def worth(
         self, k: int, slopes: np.ndarray, information: np.ndarray
@@ -351,13 +394,16 @@ def _fitted(
 ) -> tuple[Changing, Onset] | None:
     """A change fitted at its best moment, and what it is worth beside the state without it.
 
-    It is fitted from the steady noise in which it was seen.
+    It is fitted from the steady noise in which it was seen. What ends has numbers after it too.
     """
     effect, fit = candidate.effect, steady.fit
-    problem = beginning(state.problem, fit, {effect: candidate.moment}, runs)
-    values = {n: fit.values[n] + change for n, change in candidate.move.items()}
-    values |= {of_part(n, BEFORE): fit.values[n] for n in candidate.move}
     active = fit.active if effect in fit.active else (*fit.active, effect)
+    there = replace(fit, active=active) if candidate.ends else fit
+    problem = beginning(state.problem, there, {effect: candidate.moment}, runs)
+    before_it = {of_part(n, BEFORE): fit.values[n] for n in candidate.move}
+    moved = [of_part(n, BEFORE) if candidate.ends else n for n in candidate.move]
+    values = {**fit.values, **before_it}
+    values |= {n: values[n] + x for n, x in zip(moved, candidate.move.values(), strict=True)}
     trial = fitted(problem, replace(fit.at(values), active=active))
     if not math.isfinite(trial.objective):
         return None
@@ -411,7 +457,8 @@ def _compared(state: Changing, problem: Problem, trial: Fit, effect: str) -> tup
     """
     always = None
     if effect not in state.fit.active:
-        own = {n: trial.values[n] for n in _extra(problem, effect)}
+        was = _before(problem, effect) or problem.acting_names(effect)
+        own = {n.removesuffix(AT + BEFORE): trial.values[n] for n in was}
         always = replace(state.fit.at(own), active=trial.active, noise=trial.noise)
 
     def refitted(fit: Fit) -> Fit:
@@ -441,7 +488,8 @@ def _worth(
     that is wrong there always finds a moment.
     """
     effect, same = found.effect, rivals.same
-    extra = _extra(problem, effect)
+    was = _before(problem, effect)
+    extra = problem.acting_names(effect) if rivals.always else was
     others = [n for n in problem.free_names(trial.active) if n not in extra]
     inflation = quadratic.variance_inflation(extra, [*others, *extra])
     of_moment = math.log(_seconds(problem) / found.width)
@@ -450,7 +498,9 @@ def _worth(
     )
     beside_constant = nats
     if rivals.always is not None:
+        alike = [n for n in problem.free_names(trial.active) if n not in was]
         beside_constant = (rivals.always.objective - trial.objective) / inflation - of_moment
+        beside_constant -= quadratic.occam(was, alike) if was else 0.0
     without = state.problem.engine.filter(same.values, trial.noise)
     with_it = problem.engine.filter(trial.values, trial.noise)
     lasting = _lasting(without, with_it, found.moment) / inflation
@@ -465,10 +515,9 @@ def _worth(
     return replace(found, nats=nats)
 
 
-def _extra(problem: Problem, effect: str) -> list[str]:
-    """The numbers that a change adds to no change: those before it, or where there are none its own."""
-    acting = problem.acting_names(effect)
-    return [n for n in acting if n.endswith(BEFORE)] or acting
+def _before(problem: Problem, effect: str) -> list[str]:
+    """An effect's numbers before its moment, none where it begins."""
+    return [n for n in problem.acting_names(effect) if n.endswith(BEFORE)]
 
 
 def _seconds(problem: Problem) -> float:
