@@ -445,6 +445,15 @@ def test_a_changes_score_is_the_log_of_the_ratio_of_two_evidences(row, ends):
         assert nats == pytest.approx(log_evidence(G, g, precision, away) - alone, rel=1e-9)
 
 
+def test_a_constant_causes_score_is_that_of_what_ends_behind_the_flight():
+    """All of its information: what ends in the last run, with nothing of it left from there on."""
+    found, _, _ = table({"mass": 0.3}, SLOPES)
+    size = len(NAMES)
+    nothing = Beginning(2, 10, np.zeros(size), np.zeros((size, size)), np.zeros((size, size)))
+    for k, (nats, _) in enumerate(worths(found, nothing, ends=True)):
+        assert found.worth_of_constant(k) == pytest.approx(nats, rel=1e-9)
+
+
 def test_a_change_that_is_too_small_to_matter_is_worth_nothing():
     found, q, _ = table({}, 1e-6 * SLOPES)
     parts = q.parts

@@ -138,14 +138,16 @@ def with_onsets(
 class Scored:
     """What a change of one effect is worth, by the quadratic. nats: over all moments. moment: the best.
 
-    move: name -> what changes there, or where it ends, what was there before.
+    move: name -> what changes there, or where it ends, what was there before. beside: what it is worth
+    beside the same cause that was always there.
     """
 
     effect: str
     nats: float
     moment: Moment
     move: Mapping[str, float]
-    ends: bool = False
+    ends: bool
+    beside: float
 
 
 def scored(state: Changing) -> list[Scored]:
@@ -173,16 +175,18 @@ def scored(state: Changing) -> list[Scored]:
     ended = table.ended(slopes, information, crossed)
     best = []
     for k, (effect, own) in enumerate(names.items()):
-        forms = [(False, *table.worth(k, slopes, information))]
+        forms, always = [(False, *table.worth(k, slopes, information))], 0.0
         if effect not in fit.active:
             forms.append((True, *table.worth(k, *ended)))
+            always = max(0.0, table.worth_of_constant(k))
         of_effect = []
         for ends, nats, moves in forms:
             if np.isfinite(nats).any():
                 at = int(np.argmax(nats))
                 total = float(logsumexp(nats)) - math.log(len(every))  # each as likely as any other
                 move = dict(zip(own, moves[at].tolist(), strict=True))
-                of_effect.append(Scored(effect, total, every[at][0], move, ends))
+                moment = every[at][0]
+                of_effect.append(Scored(effect, total, moment, move, ends, total - always))
         best += sorted(of_effect, key=lambda s: -s.nats)[:1]
     return sorted(best, key=lambda s: -s.nats)
 
@@ -315,6 +319,11 @@ class _Table:
         slope, _, own = self.always
         return slope - slopes, own - crossed - crossed[:, self.swapped] + information
 
+    def worth_of_constant(self, k: int) -> float:
+        """What one effect is worth that was always there [nats]; k: its place."""
+        slope, _, own = self.always
+        return float(self.worth(k, slope[None], own[None])[0][0])
+
     def worth(
         self, k: int, slopes: np.ndarray, information: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -353,7 +362,8 @@ def _next(state: Changing, runs: Sequence[str]) -> tuple[Changing, Onset] | None
     best = None
     fit, _, quadratic = linearise(state.problem, without_drifts(state.fit))
     steady = replace(state, fit=fit, quadratic=quadratic)
-    near = [s for s in scored(steady) if s.nats > chosen.trial_share * chosen.evidence]
+    least, tie = chosen.trial_share * chosen.evidence, chosen.trial_share * chosen.tie
+    near = [s for s in scored(steady) if s.nats > least and s.beside > tie]
     for candidate in near[: chosen.most_trials]:
         trial = _fitted(state, steady, candidate, runs)
         if trial is None:
