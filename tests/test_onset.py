@@ -701,6 +701,32 @@ def test_what_may_decide_is_refitted_until_nothing_is_gained(monkeypatch, same, 
     assert onset._compared(state, problem, trial, "gyro_bias")[1].same is state.fit
 
 
+def scores(**worth: tuple[float, float]) -> list[onset.Scored]:
+    """Changes with what each is worth, and worth beside a constant cause of its name."""
+    moment = Moment("a", 9.0)
+    return [onset.Scored(e, nats, moment, {}, False, beside) for e, (nats, beside) in worth.items()]
+
+
+def test_what_a_constant_cause_does_as_well_is_not_worth_a_fit():
+    found = scores(wind=(7.1, 3.1), servo_lag=(6.9, 6.9), cg_offset=(60.0, 2.9))
+    assert [s.effect for s in onset._standing(found, SETTINGS)] == ["wind"]
+
+
+@pytest.mark.parametrize("gains", [True, False])
+def test_what_commands_explain_is_not_worth_a_fit(monkeypatch, gains):
+    """Asked again with their gains where they carry something on the gusts."""
+    found = scores(servo_delay=(27.9, 17.7), swash_gain=(20.0, 20.0))
+    with_gains = scores(swash_gain=(8.0, 8.0), rate_damping=(9.0, 9.0), servo_delay=(0.1, 0.1))
+    monkeypatch.setattr(onset, "with_command_gains", lambda p, fit, coloured: (p, fit))
+    monkeypatch.setattr(onset, "has_command_gains", lambda p: gains)
+    monkeypatch.setattr(onset, "linearise", lambda p, fit: (fit, [], None))
+    monkeypatch.setattr(onset, "scored", lambda state: with_gains)
+    fit = Fit((), {}, NOISE_OF_ALL)
+    steady = Changing(SimpleNamespace(settings=SETTINGS), fit, None, {})  # type: ignore[arg-type]
+    kept = onset._beside_commands(steady, found)
+    assert kept == (found[1:] if gains else found)
+
+
 def test_a_cause_that_stands_may_change_for_less_than_a_name():
     state, *_ = weighed("changes", 1.0)
     assert onset._least(state, "gyro_bias") == SETTINGS.tie

@@ -25,8 +25,10 @@ from scipy.special import logsumexp
 from coax_env.diagnosis.confounding import alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, without_drifts
+from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.search import search
+from coax_env.diagnosis.settings import Settings
 from coax_env.estimation.beginnings import Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
 from coax_env.estimation.engine import Engine, RunPass
@@ -362,8 +364,9 @@ def _next(state: Changing, runs: Sequence[str]) -> tuple[Changing, Onset] | None
     best = None
     fit, _, quadratic = linearise(state.problem, without_drifts(state.fit))
     steady = replace(state, fit=fit, quadratic=quadratic)
-    least, tie = chosen.trial_share * chosen.evidence, chosen.trial_share * chosen.tie
-    near = [s for s in scored(steady) if s.nats > least and s.beside > tie]
+    near = _standing(scored(steady), chosen)
+    if near and near[0].nats < chosen.clear_evidence * chosen.evidence:
+        near = _beside_commands(steady, near)
     for candidate in near[: chosen.most_trials]:
         trial = _fitted(state, steady, candidate, runs)
         if trial is None:
@@ -373,6 +376,26 @@ def _next(state: Changing, runs: Sequence[str]) -> tuple[Changing, Onset] | None
         if onset.nats > (best[1].nats if best else _least(state, onset.effect)):
             best = trial
     return best
+
+
+def _standing(found: Sequence[Scored], chosen: Settings) -> list[Scored]:
+    """Those that are worth a fit: beside no change, and beside a cause that was always there."""
+    least, tie = chosen.trial_share * chosen.evidence, chosen.trial_share * chosen.tie
+    return [s for s in found if s.nats > least and s.beside > tie]
+
+
+def _beside_commands(steady: Changing, near: Sequence[Scored]) -> list[Scored]:
+    """Those that stand where commands show the gusts, too.
+
+    A pilot who flies gusts out looks like a servo that gets late (input_innovations.py).
+    """
+    wider, fit = with_command_gains(steady.problem, steady.fit, coloured=True)
+    if not has_command_gains(wider):
+        return list(near)
+    fit, _, quadratic = linearise(wider, fit)
+    again = scored(Changing(wider, fit, quadratic, steady.onsets))
+    stand = {s.effect for s in _standing(again, steady.problem.settings)}
+    return [s for s in near if s.effect in stand]
 
 
 def _least(state: Changing, effect: str) -> float:
