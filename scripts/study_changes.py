@@ -27,7 +27,7 @@ def main() -> None:
     in_flight = [
         onsets.planned(kind, n, options.seed)
         for n in range(options.onsets)
-        for kind in onsets.KINDS
+        for kind in options.kinds
     ]
     if wanted:
         study(wanted, pairs.fly_and_compare, pairs.text_of, options, options.out / "table.md")
@@ -74,7 +74,11 @@ def arguments() -> argparse.Namespace:
     )  # fmt: skip
     parser.add_argument(
         "--onsets", type=int, default=0, metavar="N",
-        help="flights in which something begins, and as many constant and clean ones",
+        help="flights of each kind: something begins, is there all the time, nothing",
+    )  # fmt: skip
+    parser.add_argument(
+        "--kinds", nargs="+", choices=onsets.KINDS, default=onsets.KINDS[:3], metavar="KIND",
+        help=f"of these flights: {', '.join(onsets.KINDS)}",
     )  # fmt: skip
     command_line.add_workers(parser, "pairs", -1)
     options = parser.parse_args()

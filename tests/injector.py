@@ -145,6 +145,10 @@ class Hidden(NamedTuple):
     wake_moment: float = 0.0
 
 
+_FIELDS = ", ".join(f"a.{name} + share * (b.{name} - a.{name})" for name in Hidden._fields)
+_between = njit(eval(f"lambda a, b, share: Hidden({_FIELDS})", {"Hidden": Hidden}))
+"""Every field between those of two Hidden, by its share of the second."""
+
 # effect -> parameter -> (field of Hidden, size where none is given)
 EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
     "ground_effect": {"gain": ("ge_gain", 1.0)},
@@ -606,11 +610,11 @@ def _fly(
     craft,
     rotors,
     at_last,
-    begins,
+    shares,
 ):
     """Fly the rows of a clock; returns the commands and true readings of all of them.
 
-    Hidden is ``early``, and ``at_last`` from ``begins`` [s] on.
+    Hidden is ``early``, and by ``shares`` (rows,), 0 to 1, what is there ``at_last``.
 
     Readings: 0-1 rotor speeds, 2-4 rates, 5-7 accelerometers, 8-10 attitude, 11-13 position,
     14-16 velocity, 17 cosine of the tilt. ``clock``: (rows,) s, the log begins at 0. ``dt``: (rows,)
@@ -634,7 +638,9 @@ def _fly(
     behind = int(round(pilot.delay / step))
     wanted = np.zeros(4)
     for k in range(rows):
-        hidden = early if clock[k] < begins - 1e-9 else at_last
+        hidden = early if shares[k] == 0.0 else at_last
+        if 0.0 < shares[k] < 1.0:
+            hidden = _between(early, at_last, shares[k])
         inertia = craft.inertia_z * (1.0 + hidden.yaw_inertia)
         R = _rotation(s)
         attitude = _euler(R)
@@ -834,6 +840,7 @@ def fly(
     longest: float = math.inf,
     later: Mapping[str, Mapping[str, float] | float] | None = None,
     since: tuple[str, float] = ("", 0.0),
+    growing: float = 0.0,
 ) -> Path:
     """Write a flight with these effects hidden, and what they were in ``truth.json``.
 
@@ -847,8 +854,9 @@ def fly(
         pilot: a key of ``PILOTS``.
         card_noise: factor by which the card's noise is wrong; None: the card has none.
         longest: s at which a run ends.
-        later, since: effects that are there from a moment (run, s) on, to the end of the last run; of
-            readings and of what acts at once, not of a pose that is late.
+        later, since: effects that are there from a moment (run, s) on, to the end of the last run, with
+            sizes of 0 what ends then; of readings and of what acts at once, not of a pose that is late.
+        growing: s of flight over which they come or go evenly; 0: at once.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -862,14 +870,13 @@ def fly(
     for i, name in enumerate(names):
         rng = np.random.default_rng([seed, list(MANEUVERS).index(name)])
         length = min(MANEUVERS[name], longest)
-        if name == since[0]:
-            begins, stages = since[1], (hidden, at_last)
-        else:
-            gone_by = bool(since[0]) and i > names.index(since[0])
-            begins, stages = math.inf, (at_last if gone_by else hidden,) * 2
-        columns = _fly_run(name, length, stages[0], air, kit, craft, PILOTS[pilot], rng,
-                           stages[1], begins)  # fmt: skip
-        columns = _read_from(columns, kit, stages, begins, rng)
+        begins = math.inf
+        if since[0] and i >= names.index(since[0]):
+            flown = names[names.index(since[0]) : i]
+            begins = since[1] - sum(min(MANEUVERS[run], longest) for run in flown)
+        course = Course(hidden, at_last, begins, growing)
+        columns = _fly_run(name, length, course, air, kit, craft, PILOTS[pilot], rng)
+        columns = _read_along(columns, kit, course, rng)
         columns = thin(
             columns, kit, rng, lost_echoes=lost_echoes, radio_gaps=radio_gaps, first=i == 0
         )
@@ -884,7 +891,7 @@ def fly(
     (folder / "card.toml").write_text(card)
     full = {f"{effect}.{parameter}": value for (effect, parameter), value in values.items()}
     truth = {
-        "hidden": [*effects, *(later or {})],
+        "hidden": list(dict.fromkeys([*effects, *(later or {})])),
         "since": list(since) if later else None,
         "values": full,
         "comparable": {name: value for name, value in full.items() if name not in OTHER_FORM},
@@ -903,7 +910,7 @@ def drawn(rng: np.random.Generator) -> Craft:
         try:
             for name in ("lat_3211", "yaw_3211"):
                 noise = np.random.default_rng(0)
-                _fly_run(name, 8.0, Hidden(), GUSTY, SENSORS["full"], craft, USUAL, noise)
+                _fly_run(name, 8.0, Course(), GUSTY, SENSORS["full"], craft, USUAL, noise)
         except RuntimeError:
             continue
         return craft
@@ -926,22 +933,37 @@ def chosen_values(
     return values
 
 
+class Course(NamedTuple):
+    """What is hidden while a run is flown: `early`, and what is there `at_last` from `begins` [s] on.
+
+    growing: s over which it comes evenly.
+    """
+
+    early: Hidden = Hidden()
+    at_last: Hidden = Hidden()
+    begins: float = math.inf
+    growing: float = 0.0
+
+    def shares(self, t: np.ndarray) -> np.ndarray:
+        """Of what is there at last, at times of the log [s]; before it, as at its first row."""
+        past = np.maximum(t, 0.0) - self.begins
+        if self.growing == 0.0:
+            return (past >= -1e-9).astype(float)
+        return np.clip(past / self.growing, 0.0, 1.0)
+
+
 def _fly_run(
     name: str,
     length: float,
-    hidden: Hidden,
+    course: Course,
     air: Air,
     sensors: Sensors,
     craft: Craft,
     pilot: Pilot,
     rng: np.random.Generator,
-    at_last: Hidden | None = None,
-    begins: float = math.inf,
 ) -> dict[str, np.ndarray]:
-    """True readings of a run, `length` s of it, on the sensors' clock.
-
-    at_last: what is hidden from `begins` [s] on.
-    """
+    """True readings of a run, `length` s of it, on the sensors' clock."""
+    hidden = course.early
     times = clock(sensors, SETTLE, length, rng)
     dt = np.full(len(times) - 1, sensors.step) if sensors.unrest == 0.0 else np.diff(times)
     rows = len(dt)
@@ -961,7 +983,8 @@ def _fly_run(
     pushes = np.ascontiguousarray(pushes)
     commands, readings = _fly(
         times[:-1], dt, sensors.step, target[at], trust[at], extra[at], tremor, pushes,
-        _suited(pilot, craft), hidden, craft, rotors_of(craft), at_last or hidden, begins,
+        _suited(pilot, craft), hidden, craft, rotors_of(craft), course.at_last,
+        course.shares(times[:-1]),
     )  # fmt: skip
     first = int(np.searchsorted(times, -1e-12))
     logged = readings[first:]
@@ -1001,6 +1024,74 @@ def _on(pushes: np.ndarray, times: np.ndarray, step: float) -> np.ndarray:
     at = (times[:-1, None] + np.diff(times)[:, None] * shares).ravel()
     at = np.append(at, times[-1])
     return np.column_stack([np.interp(at, even, column) for column in pushes.T])
+
+
+def _wander(white: np.ndarray, std: float, memory: float, step: float) -> np.ndarray:
+    """Noise with an exponential memory [s]; `step`: s between values."""
+    decay = math.exp(-step / memory)
+    drive = std * math.sqrt(1.0 - decay * decay)
+    out = np.empty_like(white)
+    state = 0.0
+    for k, shock in enumerate(white):
+        state = decay * state + drive * shock
+        out[k] = state
+    return out
+
+
+COMMANDED = ("t", "rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat", "battery_v")
+
+
+def _read(
+    columns: dict[str, np.ndarray], sensors: Sensors, hidden: Hidden, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """What the sensors make of the truth; channels that they lack are left out."""
+    _misplace(columns, hidden)
+    if (
+        hidden.iron_x or hidden.iron_y
+    ):  # a compass between magnets: level, the field it points along
+        ahead, right = (
+            np.cos(columns["psi"]) + hidden.iron_x,
+            hidden.iron_y - np.sin(columns["psi"]),
+        )
+        columns["psi"] = np.arctan2(-right, ahead)
+    for i, axis in enumerate("xyz"):
+        columns["pqr"[i]] = columns["pqr"[i]] * (1.0 + getattr(hidden, f"gyro_scale_{axis}"))
+    for first, x, y in (("p", "q", "r"), ("ax", "ay", "az")):  # turned axes: Rodrigues, both triads
+        turned = _turn(np.stack([columns[c] for c in (first, x, y)]), hidden.tilt_x, hidden.tilt_y)
+        columns[first], columns[x], columns[y] = turned
+    wobble = np.cumsum(columns["rpm_upper"]) / 60.0 * sensors.step * 2.0 * np.pi
+    for i, axis in enumerate("xyz"):
+        shake = hidden.vibration * np.sin(wobble + 2.1 * i)
+        accel = columns["a" + axis] + shake
+        columns["a" + axis] = accel * (1 + getattr(hidden, f"scale_{axis}")) + getattr(
+            hidden, f"accel_{axis}"
+        )
+        columns["pqr"[i]] = columns["pqr"[i]] + getattr(hidden, f"gyro_{axis}")
+        angle = ("phi", "theta", "psi")[i]
+        columns[angle] = columns[angle] + getattr(hidden, f"attitude_{axis}")
+    columns["h"] = columns["h"] * (1.0 + hidden.sonar_scale)
+    for channel, std in sensors.noise.items():
+        columns[channel] = columns[channel] + std * rng.standard_normal(len(columns["t"]))
+    blunt(columns, sensors, rng)
+    columns["psi"] = (columns["psi"] + np.pi) % (2.0 * np.pi) - np.pi
+    return {c: x for c, x in columns.items() if c in COMMANDED or c in sensors.noise}
+
+
+def _read_along(
+    columns: dict[str, np.ndarray], sensors: Sensors, course: Course, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """`_read` along a course; between its two ends, readings are as far between theirs."""
+    shares = course.shares(columns["t"])
+    if not shares.any():
+        return _read(columns, sensors, course.early, rng)
+    same_noise = copy.deepcopy(rng)
+    early = _read({c: x.copy() for c, x in columns.items()}, sensors, course.early, same_noise)
+    late = _read(columns, sensors, course.at_last, rng)
+    whole = (shares == 0.0) | (shares == 1.0)
+    return {
+        c: np.where(whole, np.where(shares == 0.0, early[c], x), early[c] + shares * (x - early[c]))
+        for c, x in late.items()
+    }
 
 
 def _wander(white: np.ndarray, std: float, memory: float, step: float) -> np.ndarray:

@@ -144,9 +144,10 @@ def test_a_changes_worth_is_what_the_joint_quadratic_gains(least):
     table = _Table(
         quadratic, [np.zeros((5, 5))], [np.zeros(5)], np.array(rest), np.linalg.inv(alone), pull,
         [np.array(own)], [np.zeros(2)], (np.array([3, 3, 4, 4]), np.array([3, 4, 3, 4])),
+        np.array([0, 2, 1, 3]),
     )  # fmt: skip
     row = table.row_of(Beginning(0, 7, begins @ e, begins @ always.T, begins @ begins.T))
-    (nats,), (move,) = table.worth(0, *(np.array([part]) for part in row))
+    (nats,), (move,) = table.worth(0, *(np.array([part]) for part in row[:2]))
     gained = 0.5 * (h @ np.linalg.solve(H, h) - pull @ np.linalg.solve(alone, pull))
     occam = 0.5 * (np.linalg.slogdet(H)[1] - np.linalg.slogdet(alone)[1] - 2.0 * np.log(0.7))
     if np.isinf(least):
@@ -244,21 +245,49 @@ def test_what_changes_has_numbers_before_and_what_begins_has_none(short):
 # --- hidden by other code ---------------------------------------------------------------------------
 
 
-def test_the_injector_changes_nothing_before_its_moment(tmp_path):
-    def log(name, **later):
-        folder = injector.fly(tmp_path / name, {}, gusts=True, seed=5, runs=RUNS[:3], longest=6.0,
-                              **later)  # fmt: skip
-        return [list(csv.DictReader((folder / f"{run}.csv").open())) for run in RUNS[:3]]
+def biased(folder, effects, **later):
+    """Logs with a gyro's bias, which the flight does not feel, in three runs of 6 s."""
+    injector.fly(folder, effects, gusts=True, seed=5, runs=RUNS[:3], longest=6.0, **later)
+    return [list(csv.DictReader((folder / f"{run}.csv").open())) for run in RUNS[:3]]
 
-    plain = log("plain")
-    changed = log("changed", later={"gyro_bias": {"x": 0.03}}, since=(RUNS[1], 2.5))
-    for run, moment in ((0, 99.0), (1, 2.5), (2, -1.0)):
-        for a, b in zip(plain[run], changed[run], strict=True):
+
+@pytest.fixture(scope="module")
+def unbiased(tmp_path_factory):
+    return biased(tmp_path_factory.mktemp("plain"), {})
+
+
+@pytest.mark.parametrize(
+    ("early", "late", "growing"), [(0.0, 0.03, 0.0), (0.03, 0.0, 0.0), (0.0, 0.03, 6.0)],
+    ids=["begins", "ends", "grows"],
+)  # fmt: skip
+def test_the_injector_changes_nothing_but_from_its_moment_on(
+    tmp_path, unbiased, early, late, growing
+):
+    changed = biased(tmp_path, {"gyro_bias": {"x": early}}, later={"gyro_bias": {"x": late}},
+                     since=(RUNS[1], 2.5), growing=growing)  # fmt: skip
+    for run in range(3):
+        for a, b in zip(unbiased[run], changed[run], strict=True):
             rest = {c: v for c, v in a.items() if c != "p"}
             assert {c: b[c] for c in rest} == rest
+            past = 6.0 * (run - 1) + float(a["t"]) - 2.5
+            share = min(max(past / growing, 0.0), 1.0) if growing else float(past >= -1e-9)
             if a["p"]:
                 jump = float(b["p"]) - float(a["p"])
-                assert jump == pytest.approx(0.03 if float(a["t"]) >= moment else 0.0, abs=1e-5)
+                assert jump == pytest.approx(early + share * (late - early), abs=2e-5)
+
+
+def test_what_grows_is_flown_with_every_size_between():
+    """All fields alike; before the log begins as at its first row."""
+    some = {"swash_lon": 0.02, "cg_x": -1e-3, "per_volt": 0.04}
+    early = injector.Hidden(swash_lon=0.01)
+    late = injector.Hidden(**{name: x for name, x in some.items() if name in early._fields})
+    middle = injector._between(early, late, 0.25)
+    expected = [a + 0.25 * (b - a) for a, b in zip(early, late, strict=True)]
+    assert list(middle) == pytest.approx(expected)
+    t = np.array([-2.0, 0.0, 1.0, 4.0, 9.0])
+    grown = injector.Course(early, late, -1.0, 4.0).shares(t)
+    assert grown.tolist() == [0.25, 0.25, 0.5, 1.0, 1.0]
+    assert injector.Course(early, late, 4.0).shares(t).tolist() == [0.0, 0.0, 0.0, 1.0, 1.0]
 
 
 @pytest.mark.slow
@@ -298,6 +327,21 @@ def test_what_stands_in_its_place_is_not_named(tmp_path, later):
     assert cause["effect"] in later
     assert cause["since"]["run"] == "lat_3211"
     assert abs(cause["since"]["t"] - 4.0) <= max(3.0 * cause["since"]["std"], 0.05)
+
+
+@pytest.mark.slow
+def test_what_ends_in_flight_is_named_with_its_moment(tmp_path):
+    """Its numbers are those at last, none; before it, what was hidden."""
+    hidden = {"swash_offset": {"lon": -0.02, "lat": 0.015}}
+    injector.fly(tmp_path, hidden, gusts=False, seed=31, runs=RUNS, longest=9.0,
+                 later={"swash_offset": {"lon": 0.0, "lat": 0.0}}, since=("lat_3211", 6.0))  # fmt: skip
+    (cause,) = diagnose(tmp_path, hold_out=[]).findings["causes"]
+    assert cause["effect"] == "swash_offset" and cause["since"]["run"] == "lat_3211"
+    assert abs(cause["since"]["t"] - 6.0) <= max(3.0 * cause["since"]["std"], 0.05)
+    for name, size in hidden["swash_offset"].items():
+        full = f"swash_offset.{name}"
+        assert cause["before"][full]["value"] == pytest.approx(size, abs=0.005)
+        assert cause["parameters"][full]["value"] == pytest.approx(0.0, abs=0.005)
 
 
 @pytest.mark.slow
@@ -352,10 +396,11 @@ def table(at: dict[str, float], slope: np.ndarray):
     return found, quadratic, std
 
 
-def worths(found: _Table, there: Beginning) -> list[tuple[float, np.ndarray]]:
-    """What a change of each effect there is worth, and how its numbers move."""
+def worths(found: _Table, there: Beginning, ends: bool = False) -> list[tuple[float, np.ndarray]]:
+    """What a change of each effect there is worth, or its end, and how its numbers move."""
     rows = [np.array([part]) for part in found.row_of(there)]
-    return [(nats[0], moves[0]) for nats, moves in (found.worth(k, *rows) for k in range(2))]
+    of_form = found.ended(*rows) if ends else rows[:2]
+    return [(nats[0], moves[0]) for nats, moves in (found.worth(k, *of_form) for k in range(2))]
 
 
 NOISE_OF_ALL = Noise({})
@@ -371,28 +416,42 @@ def log_evidence(G, g, precision, away) -> float:
     return float(0.5 * pull @ np.linalg.solve(G + P, pull) + 0.5 * logs)
 
 
+@pytest.mark.parametrize("ends", [False, True])
 @pytest.mark.parametrize("row", [0, 1])
-def test_a_changes_score_is_the_log_of_the_ratio_of_two_evidences(row):
-    """A change in the second run acts on a part of it and on all of the third; all else on all runs."""
+def test_a_changes_score_is_the_log_of_the_ratio_of_two_evidences(row, ends):
+    """What begins in the second run acts on a part of it and on all of the third; what ends there on
+    the first and on the rest of the second; all else on all runs.
+    """
     found, q, _ = table({"mass": 0.3}, SLOPES)
     parts = q.parts
     assert parts is not None
     share = (0.7, 0.2)[row]
     here = Beginning(1, 10, share * parts.slope[1], share * parts.information[1],
                      share * parts.information[1])  # fmt: skip
-    for (nats, x), names in zip(worths(found, here), (NAMES[1:4], NAMES[4:]), strict=True):
+    acts = np.array([1.0, 1.0 - share, 0.0] if ends else [0.0, share, 1.0])
+    information = np.einsum("r,rij->ij", acts, parts.information)
+    slope = acts @ parts.slope
+    both = zip(worths(found, here, ends), (NAMES[1:4], NAMES[4:]), strict=True)
+    for (nats, x), names in both:
         c = q.index(names)
-        later_G = (here.own + parts.information[2])[np.ix_(c, c)]
-        later_g = (here.slope + parts.slope[2])[c]
-        across = (here.across + parts.information[2])[np.ix_(c, [0])]
-        G = np.block([[q.G[:1, :1], across.T], [across, later_G]])
-        g = np.concatenate([q.g[:1], later_g])
+        across = information[np.ix_(c, [0])]
+        G = np.block([[q.G[:1, :1], across.T], [across, information[np.ix_(c, c)]]])
+        g = np.concatenate([q.g[:1], slope[c]])
         precision = np.concatenate([q.precision[:1], q.precision[c]])
         away = np.concatenate([(q.at - q.mean)[:1], np.zeros(len(c))])
         alone = log_evidence(q.G[:1, :1], q.g[:1], q.precision[:1], away[:1])
         best = np.linalg.solve(G + np.diag(precision), -(g + precision * away))[1:]
         np.testing.assert_allclose(x, best, atol=1e-9 * np.abs(best).max())
         assert nats == pytest.approx(log_evidence(G, g, precision, away) - alone, rel=1e-9)
+
+
+def test_a_constant_causes_score_is_that_of_what_ends_behind_the_flight():
+    """All of its information: what ends in the last run, with nothing of it left from there on."""
+    found, _, _ = table({"mass": 0.3}, SLOPES)
+    size = len(NAMES)
+    nothing = Beginning(2, 10, np.zeros(size), np.zeros((size, size)), np.zeros((size, size)))
+    for k, (nats, _) in enumerate(worths(found, nothing, ends=True)):
+        assert found.worth_of_constant(k) == pytest.approx(nats, rel=1e-9)
 
 
 def test_a_change_that_is_too_small_to_matter_is_worth_nothing():
@@ -533,30 +592,44 @@ def test_a_models_cost_is_its_objective_and_occams_factor():
     assert onset._cost(problem, replace(fit, active=()), q) == 80.0
 
 
-@pytest.mark.parametrize(
-    ("was_there", "inflation", "expected"),
-    [
-        # beside no change: 60 nats less 5 for its numbers and log(100 s / 2 s) for its moment
-        (True, 1.0, 60.0 - 5.0 - math.log(50.0)),
-        (True, 2.0, 30.0 - 5.0 - math.log(50.0)),
-        # and where it was not there, beside what was always there: 20 nats less the moment's price
-        (False, 1.0, 20.0 - math.log(50.0)),
-        (False, 2.0, 10.0 - math.log(50.0)),
-    ],
-)
-def test_a_change_pays_for_its_numbers_and_for_its_moment(
-    monkeypatch, was_there, inflation, expected
-):
-    """None is worth anything that a gust made, that is small, or where innovations stay coloured."""
+def weighed(form: str, inflation: float):
+    """A change of 100 nats in 100 s, its state at 170: what `_worth` takes, but for the rivals.
+
+    Of what was there and changes, of what begins, or of what ends; Occam's factor 5 nats a number.
+    """
+    t = np.array([3.0, 53.0])
+    engine = SimpleNamespace(
+        records=[SimpleNamespace(t=t), SimpleNamespace(t=t + 9.0)], filter=lambda values, noise: []
+    )
+    names = ["gyro_bias.x", *([] if form == "begins" else [of_part("gyro_bias.x", BEFORE)])]
+    problem = SimpleNamespace(
+        engine=engine, model=SimpleNamespace(channels=("p", "q")), settings=SETTINGS,
+        acting_names=lambda effect: names, free_names=lambda active: ["mass", *names],
+    )  # fmt: skip
+    extra = names if form == "ends" else names[-1:]
+
+    def variance_inflation(own: Any, free: Any) -> float:
+        assert own == extra and set(free) == {"mass", *names}
+        return inflation
+
+    def occam(own: Any, rest: Any) -> float:
+        assert {*own, *rest} == {"mass", *names}
+        return 5.0 * len(own)
+
+    quadratic = SimpleNamespace(variance_inflation=variance_inflation, occam=occam)
+    active = ("gyro_bias",) if form == "changes" else ()
+    fit = Fit(active, {"gyro_bias.x": 0.0}, NOISE_OF_ALL, objective=170.0)
+    trial = replace(fit, active=("gyro_bias",), objective=100.0, values=dict.fromkeys(names, 0.01))
+    return SimpleNamespace(problem=problem, fit=fit), problem, trial, quadratic
+
+
+@pytest.mark.parametrize("form", ["changes", "begins", "ends"])
+@pytest.mark.parametrize("inflation", [1.0, 2.0])
+def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, form, inflation):
+    """Beside no change; and beside a cause that was always there it must be worth a tie, the moment
+    paid for. None is worth anything that a gust made, that is small, or where channels stay coloured.
+    """
     made = {"lasting": 12.1, "matters": True, "white": True}
-
-    def fitted(problem: Any, fit: Fit, steps: int) -> Fit:
-        same = fit.active == active
-        return replace(fit, objective=160.0 if same else 120.0)
-
-    active = ("gyro_bias",) if was_there else ()
-    monkeypatch.setattr(onset, "fitted", fitted)
-    monkeypatch.setattr(onset, "noise_fitted", lambda problem, fit: fit)
     monkeypatch.setattr(onset, "_lasting", lambda without, with_it, moment: made["lasting"])
     monkeypatch.setattr(onset, "_matters", lambda problem, fit, effect: made["matters"])
     monkeypatch.setattr(onset, "channels_of", lambda *given: ["p"])
@@ -564,40 +637,97 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(
         onset, "whiteness", lambda passes, channels: {
             "p": SimpleNamespace(white=made["white"]), "q": SimpleNamespace(white=False)}
     )  # fmt: skip
-    t = np.array([3.0, 53.0])
-    engine = SimpleNamespace(
-        records=[SimpleNamespace(t=t), SimpleNamespace(t=t + 9.0)], filter=lambda values, noise: []
-    )
-    names = ["gyro_bias.x", *([of_part("gyro_bias.x", BEFORE)] if was_there else [])]
-    problem = SimpleNamespace(
-        engine=engine, model=SimpleNamespace(channels=("p", "q")), settings=SETTINGS,
-        acting_names=lambda effect: names, free_names=lambda active: ["mass", *names],
-    )  # fmt: skip
-    extra = names[-1:]
-
-    def variance_inflation(own: Any, free: Any) -> float:
-        assert own == extra and set(free) == {"mass", *names}
-        return inflation
-
-    quadratic = SimpleNamespace(
-        variance_inflation=variance_inflation, occam=lambda own, rest: 5.0 if own == extra else 0.0
-    )
-    fit = Fit(active, {"gyro_bias.x": 0.0}, NOISE_OF_ALL, objective=170.0)
-    trial = replace(fit, active=("gyro_bias",), objective=100.0, values=dict.fromkeys(names, 0.01))
-    state = SimpleNamespace(problem=problem, fit=fit)
+    state, problem, trial, quadratic = weighed(form, inflation)
     found = onset.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
+    of_moment = math.log(100.0 / 2.0)
 
-    def worth() -> float:
-        return onset._worth(state, problem, trial, quadratic, found).nats  # type: ignore[arg-type]
+    def worth(always: float = 900.0, same: float = 160.0) -> float:
+        rivals = onset.Rivals(
+            replace(state.fit, objective=same),
+            None if form == "changes" else replace(trial, objective=always),
+        )
+        return onset._worth(state, problem, trial, rivals, quadratic, found).nats  # type: ignore[arg-type]
 
+    expected = 60.0 / inflation - (10.0 if form == "ends" else 5.0) - of_moment
     assert worth() == pytest.approx(expected)
-    state.fit = replace(fit, objective=150.0)  # better without another noise: 50 nats
-    best = min(expected, 50.0 / inflation - 5.0 - math.log(50.0))
-    assert worth() == pytest.approx(best)
-    state.fit = fit
+    tie = 100.0 + inflation * (SETTINGS.tie + of_moment + (5.0 if form == "ends" else 0.0))
+    if form == "changes":
+        assert worth(same=tie + 5.0 * inflation - 0.1) == -math.inf
+        assert worth(same=tie + 5.0 * inflation + 0.1) == pytest.approx(6.0 + 0.1 / inflation)
+    else:
+        assert worth(always=tie - 0.1) == -math.inf
+        assert worth(always=tie + 0.1) == pytest.approx(expected)
     for key, wrong in (("lasting", 6.0 * inflation - 0.1), ("matters", False), ("white", False)):
         kept, made[key] = made[key], wrong
         assert worth() == -math.inf, key
         made[key] = kept
     made["lasting"] = 6.0 * inflation + 0.1
     assert worth() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("same", "form", "closer"),
+    [(900.0, "changes", False), (130.0, "changes", True), (99.0, "changes", False),
+     (900.0, "begins", True), (900.0, "ends", True)],
+)  # fmt: skip
+def test_what_may_decide_is_refitted_until_nothing_is_gained(monkeypatch, same, form, closer):
+    """The change as well as what it is beside: 100 nats; a cause always there 131, from the size that
+    it had while it was there.
+    """
+    was_there = form == "changes"
+    state, problem, trial, _ = weighed(form, 1.0)
+    if form == "ends":
+        was = {"gyro_bias.x": 0.0, of_part("gyro_bias.x", BEFORE): 0.01}
+        trial = replace(trial, values=was)
+    state.fit = replace(state.fit, objective=1000.0)
+
+    def fitted(of: Any, fit: Fit, steps: int) -> Fit:
+        assert of is state.problem and fit.noise is trial.noise
+        begun = not was_there and fit.active == trial.active
+        assert not begun or fit.values["gyro_bias.x"] == 0.01
+        return replace(fit, objective=131.0 if begun else same)
+
+    monkeypatch.setattr(onset, "fitted", fitted)
+    monkeypatch.setattr(onset, "noise_fitted", lambda of, fit: fit)
+    monkeypatch.setattr(
+        onset, "converged", lambda of, fit: replace(fit, objective=fit.objective - 7.0)
+    )
+    after, rivals = onset._compared(state, problem, trial, "gyro_bias")
+    less = 7.0 if closer else 0.0
+    assert after.objective == 100.0 - less and rivals.same.objective == same - less
+    assert (rivals.always is None) == was_there
+    assert was_there or rivals.always.objective == 131.0 - less
+    state.fit = replace(state.fit, objective=90.0)  # better without another noise
+    assert onset._compared(state, problem, trial, "gyro_bias")[1].same is state.fit
+
+
+def scores(**worth: tuple[float, float]) -> list[onset.Scored]:
+    """Changes with what each is worth, and worth beside a constant cause of its name."""
+    moment = Moment("a", 9.0)
+    return [onset.Scored(e, nats, moment, {}, False, beside) for e, (nats, beside) in worth.items()]
+
+
+def test_what_a_constant_cause_does_as_well_is_not_worth_a_fit():
+    found = scores(wind=(7.1, 3.1), servo_lag=(6.9, 6.9), cg_offset=(60.0, 2.9))
+    assert [s.effect for s in onset._standing(found, SETTINGS)] == ["wind"]
+
+
+@pytest.mark.parametrize("gains", [True, False])
+def test_what_commands_explain_is_not_worth_a_fit(monkeypatch, gains):
+    """Asked again with their gains where they carry something on the gusts."""
+    found = scores(servo_delay=(27.9, 17.7), swash_gain=(20.0, 20.0))
+    with_gains = scores(swash_gain=(8.0, 8.0), rate_damping=(9.0, 9.0), servo_delay=(0.1, 0.1))
+    monkeypatch.setattr(onset, "with_command_gains", lambda p, fit, coloured: (p, fit))
+    monkeypatch.setattr(onset, "has_command_gains", lambda p: gains)
+    monkeypatch.setattr(onset, "linearise", lambda p, fit: (fit, [], None))
+    monkeypatch.setattr(onset, "scored", lambda state: with_gains)
+    fit = Fit((), {}, NOISE_OF_ALL)
+    steady = Changing(SimpleNamespace(settings=SETTINGS), fit, None, {})  # type: ignore[arg-type]
+    kept = onset._beside_commands(steady, found)
+    assert kept == (found[1:] if gains else found)
+
+
+def test_a_cause_that_stands_may_change_for_less_than_a_name():
+    state, *_ = weighed("changes", 1.0)
+    assert onset._least(state, "gyro_bias") == SETTINGS.tie
+    assert onset._least(state, "servo_lag") == SETTINGS.evidence

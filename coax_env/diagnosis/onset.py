@@ -4,16 +4,18 @@ A change at every moment is scored at once, at the gains of the filter without i
 likelihood ratio; Willsky and Jones 1976; Basseville and Nikiforov 1993, ch. 7; beginnings.py).
 What stands out is fitted, noise levels too, at the moment that the likelihood itself prefers, and must
 pay: for its numbers by their Occam factor, and for its moment, which could have been any, by the share
-of the flown time that the data leave for it. A cause that was always there is preferred to one that
-pays less than the evidence of a name; so is none. A gust that is over within a second is no change.
+of the flown time that the data leave for it. No change is preferred to one that pays less than the
+evidence of a name, a cause that was always there to one that pays less than a tie beside it. A gust
+that is over within a second is no change.
 
 Changes last to the end of the last run: the machine is what it is then. Where one is found, causes are
 searched for again beside it: without it, others may have stood in its place.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -22,14 +24,16 @@ from scipy.special import logsumexp
 
 from coax_env.diagnosis.confounding import alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
-from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, without_drifts
+from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, without_drifts
+from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.search import search
+from coax_env.diagnosis.settings import Settings
 from coax_env.estimation.beginnings import Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
 from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.helicopter import Moment
-from coax_env.estimation.parted_engine import of_part
+from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
 from coax_env.estimation.whiteness import Whiteness, whiteness
@@ -59,6 +63,9 @@ FADED = 10.0
 """nats under the best moment's from which on another has no share in the interval; ours."""
 SMOOTH = 0.5
 """nats by which two moments may differ for a line between them to do; ours."""
+CLEAR = 3.0
+"""Thresholds by which a change is likelier than a model without it, to need no closer fit of that: a
+name's, what numbers and moment cost, and what a close fit finds; ours."""
 OVER = (0.5, 1.5)
 """s before and after a moment in which a gust may have made the evidence; ours."""
 
@@ -133,17 +140,20 @@ def with_onsets(
 class Scored:
     """What a change of one effect is worth, by the quadratic. nats: over all moments. moment: the best.
 
-    move: name -> what changes there.
+    move: name -> what changes there, or where it ends, what was there before. beside: what it is worth
+    beside the same cause that was always there.
     """
 
     effect: str
     nats: float
     moment: Moment
     move: Mapping[str, float]
+    ends: bool
+    beside: float
 
 
 def scored(state: Changing) -> list[Scored]:
-    """Effects that may have begun or changed, by what that is worth over all moments, best first.
+    """Effects that may have begun, changed or ended, by what that is worth at any moment, best first.
 
     Args:
         state: a fit, and the quadratic at it.
@@ -161,15 +171,25 @@ def scored(state: Changing) -> list[Scored]:
     ]
     if not every:
         return []
-    slopes, information = (np.array(part) for part in zip(*(r for _, r in every), strict=True))
+    slopes, information, crossed = (
+        np.array(part) for part in zip(*(r for _, r in every), strict=True)
+    )
+    ended = table.ended(slopes, information, crossed)
     best = []
     for k, (effect, own) in enumerate(names.items()):
-        nats, moves = table.worth(k, slopes, information)
-        if np.isfinite(nats).any():
-            at = int(np.argmax(nats))
-            total = float(logsumexp(nats)) - math.log(len(every))  # each as likely as any other
-            move = dict(zip(own, moves[at].tolist(), strict=True))
-            best.append(Scored(effect, total, every[at][0], move))
+        forms, always = [(False, *table.worth(k, slopes, information))], 0.0
+        if effect not in fit.active:
+            forms.append((True, *table.worth(k, *ended)))
+            always = max(0.0, table.worth_of_constant(k))
+        of_effect = []
+        for ends, nats, moves in forms:
+            if np.isfinite(nats).any():
+                at = int(np.argmax(nats))
+                total = float(logsumexp(nats)) - math.log(len(every))  # each as likely as any other
+                move = dict(zip(own, moves[at].tolist(), strict=True))
+                moment = every[at][0]
+                of_effect.append(Scored(effect, total, moment, move, ends, total - always))
+        best += sorted(of_effect, key=lambda s: -s.nats)[:1]
     return sorted(best, key=lambda s: -s.nats)
 
 
@@ -228,6 +248,7 @@ class _Table:
     groups: Sequence[np.ndarray]
     smallest: Sequence[np.ndarray]
     pairs: tuple[np.ndarray, np.ndarray]
+    swapped: np.ndarray
 
     @classmethod
     def of(cls, state: Changing, names: Mapping[str, Sequence[str]]) -> "_Table":
@@ -239,6 +260,7 @@ class _Table:
         pull = quadratic.g + quadratic.precision * (quadratic.at - quadratic.mean)
         known = quadratic.G[np.ix_(rest, rest)] + np.diag(quadratic.precision[rest])
         groups = [quadratic.index(own) for own in names.values()]
+        firsts = np.cumsum([0, *(c.size**2 for c in groups)])
         sizes = {
             f"{e}.{p.name}": max(p.smallest, 1e-12) for e in names for p in problem.model.sized(e)
         }
@@ -255,18 +277,54 @@ class _Table:
                 np.concatenate([np.repeat(c, c.size) for c in groups]),
                 np.concatenate([np.tile(c, c.size) for c in groups]),
             ),
-        )
+            np.concatenate(
+                [first + np.arange(c.size**2).reshape(c.size, c.size).T.ravel()
+                 for first, c in zip(firsts, groups, strict=False)]
+            ),
+        )  # fmt: skip
 
-    def row_of(self, b: Beginning) -> tuple[np.ndarray, np.ndarray]:
-        """Slope and information of every effect's numbers that move from there on, what is free beside
-        them projected out: (k,) of all numbers, and the groups' matrices, row by row.
+    def row_of(self, b: Beginning) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Slope and information of every effect's numbers that move from there on, and information
+        across them and those that always were, what is free beside them projected out: (k,) of all
+        numbers, and the groups' matrices, row by row.
         """
-        across = b.across[:, self.rest] + self.later[b.record][:, self.rest]
+        later = self.later[b.record]
+        across = b.across[:, self.rest] + later[:, self.rest]
         weights = across @ self.inverse
         slope = b.slope + self.slope_later[b.record] - weights @ self.pull
         i, j = self.pairs
-        own = b.own[i, j] + self.later[b.record][i, j]
-        return slope, own - np.einsum("pr,pr->p", across[i], weights[j])
+        of_rest = across[i]
+        own = b.own[i, j] + later[i, j] - np.einsum("pr,pr->p", of_rest, weights[j])
+        crossed = b.across[i, j] + later[i, j] - np.einsum("pr,pr->p", of_rest, self.always[1][j])
+        return slope, own, crossed
+
+    @cached_property
+    def always(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Slope (k,) of numbers that always were, their weights on what is free beside them (k, r), and
+        the groups' information.
+        """
+        across = self.quadratic.G[:, self.rest]
+        weights = across @ self.inverse
+        i, j = self.pairs
+        own = self.quadratic.G[i, j] - np.einsum("pr,pr->p", across[i], weights[j])
+        return self.quadratic.g - weights @ self.pull, weights, own
+
+    def ended(
+        self, slopes: np.ndarray, information: np.ndarray, crossed: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Slopes and information of what was there up to each row: of what always was, less what moves
+        from there on.
+
+        Args:
+            slopes, information, crossed: `row_of` all rows, stacked.
+        """
+        slope, _, own = self.always
+        return slope - slopes, own - crossed - crossed[:, self.swapped] + information
+
+    def worth_of_constant(self, k: int) -> float:
+        """What one effect is worth that was always there [nats]; k: its place."""
+        slope, _, own = self.always
+        return float(self.worth(k, slope[None], own[None])[0][0])
 
     def worth(
         self, k: int, slopes: np.ndarray, information: np.ndarray
@@ -306,16 +364,44 @@ def _next(state: Changing, runs: Sequence[str]) -> tuple[Changing, Onset] | None
     best = None
     fit, _, quadratic = linearise(state.problem, without_drifts(state.fit))
     steady = replace(state, fit=fit, quadratic=quadratic)
-    near = [s for s in scored(steady) if s.nats > chosen.trial_share * chosen.evidence]
+    near = _standing(scored(steady), chosen)
+    if near and near[0].nats < chosen.clear_evidence * chosen.evidence:
+        near = _beside_commands(steady, near)
     for candidate in near[: chosen.most_trials]:
         trial = _fitted(state, steady, candidate, runs)
         if trial is None:
             continue
         onset = trial[1]
         state.problem.report(f"{onset.effect} since {onset.t:.2f} s: {onset.nats:.1f} nats, fitted")
-        if onset.nats > (best[1].nats if best else chosen.evidence):
+        if onset.nats > (best[1].nats if best else _least(state, onset.effect)):
             best = trial
     return best
+
+
+def _standing(found: Sequence[Scored], chosen: Settings) -> list[Scored]:
+    """Those that are worth a fit: beside no change, and beside a cause that was always there."""
+    least, tie = chosen.trial_share * chosen.evidence, chosen.trial_share * chosen.tie
+    return [s for s in found if s.nats > least and s.beside > tie]
+
+
+def _beside_commands(steady: Changing, near: Sequence[Scored]) -> list[Scored]:
+    """Those that stand where commands show the gusts, too.
+
+    A pilot who flies gusts out looks like a servo that gets late (input_innovations.py).
+    """
+    wider, fit = with_command_gains(steady.problem, steady.fit, coloured=True)
+    if not has_command_gains(wider):
+        return list(near)
+    fit, _, quadratic = linearise(wider, fit)
+    again = scored(Changing(wider, fit, quadratic, steady.onsets))
+    stand = {s.effect for s in _standing(again, steady.problem.settings)}
+    return [s for s in near if s.effect in stand]
+
+
+def _least(state: Changing, effect: str) -> float:
+    """nats that a change is worth at least: as a name, or beside one that stands already, a tie."""
+    chosen = state.problem.settings
+    return chosen.tie if effect in state.fit.active else chosen.evidence
 
 
 def beginning(
@@ -341,13 +427,16 @@ def _fitted(
 ) -> tuple[Changing, Onset] | None:
     """A change fitted at its best moment, and what it is worth beside the state without it.
 
-    It is fitted from the steady noise in which it was seen.
+    It is fitted from the steady noise in which it was seen. What ends has numbers after it too.
     """
     effect, fit = candidate.effect, steady.fit
-    problem = beginning(state.problem, fit, {effect: candidate.moment}, runs)
-    values = {n: fit.values[n] + change for n, change in candidate.move.items()}
-    values |= {of_part(n, BEFORE): fit.values[n] for n in candidate.move}
     active = fit.active if effect in fit.active else (*fit.active, effect)
+    there = replace(fit, active=active) if candidate.ends else fit
+    problem = beginning(state.problem, there, {effect: candidate.moment}, runs)
+    before_it = {of_part(n, BEFORE): fit.values[n] for n in candidate.move}
+    moved = [of_part(n, BEFORE) if candidate.ends else n for n in candidate.move]
+    values = {**fit.values, **before_it}
+    values |= {n: values[n] + x for n, x in zip(moved, candidate.move.values(), strict=True)}
     trial = fitted(problem, replace(fit.at(values), active=active))
     if not math.isfinite(trial.objective):
         return None
@@ -355,8 +444,9 @@ def _fitted(
     trial = fitted(problem, noise_fitted(problem, trial), steps=2)
     problem, found = _moved(problem, trial, effect, runs)
     trial = _with_noise_of(problem, trial, state.fit)
+    trial, rivals = _compared(state, problem, trial, effect)
     trial, _, quadratic = linearise(problem, trial)
-    onset = _worth(state, problem, trial, quadratic, found)
+    onset = _worth(state, problem, trial, rivals, quadratic, found)
     return Changing(problem, trial, quadratic, {**state.onsets, effect: onset}), onset
 
 
@@ -376,37 +466,81 @@ def _with_noise_of(problem: Problem, trial: Fit, fit: Fit) -> Fit:
     return other if other.objective < trial.objective else trial
 
 
+@dataclass(frozen=True)
+class Rivals:
+    """Models without a change. same: with what there was. always: with the effect always there; None
+    where it was.
+    """
+
+    same: Fit
+    always: Fit | None
+
+    def nearest(self) -> float:
+        """The lesser objective [nats]."""
+        return min(fit.objective for fit in (self.same, self.always) if fit is not None)
+
+    def by(self, work: Callable[[Fit], Fit]) -> "Rivals":
+        """Something done to both."""
+        return Rivals(work(self.same), self.always and work(self.always))
+
+
+def _compared(state: Changing, problem: Problem, trial: Fit, effect: str) -> tuple[Fit, Rivals]:
+    """A change and its rivals, refitted with noise levels of their own: until nothing is gained where
+    their difference may decide. One that had not converged would lose by it, or its rival.
+    """
+    always = None
+    if effect not in state.fit.active:
+        was = _before(problem, effect) or problem.acting_names(effect)
+        own = {n.removesuffix(AT + BEFORE): trial.values[n] for n in was}
+        always = replace(state.fit.at(own), active=trial.active, noise=trial.noise)
+
+    def refitted(fit: Fit) -> Fit:
+        return fitted(state.problem, noise_fitted(state.problem, fit), steps=2)
+
+    rivals = Rivals(replace(state.fit, noise=trial.noise), always).by(refitted)
+    if state.fit.objective < rivals.same.objective:
+        rivals = replace(rivals, same=state.fit)
+    if 0.0 < rivals.nearest() - trial.objective < CLEAR * problem.settings.evidence:
+        trial = converged(problem, trial)
+        rivals = rivals.by(lambda fit: converged(state.problem, fit))
+    return trial, rivals
+
+
 def _worth(
-    state: Changing, problem: Problem, trial: Fit, quadratic: Quadratic, found: Onset
+    state: Changing,
+    problem: Problem,
+    trial: Fit,
+    rivals: Rivals,
+    quadratic: Quadratic,
+    found: Onset,
 ) -> Onset:
     """An onset with its evidence: beside no change, its numbers and its moment paid for.
 
-    Minus infinity where a gust could have made it, where it is too small to matter, and where the
-    channels that show it stay coloured: a model that is wrong there always finds a moment.
+    Minus infinity where it is within a tie of a cause that was always there, where a gust could have
+    made it, where it is too small to matter, and where the channels that show it stay coloured: a model
+    that is wrong there always finds a moment.
     """
-    effect = found.effect
-    same = replace(state.fit, noise=trial.noise)
-    same = fitted(state.problem, noise_fitted(state.problem, same), steps=2)
-    if state.fit.objective < same.objective:
-        same = state.fit
-    extra = _extra(problem, effect)
+    effect, same = found.effect, rivals.same
+    was = _before(problem, effect)
+    extra = problem.acting_names(effect) if rivals.always else was
     others = [n for n in problem.free_names(trial.active) if n not in extra]
     inflation = quadratic.variance_inflation(extra, [*others, *extra])
-    price = quadratic.occam(extra, others) + math.log(_seconds(problem) / found.width)
-    nats = (same.objective - trial.objective) / inflation - price
-    if effect not in state.fit.active:  # one that was always there is preferred
-        own = {n: trial.values[n] for n in extra}
-        always = replace(state.fit.at(own), active=trial.active, noise=trial.noise)
-        always = fitted(state.problem, noise_fitted(state.problem, always), steps=2)
-        gained = (always.objective - trial.objective) / inflation
-        nats = min(nats, gained - math.log(_seconds(problem) / found.width))
+    of_moment = math.log(_seconds(problem) / found.width)
+    nats = (
+        (same.objective - trial.objective) / inflation - quadratic.occam(extra, others) - of_moment
+    )
+    beside_constant = nats
+    if rivals.always is not None:
+        alike = [n for n in problem.free_names(trial.active) if n not in was]
+        beside_constant = (rivals.always.objective - trial.objective) / inflation - of_moment
+        beside_constant -= quadratic.occam(was, alike) if was else 0.0
     without = state.problem.engine.filter(same.values, trial.noise)
     with_it = problem.engine.filter(trial.values, trial.noise)
     lasting = _lasting(without, with_it, found.moment) / inflation
     white = whiteness(with_it, problem.model.channels)
     shows = channels_of(problem, trial, quadratic, effect)
     if (
-        lasting < problem.settings.tie
+        min(lasting, beside_constant) < problem.settings.tie
         or not _matters(problem, trial, effect)
         or any(c in white and not white[c].white for c in shows)
     ):
@@ -414,10 +548,9 @@ def _worth(
     return replace(found, nats=nats)
 
 
-def _extra(problem: Problem, effect: str) -> list[str]:
-    """The numbers that a change adds to no change: those before it, or where there are none its own."""
-    acting = problem.acting_names(effect)
-    return [n for n in acting if n.endswith(BEFORE)] or acting
+def _before(problem: Problem, effect: str) -> list[str]:
+    """An effect's numbers before its moment, none where it begins."""
+    return [n for n in problem.acting_names(effect) if n.endswith(BEFORE)]
 
 
 def _seconds(problem: Problem) -> float:

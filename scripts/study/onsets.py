@@ -1,16 +1,16 @@
 """Flights in which something begins, flown by the injector: is it named, and with its moment?
 
-Of three kinds: a fault begins in mid-run, a fault is there all the time, nothing is hidden. Other
-faults are there all the time in three of four, gusts in every other flight.
+Of five kinds: a fault begins in mid-run, ends there, grows from there on, is there all the time, or
+nothing is hidden. Other faults are there all the time in three of four, gusts in every other flight.
 """
 
 import json
-import math
 import tempfile
 import time
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import injector
@@ -18,14 +18,20 @@ import numpy as np
 from injector_air import Air
 
 from coax_env.diagnosis.diagnose import diagnose
+from coax_env.diagnosis.settings import SETTINGS
 from study.judge import tied
+from study.onset_worth import worth_of_change
 from study.pairs import FAULTS, wilson
 from study.plan import sizes_of
 
 RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
 LONGEST = 12.0
 """s of each run: 48 s a flight, for time."""
-KINDS = ("begins", "constant", "clean")
+KINDS = ("begins", "constant", "clean", "ends", "grows")
+CHANGES = ("begins", "ends", "grows")
+"""Kinds in which something changes in flight."""
+GROWING = 12.0
+"""s of flight over which what grows comes to its size."""
 BEGINS = (
     "swash_offset", "torque_balance", "gyro_bias", "thrust_scale", "cg_offset", "attitude_bias",
     "added_mass", "motor_lag", "accel_bias", "servo_play", "swash_gain", "servo_lag",
@@ -37,7 +43,7 @@ EARLIEST, LATEST = 3.0, 9.0
 
 @dataclass(frozen=True)
 class Planned:
-    """One flight of the study. fault: what begins at `since`, or is there all the time."""
+    """One flight of the study. fault: what changes at `since`, or is there all the time."""
 
     kind: str
     number: int
@@ -74,94 +80,139 @@ def planned(kind: str, number: int, seed: int) -> Planned:
     )
 
 
+def fly(plan: Planned, folder: Path) -> Path:
+    """The flight, in a folder."""
+    air = {**plan.air, "memory": tuple(plan.air["memory"])} if "memory" in plan.air else plan.air
+    before, after = stages(plan)
+    return injector.fly(
+        folder, {**plan.others, **before}, gusts=Air(**air), seed=plan.seed, runs=RUNS,
+        longest=LONGEST, later=after if plan.kind in CHANGES else None,
+        since=plan.since if plan.kind in CHANGES else ("", 0.0),
+        growing=GROWING if plan.kind == "grows" else 0.0,
+    )  # fmt: skip
+
+
+def stages(plan: Planned) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, float]]]:
+    """The fault with its sizes at first and at last."""
+    off = {effect: dict.fromkeys(sizes, 0.0) for effect, sizes in plan.fault.items()}
+    if plan.kind in ("begins", "grows"):
+        return {}, plan.fault
+    return plan.fault, off if plan.kind == "ends" else plan.fault
+
+
 def fly_and_diagnose(plan: Planned) -> dict[str, Any]:
     """The row of a flight; a failure is a row with `error`."""
     row: dict[str, Any] = {"plan": json.loads(json.dumps(asdict(plan)))}
-    air = {**plan.air, "memory": tuple(plan.air["memory"])} if "memory" in plan.air else plan.air
-    begins = plan.kind == "begins"
     try:
-        with tempfile.TemporaryDirectory() as folder:
-            injector.fly(
-                folder, plan.others if begins else {**plan.others, **plan.fault},
-                gusts=Air(**air), seed=plan.seed, runs=RUNS, longest=LONGEST,
-                later=plan.fault if begins else None, since=plan.since if begins else ("", 0.0),
-            )  # fmt: skip
+        with tempfile.TemporaryDirectory() as name:
+            folder = fly(plan, Path(name))
             began = time.process_time()
             findings = diagnose(folder, hold_out=[]).findings
+            row |= {"causes": findings["causes"], "seconds": time.process_time() - began}
+            if plan.kind in ("begins", "ends"):
+                before, after = stages(plan)
+                off = {effect: dict.fromkeys(sizes, 0.0) for effect, sizes in after.items()}
+                row["worth"] = worth_of_change(
+                    folder, before or off, after, plan.others, plan.since
+                )
     except Exception:
         return row | {"error": traceback.format_exc()}
-    return row | {"causes": findings["causes"], "seconds": time.process_time() - began}
+    return row
 
 
 # --- judged -----------------------------------------------------------------------------------------
 
 
 def judged(row: Mapping[str, Any]) -> dict[str, Any]:
-    """One row: what was named, since when, and what was named falsely."""
+    """One row: what was named, since when, and what was named falsely.
+
+    A change should show where the flight's own information gives it twice the threshold.
+    """
     plan, causes = row["plan"], row["causes"]
     hidden = [*plan["fault"], *plan["others"]]
     mine = [c for c in causes if any(tied(c["effect"], e) for e in plan["fault"])]
-    begun = [c for c in mine if c["since"]] if plan["kind"] == "begins" else []
+    changed = [c for c in mine if c["since"]] if plan["kind"] in CHANGES else []
     error = None
     held = False
-    if begun:
-        since, (run, t) = begun[0]["since"], plan["since"]
-        same = since["run"] == run
-        error = abs(since["t"] - t) if same else math.inf
+    if changed:
+        since = changed[0]["since"]
+        error = abs(_flown(since["run"], since["t"]) - _flown(*plan["since"]))
         held = error <= 1.96 * since["std"]
     return {
         "named": bool(mine),
-        "since": bool(begun),
+        "since": bool(changed),
+        "should_show": row.get("worth", 0.0) > 2.0 * SETTINGS.evidence,
         "error": error,
         "held": held,
         "false": [
             c["effect"] for c in causes if not any(tied(c["effect"], truth) for truth in hidden)
         ],
-        "false_since": [c["effect"] for c in causes if c["since"] and c not in begun],
+        "false_since": [c["effect"] for c in causes if c["since"] and c not in changed],
     }
+
+
+def _flown(run: str, t: float) -> float:
+    """s of flight before a moment."""
+    return RUNS.index(run) * LONGEST + t
 
 
 def text_of(rows: Sequence[Mapping[str, Any]]) -> str:
     """The figures of all rows, and every one that is not as it should be."""
     good = [(r, judged(r)) for r in rows if "causes" in r]
     of = {kind: [j for r, j in good if r["plan"]["kind"] == kind] for kind in KINDS}
-    since = [j for j in of["begins"] if j["since"]]
+    figures = [f for kind in CHANGES if of[kind] for f in _of_change(kind, of[kind])]
     constant = of["constant"] + of["clean"]
+    figures += [
+        ("constant: a moment", [bool(j["false_since"]) for j in of["constant"]]),
+        ("clean: a moment", [bool(j["false_since"]) for j in of["clean"]]),
+        ("constant or clean: a false name", [bool(j["false"]) for j in constant]),
+    ]
     lines = ["| figure | right | of | share | 95 % interval |", "|---|---|---|---|---|"]
-    for words, right, count in (
-        ("begins in mid-run: named", sum(j["named"] for j in of["begins"]), len(of["begins"])),
-        ("and with its moment", len(since), len(of["begins"])),
-        ("the moment within its 95 % interval", sum(j["held"] for j in since), len(since)),
-        ("a false name where it begins", sum(bool(j["false"]) for j in of["begins"]),
-         len(of["begins"])),
-        ("a false moment where it begins", sum(bool(j["false_since"]) for j in of["begins"]),
-         len(of["begins"])),
-        ("constant: a moment", sum(bool(j["false_since"]) for j in of["constant"]),
-         len(of["constant"])),
-        ("clean: a moment", sum(bool(j["false_since"]) for j in of["clean"]), len(of["clean"])),
-        ("constant or clean: a false name", sum(bool(j["false"]) for j in constant), len(constant)),
-    ):  # fmt: skip
-        low, high = wilson(right, count)
-        share = f"{100 * right / count:.0f} %" if count else "-"
-        lines.append(
-            f"| {words} | {right} | {count} | {share} | {100 * low:.0f} to {100 * high:.0f} % |"
-        )
-    if since:
-        errors = [j["error"] for j in since]
-        lines += ["", f"Median error of the moment: {float(np.median(errors)):.3f} s."]
+    lines += [_line(words, right) for words, right in figures]
+    for kind in CHANGES:
+        if errors := [j["error"] for j in of[kind] if j["since"]]:
+            middle, most = float(np.median(errors)), max(errors)
+            lines += [
+                "",
+                f"{kind}: median error of the moment {middle:.3f} s, largest {most:.2f} s.",
+            ]
     lines += ["", f"{len(rows) - len(good)} failed.", ""]
-    return "\n".join([*lines, *(_remark(r, j) for r, j in good if _is_off(r, j))]) + "\n"
+    return "\n".join([*lines, *(_remark(r) for r, j in good if _is_off(r, j))]) + "\n"
+
+
+def _of_change(kind: str, of: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[bool]]]:
+    """Figures of one kind in which something changes."""
+    shown = [j for j in of if j["should_show"]]
+    figures = [(f"{kind}: named", [j["named"] for j in of]),
+               (f"{kind}: with its moment", [j["since"] for j in of])]  # fmt: skip
+    if kind != "grows":
+        figures += [(f"{kind}, should show: named", [j["named"] for j in shown]),
+                    (f"{kind}, should show: with its moment", [j["since"] for j in shown]),
+                    (f"{kind}: the moment within its 95 % interval",
+                     [j["held"] for j in of if j["since"]])]  # fmt: skip
+    return [*figures, (f"{kind}: a false name", [bool(j["false"]) for j in of]),
+            (f"{kind}: a false moment", [bool(j["false_since"]) for j in of])]  # fmt: skip
+
+
+def _line(words: str, right: Sequence[bool]) -> str:
+    """A row of the table."""
+    low, high = wilson(sum(right), len(right))
+    share = f"{100 * sum(right) / len(right):.0f} %" if right else "-"
+    interval = f"{100 * low:.0f} to {100 * high:.0f} %"
+    return f"| {words} | {sum(right)} | {len(right)} | {share} | {interval} |"
 
 
 def _is_off(row: Mapping[str, Any], j: Mapping[str, Any]) -> bool:
-    missed = row["plan"]["kind"] == "begins" and not (j["since"] and j["held"])
+    kind = row["plan"]["kind"]
+    missed = kind in CHANGES and not (j["since"] and (j["held"] or kind == "grows"))
     return bool(missed or j["false"] or j["false_since"])
 
 
-def _remark(row: Mapping[str, Any], j: Mapping[str, Any]) -> str:
+def _remark(row: Mapping[str, Any]) -> str:
     plan = row["plan"]
+    worth = f", worth {row['worth']:.0f} nats" if "worth" in row else ""
     said = [(c["effect"], round(c["evidence"], 1), c["since"]) for c in row["causes"]]
     return (
         f"- {plan['kind']} {plan['number']} {plan['fault']} {plan['since']} beside"
-        f" {list(plan['others'])} ({plan['air']['gusts']}): {said}"
+        f" {list(plan['others'])} ({plan['air']['gusts']}){worth}: {said}"
     )
