@@ -4,7 +4,8 @@ It tracks the sixteen states, what the actuators really do, a disturbing force a
 memory of a few seconds, and slow biases of gyros, roll and pitch. The disturbances stand for gusts
 and for everything in which the flown machine differs from the designed one, a trim that is off
 above all: what they explain is steered against at once. States that the suite does not show are
-left out and named in ``unobserved``.
+left out and named in ``unobserved``. Beside the linear model it knows one product: a machine that
+yaws sees its velocity, tilt and place turn.
 
 Gains are those of the periodic steady state: the sensors' rates repeat every ten rows (or fewer),
 so there is one gain per row of that cycle, and one for the first reading of a flight.
@@ -70,6 +71,9 @@ _FIRST_STD = {"m": 1.0, "m/s": 1.0, "rad": 0.1, "rad/s": 0.5, "N": 1.0, "N m": 0
 _PROCESS_STD = {"m": 1e-5, "m/s": 1e-3, "rad": 2e-4, "rad/s": 2e-3, "N": 0.0, "N m": 0.0}
 _PAIRS = (("vn", "ve"), ("pn", "pe"), ("x", "y"))
 """Horizontal pairs, which are turned into the heading before use: the design is for psi = 0."""
+_TURNED = (("u", "v"), ("phi", "theta"), ("x", "y"))
+"""Pairs of states that turn with the axes: of each, d/dt = r second and -r first by the yaw rate alone,
+equations (32)-(33), (38)-(39), (41)-(42). A product of deviations: the linear model lacks it."""
 _NAMES = (*(name for name, _ in FULL_STATES[:N_SAMPLED]), *(f"bias_{name}" for name in BIAS_STD))
 _UNITS = dict(FULL_STATES)
 _BIASES = slice(N_SAMPLED, None)
@@ -297,6 +301,13 @@ def horizontal_pairs(design: EstimatorDesign) -> np.ndarray:
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
+def turned_pairs(design: EstimatorDesign) -> np.ndarray:
+    """Pairs of states that turn with the axes of a machine that yaws, by their places, (k, 2)."""
+    names = design.states
+    pairs = [(names.index(a), names.index(b)) for a, b in _TURNED if a in names and b in names]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
 class Tracker:
     """The running filter, for one helicopter or many, and the integrals of some readings.
 
@@ -317,6 +328,8 @@ class Tracker:
         self._there = np.ones(count, dtype=np.bool_)
         self._heading = names.index("psi") if "psi" in names else -1
         self._turn = design.index("psi") if "psi" in design.states else -1
+        self._turned = turned_pairs(design)
+        self._yaw_rate = design.index("r")
         self.offset = design.action_trim - design.command_trim
         self._first = design.first_state
         self._A, self._B, self._C, self._D, self._first_gain, self._gains = (
@@ -404,7 +417,9 @@ class Tracker:
     def acted(self, actions: np.ndarray) -> None:
         """Move on by one control period under actions (count, 4)."""
         self._command = self.offset + self.design.action_scale * actions
-        _predict(self._command, self._A, self._B, self._turn, self.state)
+        _predict(
+            self._command, self._A, self._B, self._turn, self._turned, self._yaw_rate, self.state
+        )
         self.integrals += DT * self._readings[:, self._integrated] * self._there[:, None]
         np.clip(self.integrals, -self._most, self._most, out=self.integrals)
         self._rows += 1
@@ -503,8 +518,9 @@ def _correct(
 
 
 @compiled(makes_arrays=True, fastmath={"contract"})
-def _predict(command, A_by_state, B_by_command, turn, state):
-    """Move states (count, n) on by one control period, in place: x = A x + B du.
+def _predict(command, A_by_state, B_by_command, turn, pairs, yaw_rate, state):
+    """Move states (count, n) on by one control period, in place: x = A x + B du, `pairs` (k, 2) then
+    turned by what state number `yaw_rate` turns the axes in it.
 
     The heading, state number `turn` (-1: none), stays within -pi .. pi: whatever a compass has made
     of it, no controller is to fly a whole turn back.
@@ -516,6 +532,12 @@ def _predict(command, A_by_state, B_by_command, turn, state):
         state[i] = 0.0
         _add_product(A_by_state, before, state[i])
         _add_product(B_by_command, command[i], state[i])
+        cosine, sine = math.cos(DT * before[yaw_rate]), math.sin(DT * before[yaw_rate])
+        for k in range(len(pairs)):
+            a, b = pairs[k, 0], pairs[k, 1]
+            first, second = state[i, a], state[i, b]
+            state[i, a] = cosine * first + sine * second
+            state[i, b] = cosine * second - sine * first
         if turn >= 0:
             state[i, turn] = wrap_angle(state[i, turn])
 

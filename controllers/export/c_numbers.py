@@ -9,7 +9,13 @@ import numpy as np
 from coax_env.env import hover
 from coax_env.env.period import DT
 from coax_env.model.sensors import slow_instruments, suite
-from controllers.estimator import WINDUP, EstimatorDesign, horizontal_pairs, integrated_readings
+from controllers.estimator import (
+    WINDUP,
+    EstimatorDesign,
+    horizontal_pairs,
+    integrated_readings,
+    turned_pairs,
+)
 from controllers.export.c_values import Fields, constant, literal, macro, structure, structures
 from controllers.lqr import LQG
 from controllers.pid import PID
@@ -144,6 +150,9 @@ def _filter_numbers(design: EstimatorDesign, points: Sequence[Fields]) -> list[s
         macro("CYCLE", len(design.gains)),
         macro("INTEGRALS", len(integrated)),
         *(macro(f"STATE_{name.upper()}", place(name, states)) for name in ("x", "y", "z", "psi")),
+        macro("STATE_R", place("r", states)),
+        macro("TURNED_PAIRS", len(turned_pairs(design))),
+        constant("TURNED", turned_pairs(design)),
         macro("READ_PSI", psi),
         macro("OBSERVED_PSI", int(design.reading_places[psi]) if psi >= 0 else 0),
         macro("PAIRS", len(horizontal_pairs(design))),

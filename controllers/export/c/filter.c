@@ -103,7 +103,7 @@ static void correct(coax_controller *c, const blend *b, const float *seen, float
 /* On by one control period under the action that was given. */
 static void predict(coax_controller *c, const blend *b, const float *reading, int there)
 {
-    float next[STATES] = {0.0f}, dx[STATES], du[COAX_COMMANDS];
+    float next[STATES] = {0.0f}, dx[STATES], moved[STATES], du[COAX_COMMANDS];
 
     for (int s = 0; s < b->count; s++) {
         const design_point *p = b->point[s];
@@ -111,13 +111,16 @@ static void predict(coax_controller *c, const blend *b, const float *reading, in
         for (int j = 0; j < COAX_COMMANDS; j++)
             du[j] = p->offset[j] + ACTION_SCALE[j] * c->action[j];
         for (int i = 0; i < STATES; i++) {
-            float sum = p->state_trim[i] + p->advance[i];
+            moved[i] = 0.0f;
             for (int j = 0; j < STATES; j++)
-                sum += p->A[i][j] * dx[j];
+                moved[i] += p->A[i][j] * dx[j];
             for (int j = 0; j < COAX_COMMANDS; j++)
-                sum += p->B[i][j] * du[j];
-            next[i] += b->weight[s] * sum;
+                moved[i] += p->B[i][j] * du[j];
         }
+        for (int k = 0; k < TURNED_PAIRS; k++) /* what yawing does to velocity, tilt and place */
+            turn(&moved[TURNED[k][0]], &moved[TURNED[k][1]], -PERIOD * dx[STATE_R]);
+        for (int i = 0; i < STATES; i++)
+            next[i] += b->weight[s] * (p->state_trim[i] + p->advance[i] + moved[i]);
     }
     for (int i = 0; i < STATES; i++)
         c->state[i] = next[i];
