@@ -51,7 +51,7 @@ from coax_env.model.sampling import is_new
 from coax_env.model.sensors import BASE_RATE, Sensor, slow_instruments, suite
 from coax_env.model.vehicle import Vehicle
 from controllers.feedback import Feedback
-from controllers.target import TargetView, turned
+from controllers.target import HEADING_AXIS, HEIGHT_AXIS, PLACE_AXIS, Approach, TargetView, turned
 
 DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; unlike the fly-bar's, to be distinguished
 FORCE_SHARE = 0.05  # std of the disturbing force, of the weight
@@ -294,6 +294,11 @@ def integrated_readings(design: EstimatorDesign) -> dict[str, float]:
     return found | {n: limit["heading"] for n in ("psi",) if n in design.readings}
 
 
+def axis_of(reading: str) -> int:
+    """The axis of the setpoint, see `target.AXES`, on the way in which a reading's integral stops."""
+    return {"h": HEIGHT_AXIS, "z": HEIGHT_AXIS, "psi": HEADING_AXIS}.get(reading, PLACE_AXIS)
+
+
 def horizontal_pairs(design: EstimatorDesign) -> np.ndarray:
     """Readings that are north and east of one vector, by their places, (k, 2)."""
     names = design.readings
@@ -325,7 +330,9 @@ class Tracker:
         self._pairs = horizontal_pairs(design)
         self._view = TargetView(design.sensors)
         self._asked = np.zeros((count, 4))
-        self._there = np.ones(count, dtype=np.bool_)
+        self._approach = Approach(count)
+        self._axes = [axis_of(name) for name in integrated]
+        self._there = np.ones((count, len(integrated)), dtype=np.bool_)
         self._heading = names.index("psi") if "psi" in names else -1
         self._turn = design.index("psi") if "psi" in design.states else -1
         self._turned = turned_pairs(design)
@@ -352,6 +359,7 @@ class Tracker:
         self.integrals[which] = 0.0
         self._command[which] = self.offset
         self._rows[which] = 0
+        self._approach.reset(which)
 
     def see(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
         """Take in observations (count, n_obs), only in the rows of a mask where one is given.
@@ -398,7 +406,8 @@ class Tracker:
 
     def _aimed(self, observations: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Observations from the point asked for; where that has moved, the estimate moves too."""
-        seen, asked, there = self._view.relative_to_target(observations)
+        reach = self._approach.reach(self._view.way(observations), which)
+        seen, asked, there = self._view.relative_to_target(observations, reach)
         moved = np.where((self._rows > 0)[:, None], asked - self._asked, 0.0)[which]
         heading = asked[which, HEADING] + seen[which, self._view.names.index("psi")]
         forward, right = turned(moved[:, HORIZONTAL], -heading).T
@@ -411,7 +420,7 @@ class Tracker:
         for name, change in changes.items():
             if name in self.design.states:
                 self.state[which, self.design.index(name)] -= change
-        self._asked[which], self._there[which] = asked[which], there[which]
+        self._asked[which], self._there[which] = asked[which], there[which][:, self._axes]
         return seen
 
     def acted(self, actions: np.ndarray) -> None:
@@ -420,7 +429,7 @@ class Tracker:
         _predict(
             self._command, self._A, self._B, self._turn, self._turned, self._yaw_rate, self.state
         )
-        self.integrals += DT * self._readings[:, self._integrated] * self._there[:, None]
+        self.integrals += DT * self._readings[:, self._integrated] * self._there
         np.clip(self.integrals, -self._most, self._most, out=self.integrals)
         self._rows += 1
 

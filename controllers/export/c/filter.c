@@ -24,8 +24,22 @@ void coax_reset(coax_controller *c)
         c->action[j] = c->asked[j] = 0.0f;
     c->asked[DOWN] = -HOVER_HEIGHT;
     c->speed = 0.0f;
+    c->nearest = c->last = -1.0f; /* none yet: no distance is near it */
     c->row = 0;
     c->started = 0;
+}
+
+/* How far the setpoint may be away: less where the machine was blown back from where it has been. */
+static float reach(coax_controller *c, const float *way)
+{
+    const float distance = hypotf(way[FORWARD], way[RIGHT]);
+
+    if (isfinite(distance)) {
+        c->nearest = fabsf(distance - c->last) < NEW_TARGET ? fminf(c->nearest, distance) : distance;
+        c->last = distance;
+    }
+    return REACH_PLACE + within((c->last - c->nearest - BLOWN_FIRST) / (BLOWN_LAST - BLOWN_FIRST), 0.0f, 1.0f)
+                             * (REACH_RETURN - REACH_PLACE);
 }
 
 /* The setpoint has moved: so has the estimate, which is relative to it. */
@@ -101,7 +115,7 @@ static void correct(coax_controller *c, const blend *b, const float *seen, float
 }
 
 /* On by one control period under the action that was given. */
-static void predict(coax_controller *c, const blend *b, const float *reading, int there)
+static void predict(coax_controller *c, const blend *b, const float *reading, const int *there)
 {
     float next[STATES] = {0.0f}, dx[STATES], moved[STATES], du[COAX_COMMANDS];
 
@@ -127,7 +141,7 @@ static void predict(coax_controller *c, const blend *b, const float *reading, in
     if (STATE_PSI >= 0)
         c->state[STATE_PSI] = wrapped(c->state[STATE_PSI]);
     for (int k = 0; k < INTEGRALS; k++) {
-        if (there)
+        if (there[AXIS[k]])
             c->integral[k] += PERIOD * reading[INTEGRATED[k]];
         c->integral[k] = within(c->integral[k], -MOST[k], MOST[k]);
     }
