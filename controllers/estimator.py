@@ -4,7 +4,8 @@ It tracks the sixteen states, what the actuators really do, a disturbing force a
 memory of a few seconds, and slow biases of gyros, roll and pitch. The disturbances stand for gusts
 and for everything in which the flown machine differs from the designed one, a trim that is off
 above all: what they explain is steered against at once. States that the suite does not show are
-left out and named in ``unobserved``.
+left out and named in ``unobserved``. Beside the linear model it knows one product: a machine that
+yaws sees its velocity, tilt and place turn.
 
 Gains are those of the periodic steady state: the sensors' rates repeat every ten rows (or fewer),
 so there is one gain per row of that cycle, and one for the first reading of a flight.
@@ -50,7 +51,7 @@ from coax_env.model.sampling import is_new
 from coax_env.model.sensors import BASE_RATE, Sensor, slow_instruments, suite
 from coax_env.model.vehicle import Vehicle
 from controllers.feedback import Feedback
-from controllers.target import TargetView, turned
+from controllers.target import HEADING_AXIS, HEIGHT_AXIS, PLACE_AXIS, Approach, TargetView, turned
 
 DISTURBANCE_MEMORY = 5.0  # [s] of force and moment; unlike the fly-bar's, to be distinguished
 FORCE_SHARE = 0.05  # std of the disturbing force, of the weight
@@ -70,6 +71,9 @@ _FIRST_STD = {"m": 1.0, "m/s": 1.0, "rad": 0.1, "rad/s": 0.5, "N": 1.0, "N m": 0
 _PROCESS_STD = {"m": 1e-5, "m/s": 1e-3, "rad": 2e-4, "rad/s": 2e-3, "N": 0.0, "N m": 0.0}
 _PAIRS = (("vn", "ve"), ("pn", "pe"), ("x", "y"))
 """Horizontal pairs, which are turned into the heading before use: the design is for psi = 0."""
+_TURNED = (("u", "v"), ("phi", "theta"), ("x", "y"))
+"""Pairs of states that turn with the axes: of each, d/dt = r second and -r first by the yaw rate alone,
+equations (32)-(33), (38)-(39), (41)-(42). A product of deviations: the linear model lacks it."""
 _NAMES = (*(name for name, _ in FULL_STATES[:N_SAMPLED]), *(f"bias_{name}" for name in BIAS_STD))
 _UNITS = dict(FULL_STATES)
 _BIASES = slice(N_SAMPLED, None)
@@ -290,10 +294,22 @@ def integrated_readings(design: EstimatorDesign) -> dict[str, float]:
     return found | {n: limit["heading"] for n in ("psi",) if n in design.readings}
 
 
+def axis_of(reading: str) -> int:
+    """The axis of the setpoint, see `target.AXES`, on the way in which a reading's integral stops."""
+    return {"h": HEIGHT_AXIS, "z": HEIGHT_AXIS, "psi": HEADING_AXIS}.get(reading, PLACE_AXIS)
+
+
 def horizontal_pairs(design: EstimatorDesign) -> np.ndarray:
     """Readings that are north and east of one vector, by their places, (k, 2)."""
     names = design.readings
     pairs = [(names.index(a), names.index(b)) for a, b in _PAIRS if a in names]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def turned_pairs(design: EstimatorDesign) -> np.ndarray:
+    """Pairs of states that turn with the axes of a machine that yaws, by their places, (k, 2)."""
+    names = design.states
+    pairs = [(names.index(a), names.index(b)) for a, b in _TURNED if a in names and b in names]
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
@@ -314,9 +330,13 @@ class Tracker:
         self._pairs = horizontal_pairs(design)
         self._view = TargetView(design.sensors)
         self._asked = np.zeros((count, 4))
-        self._there = np.ones(count, dtype=np.bool_)
+        self._approach = Approach(count)
+        self._axes = [axis_of(name) for name in integrated]
+        self._there = np.ones((count, len(integrated)), dtype=np.bool_)
         self._heading = names.index("psi") if "psi" in names else -1
         self._turn = design.index("psi") if "psi" in design.states else -1
+        self._turned = turned_pairs(design)
+        self._yaw_rate = design.index("r")
         self.offset = design.action_trim - design.command_trim
         self._first = design.first_state
         self._A, self._B, self._C, self._D, self._first_gain, self._gains = (
@@ -339,6 +359,7 @@ class Tracker:
         self.integrals[which] = 0.0
         self._command[which] = self.offset
         self._rows[which] = 0
+        self._approach.reset(which)
 
     def see(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
         """Take in observations (count, n_obs), only in the rows of a mask where one is given.
@@ -385,7 +406,8 @@ class Tracker:
 
     def _aimed(self, observations: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Observations from the point asked for; where that has moved, the estimate moves too."""
-        seen, asked, there = self._view.relative_to_target(observations)
+        reach = self._approach.reach(self._view.way(observations), which)
+        seen, asked, there = self._view.relative_to_target(observations, reach)
         moved = np.where((self._rows > 0)[:, None], asked - self._asked, 0.0)[which]
         heading = asked[which, HEADING] + seen[which, self._view.names.index("psi")]
         forward, right = turned(moved[:, HORIZONTAL], -heading).T
@@ -398,14 +420,16 @@ class Tracker:
         for name, change in changes.items():
             if name in self.design.states:
                 self.state[which, self.design.index(name)] -= change
-        self._asked[which], self._there[which] = asked[which], there[which]
+        self._asked[which], self._there[which] = asked[which], there[which][:, self._axes]
         return seen
 
     def acted(self, actions: np.ndarray) -> None:
         """Move on by one control period under actions (count, 4)."""
         self._command = self.offset + self.design.action_scale * actions
-        _predict(self._command, self._A, self._B, self._turn, self.state)
-        self.integrals += DT * self._readings[:, self._integrated] * self._there[:, None]
+        _predict(
+            self._command, self._A, self._B, self._turn, self._turned, self._yaw_rate, self.state
+        )
+        self.integrals += DT * self._readings[:, self._integrated] * self._there
         np.clip(self.integrals, -self._most, self._most, out=self.integrals)
         self._rows += 1
 
@@ -503,8 +527,9 @@ def _correct(
 
 
 @compiled(makes_arrays=True, fastmath={"contract"})
-def _predict(command, A_by_state, B_by_command, turn, state):
-    """Move states (count, n) on by one control period, in place: x = A x + B du.
+def _predict(command, A_by_state, B_by_command, turn, pairs, yaw_rate, state):
+    """Move states (count, n) on by one control period, in place: x = A x + B du, `pairs` (k, 2) then
+    turned by what state number `yaw_rate` turns the axes in it.
 
     The heading, state number `turn` (-1: none), stays within -pi .. pi: whatever a compass has made
     of it, no controller is to fly a whole turn back.
@@ -516,6 +541,12 @@ def _predict(command, A_by_state, B_by_command, turn, state):
         state[i] = 0.0
         _add_product(A_by_state, before, state[i])
         _add_product(B_by_command, command[i], state[i])
+        cosine, sine = math.cos(DT * before[yaw_rate]), math.sin(DT * before[yaw_rate])
+        for k in range(len(pairs)):
+            a, b = pairs[k, 0], pairs[k, 1]
+            first, second = state[i, a], state[i, b]
+            state[i, a] = cosine * first + sine * second
+            state[i, b] = cosine * second - sine * first
         if turn >= 0:
             state[i, turn] = wrap_angle(state[i, turn])
 

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from coax_env.diagnosis.diagnose import diagnose
+from coax_env.env import tasks
+from coax_env.errors import InputError
 from coax_env.files import write_json, write_text
 from coax_env.model.usual_sizes import sized_for
 from coax_env.model.vehicle import Vehicle
@@ -25,6 +27,7 @@ from coax_env.report import figures
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from coax_env.simulation.simulate import simulate
 from controllers import lqr, pid, ppo
+from controllers.comparison import TARGET_SENSORS
 from controllers.evaluation import evaluate
 from controllers.loading import Controller, load_controller
 from controllers.model_comparison import FIRST_TEST_SEED, MANEUVERS, MODELS
@@ -68,6 +71,7 @@ def fly_machine(
     ppo_steps: int = 0,
     truth: bool = False,
     progress: Callable[[str], None] | None = None,
+    **world: Any,
 ) -> dict[str, Any]:
     """Diagnose one machine's simulated flight, and fly it with controllers of both models.
 
@@ -84,6 +88,8 @@ def fly_machine(
         truth: the corrected model is the machine itself, without a diagnosis: the most that any
             correction can gain.
         progress: called with what is being done.
+        world: arguments of the env that they fly and PPO is trained in, such as ``task`` and ``wind``:
+            the same for all results of a folder.
 
     Returns:
         what was hidden and named, and by kind of controller the cost of every flight, bare and
@@ -94,17 +100,20 @@ def fly_machine(
     found = _stored(path)
     if found is None:
         report_progress(f"machine {seed}: {', '.join(machine.effects)}: diagnosing")
-        found = _diagnosed(seed, machine, bare, path, truth)
+        found = _diagnosed(seed, machine, bare, path, truth) | {"world": world}
+    elif found.get("world", {}) != json.loads(json.dumps(world)):
+        raise InputError(f"{path} was flown in another world: {found.get('world', {})}")
     corrected = load_vehicle(path.with_suffix(".toml"))
-    for kind, make in _designs(seed, bare, out, ppo_steps).items():
+    for kind, make in _designs(seed, bare, out, ppo_steps, world).items():
         if kind in found["scores"]:
             continue
         flown = {}
         for name, model in zip(MODELS, (bare, corrected), strict=True):
             report_progress(f"machine {seed}: {kind} {name}")
             score = evaluate(
-                make(model, name), machine, episodes, seed=seed + FIRST_TEST_SEED, each_flight=True
-            )
+                make(model, name), machine, episodes, seed=seed + FIRST_TEST_SEED, each_flight=True,
+                **world,
+            )  # fmt: skip
             flown[name] = {key: score[key] for key in ("mean_cost", "success_rate", "flight_costs")}
         found["scores"][kind] = flown
         write_json(path, found)
@@ -138,27 +147,30 @@ def _diagnosed(
 
 
 def _designs(
-    seed: int, bare: Vehicle, out: Path, ppo_steps: int
+    seed: int, bare: Vehicle, out: Path, ppo_steps: int, world: Mapping[str, Any]
 ) -> dict[str, Callable[[Vehicle, str], Controller]]:
     """How a controller of each kind is made of a model and its name."""
+    aims = tasks.task(world.get("task", "hover")).shows_target
+    sensors, limits = (TARGET_SENSORS, lqr.BRISK) if aims else ("onboard", None)
     found: dict[str, Callable[[Vehicle, str], Controller]] = {
-        "lqg": lambda model, _: lqr.design(model, bare),
-        "lqg_hedged": lambda model, _: lqr.design(model, bare, hedge=lqr.HEDGE),
-        "pid": lambda model, _: pid.design(model, bare),
+        "lqg": lambda model, _: lqr.design(model, bare, sensors, limits),
+        "lqg_hedged": lambda model, _: lqr.design(model, bare, sensors, limits, hedge=lqr.HEDGE),
+        "pid": lambda model, _: pid.design(model, bare, sensors),
     }
     if ppo_steps:
-        found["ppo"] = lambda model, name: _policy(model, name, seed, bare, out, ppo_steps)
+        training = {"steps": ppo_steps, "nominal": bare, "sensors": sensors, **world}
+        found["ppo"] = lambda model, name: _policy(model, name, seed, out, training)
     return found
 
 
 def _policy(
-    model: Vehicle, name: str, seed: int, bare: Vehicle, out: Path, steps: int
+    model: Vehicle, name: str, seed: int, out: Path, training: Mapping[str, Any]
 ) -> Controller:
     """A policy trained on a model; the bare model's is shared."""
     folder = out / "policies" / (name if name == MODELS[0] else f"{name}_{seed}")
     path = folder / "policy.zip"
     if not (folder / "done").exists():
-        path = ppo.train(model, folder, steps, 0, bare)
+        path = ppo.train(model, folder, **training)
         (folder / "done").touch()
     return load_controller(path)
 
@@ -171,11 +183,12 @@ def fly_machines(
     ppo_steps: int = 0,
     truth: bool = False,
     progress: Callable[[str], None] | None = None,
+    **world: Any,
 ) -> Iterator[dict[str, Any]]:
     """`fly_machine` of every seed; arguments as there. With `truth` results lie in OUT/truth."""
     bare = load_vehicle(bare)
     for seed in seeds:
-        yield fly_machine(seed, bare, out, episodes, ppo_steps, truth, progress)
+        yield fly_machine(seed, bare, out, episodes, ppo_steps, truth, progress, **world)
 
 
 def result_path(out: Path, seed: int, truth: bool = False) -> Path:
@@ -260,6 +273,12 @@ def in_words(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
     ]
 
 
+def _world_in_words(results: Sequence[Mapping[str, Any]]) -> str:
+    world = dict(results[0].get("world", {}))
+    task = world.pop("task", "hover")
+    return f"{task}, {', '.join(f'{k} {v}' for k, v in world.items()) or 'still air'}"
+
+
 def machines_page(results: Sequence[Mapping[str, Any]], words: str = "") -> str:
     """The report as HTML text.
 
@@ -281,8 +300,8 @@ def machines_page(results: Sequence[Mapping[str, Any]], words: str = "") -> str:
             bullets(in_words(found)),
         ]),
         Section("Machines", [
-            prose("Mean cost per step of hovering in still air; the share of flights that succeed "
-                  "where it is not all."),
+            prose(f"Mean cost per step of {_world_in_words(results)}; the share of flights that "
+                  "succeed where it is not all."),
             table(HEADER, rows(results)),
         ]),
     ]  # fmt: skip

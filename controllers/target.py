@@ -4,7 +4,7 @@ In the tasks ``position`` and ``waypoints`` the observation ends with the vector
 (coax_env/env/tasks.py). Moved and rotated so that the target lies at the start's position, height
 and heading, it is an observation of ``hover``, and a hover controller flies it. A distant target is
 approached through setpoints on the way, no farther than REACH: a larger error would only saturate
-a linear controller.
+a linear controller. What the wind blows back from where it has been returns through nearer ones.
 """
 
 import math
@@ -18,6 +18,15 @@ from coax_env.model.sensors import slow_instruments, suite
 
 REACH = {"place": 0.5, "height": 0.4, "heading": math.radians(10.0)}
 """Farthest setpoint at once [m, m, rad]."""
+RETURN = 0.2
+"""[m] the farthest place of a machine that was blown back: a brisk return is fast for long."""
+BLOWN_BACK = (0.25, 0.5)
+"""[m] farther from the target than it has been: the setpoint comes nearer from the first on, and is
+RETURN's from the second."""
+NEW_TARGET = 0.3  # [m] a change of the distance in a control period that no flight makes
+AXES = range(3)
+PLACE_AXIS, HEIGHT_AXIS, HEADING_AXIS = AXES
+"""Of a setpoint, which can be the target's in one and still on the way in another."""
 
 
 class TargetView:
@@ -51,7 +60,7 @@ class TargetView:
         if self.has_target(observations):
             seen, _, there = self.relative_to_target(observations)
             self._subtract_motion(seen, observations)
-            return seen, there
+            return seen, np.asarray(there.all(axis=1))
         return observations.astype(float), np.ones(len(observations), dtype=bool)
 
     @property
@@ -63,10 +72,11 @@ class TargetView:
         """The way from the setpoint on to the target, WAY (count, 4); zero without a target."""
         if not self.has_target(observations):
             return np.zeros((len(observations), tasks.N_WAY))
-        way = self._way(observations)
+        way = self.way(observations)
         return way - _within_reach(way)
 
-    def _way(self, observations: np.ndarray) -> np.ndarray:
+    def way(self, observations: np.ndarray) -> np.ndarray:
+        """The whole way to the target, WAY (count, 4), of observations that have one."""
         return np.array(observations[:, self.width : self.width + tasks.N_WAY], dtype=float)
 
     def _subtract_motion(self, seen: np.ndarray, observations: np.ndarray) -> None:
@@ -82,18 +92,22 @@ class TargetView:
                 seen[:, self.names.index(name)] -= -motion[:, 2] if k == 2 else level[:, k]
 
     def relative_to_target(
-        self, observations: np.ndarray
+        self, observations: np.ndarray, place: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Observations (count, width + 4) as those of a hover at the target, or on the way to it.
 
+        Args:
+            observations: with a target in them.
+            place: how far the setpoint may be away [m], (count,); None: REACH's.
+
         Returns:
             observations (count, width); the setpoint, x y z psi (count, 4); whether it is
-            the target itself, (count,) bool.
+            the target itself in AXES, (count, 3) bool.
         """
         assert self.places is not None
         seen = np.array(observations[:, : self.width], dtype=float)
-        whole = self._way(observations)
-        way = _within_reach(whole)
+        whole = self.way(observations)
+        way = _within_reach(whole, place)
         x, y, z, psi = self.places
         heading = seen[:, psi].copy()
         setpoint = np.empty((len(seen), 4))
@@ -105,14 +119,42 @@ class TargetView:
         seen[:, z] = self.up * (hover.HEIGHT - way[:, UP])
         if self._speed:
             seen[:, self._speed] = turned(seen[:, self._speed], -setpoint[:, HEADING])
-        return seen, setpoint, (way == whole).all(axis=1)
+        same = way == whole
+        there = np.column_stack([same[:, HORIZONTAL].all(axis=1), same[:, UP], same[:, TURN]])
+        return seen, setpoint, there
 
 
-def _within_reach(way: np.ndarray) -> np.ndarray:
-    """A way (count, 4), or its beginning where it is longer than REACH."""
+class Approach:
+    """How near each of many helicopters has come to its target, which tells who was blown back."""
+
+    def __init__(self, count: int) -> None:
+        self._nearest, self._last = np.full(count, np.nan), np.full(count, np.nan)
+
+    def reset(self, which: np.ndarray) -> None:
+        """The rows of a mask (count,) begin new flights."""
+        self._last[which] = np.nan
+
+    def reach(self, way: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """How far the setpoint may be away [m], (count,): REACH's, down to RETURN where blown back.
+
+        Args:
+            way: to the target, (count, 4). which: rows whose way is new, (count,) bool.
+        """
+        distance = np.hypot(way[:, FORWARD], way[:, RIGHT])
+        goes_on = np.abs(distance - self._last) < NEW_TARGET
+        nearest = np.where(goes_on, np.minimum(self._nearest, distance), distance)
+        self._nearest[which], self._last[which] = nearest[which], distance[which]
+        first, last = BLOWN_BACK
+        back = np.clip((distance - self._nearest - first) / (last - first), 0.0, 1.0)
+        return np.asarray(REACH["place"] + back * (RETURN - REACH["place"]))
+
+
+def _within_reach(way: np.ndarray, place: np.ndarray | None = None) -> np.ndarray:
+    """A way (count, 4), or its beginning where it is longer than REACH, or than `place` (count,)."""
     way = way.copy()
     distance = np.maximum(np.hypot(way[:, FORWARD], way[:, RIGHT]), 1e-9)
-    way[:, HORIZONTAL] *= np.minimum(1.0, REACH["place"] / distance)[:, None]
+    farthest = np.asarray(REACH["place"] if place is None else place)
+    way[:, HORIZONTAL] *= np.minimum(1.0, farthest / distance)[:, None]
     way[:, UP] = np.clip(way[:, UP], -REACH["height"], REACH["height"])
     way[:, TURN] = np.clip(way[:, TURN], -REACH["heading"], REACH["heading"])
     return way

@@ -100,12 +100,12 @@ class TaskVecEnv(FleetVecEnv):
         for _ in range(self.hold):
             actions = np.clip(asked + self._base(), -1.0, 1.0)
             self.tracker.acted(actions)
-            targets = self.env.fleet.targets.copy()
+            targets, rates = self.env.fleet.targets.copy(), self._target_rates()
             observations, rewards, terminated, truncated, info = self.env.step(actions)
             done = terminated | truncated
             states = info["final_info"]["state"] if done.any() else info["state"]
             total += np.where(
-                over, 0.0, rewards + self._bonus(states, actions, targets, terminated)
+                over, 0.0, rewards + self._bonus(states, actions, targets, rates, terminated)
             )
             self._return += np.where(over, 0.0, rewards)
             self._length += ~over
@@ -128,13 +128,18 @@ class TaskVecEnv(FleetVecEnv):
             return 0.0
         return linear_actions(self.tracker, self._base_gain, self._known)
 
+    def _target_rates(self) -> np.ndarray | None:
+        """Of the targets' x y z psi (n_envs, 4), where they move."""
+        return self.env.fleet.target_rates if self.env.fleet.task.follows_path else None
+
     def _bonus(
-        self, states: np.ndarray, actions: np.ndarray, targets: np.ndarray, terminated: np.ndarray
-    ) -> np.ndarray:
+        self, states: np.ndarray, actions: np.ndarray, targets: np.ndarray,
+        rates: np.ndarray | None, terminated: np.ndarray,
+    ) -> np.ndarray:  # fmt: skip
         """What one period adds to the env's reward, (n_envs,); 0 where the flight has failed."""
         if not self.cost_weight:
             return np.zeros(self.num_envs)
-        cost = hover.cost(states, actions, targets, self.cost_limits)
+        cost = hover.cost(states, actions, targets, self.cost_limits, rates)
         cost = np.nan_to_num(cost, nan=MOST_COST)
         return np.where(terminated, 0.0, self.cost_weight * np.maximum(MOST_COST - cost, 0.0))
 

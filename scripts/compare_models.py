@@ -3,6 +3,7 @@
 import argparse
 import os
 from pathlib import Path
+from typing import Any
 
 import command_line
 
@@ -19,6 +20,8 @@ def main() -> None:
     if options.machines:
         compare_machines(options)
         return
+    if world(options):
+        raise InputError("--task, --wind and --turbulence go with --machines")
     model_comparison.check_machine(options.machine, options.flight)
     bare = load_vehicle(options.model)
     machine = (
@@ -65,7 +68,7 @@ def compare_machines(options: argparse.Namespace) -> None:
     with command_line.progress("compare_models") as report_progress:
         for found in machines.fly_machines(
             seeds, options.model, options.out, options.episodes, round(options.steps),
-            options.truth, report_progress,
+            options.truth, report_progress, **world(options),
         ):  # fmt: skip
             results.append(found)
             write_json(options.out / f"{kind}.json", machines.summary(results))
@@ -76,6 +79,12 @@ def compare_machines(options: argparse.Namespace) -> None:
     command_line.print_columns([machines.HEADER, *machines.rows(results)])
     print("\n".join(machines.in_words(machines.summary(results))))
     print(page)
+
+
+def world(options: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of the env that `--machines` are flown in, where not hover in still air."""
+    task = {"task": options.task} if options.task != "hover" else {}
+    return task | command_line.air(options)
 
 
 def arguments() -> argparse.Namespace:
@@ -101,6 +110,11 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--steps", type=float, default=4e6, help="of each policy's training; 0: no PPO"
     )
+    parser.add_argument(
+        "--task", default="hover", choices=["hover", "position"],
+        help="with --machines: what they fly (default: hover)",
+    )  # fmt: skip
+    command_line.add_air(parser)
     return parser.parse_args()
 
 

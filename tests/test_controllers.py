@@ -33,7 +33,7 @@ from controllers.estimator import Tracker, design_estimator, integrated_readings
 from controllers.evaluation import evaluate, evaluate_spread
 from controllers.loading import make_controller
 from controllers.policy import Network
-from controllers.target import TargetView
+from controllers.target import Approach, TargetView
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 LAMA = coax_env.load_vehicle("lama400d")
@@ -475,7 +475,7 @@ def test_a_target_seen_from_itself_is_a_hover():
         base[0, names.index("h")] = 2.2
         base[0, [names.index("vn"), names.index("ve")]] = np.cos(psi), np.sin(psi)
         seen, asked, there = view.relative_to_target(np.hstack([base, np.zeros((1, 4))]))
-        assert asked[0] == pytest.approx([*goal, -2.2, psi]) and there[0]
+        assert asked[0] == pytest.approx([*goal, -2.2, psi]) and there.all()
         assert seen[0, [names.index(n) for n in ("pn", "pe", "psi")]] == pytest.approx(np.zeros(3))
         assert seen[0, names.index("h")] == pytest.approx(hover.HEIGHT)
         assert seen[0, [names.index("vn"), names.index("ve")]] == pytest.approx([1.0, 0.0])
@@ -485,8 +485,31 @@ def test_a_target_seen_from_itself_is_a_hover():
         north, east = 0.2 * cosine + 0.1 * sine, 0.2 * sine - 0.1 * cosine
         assert asked[0] == pytest.approx([goal[0] + north, goal[1] + east, -2.25, psi + 0.1])
         there_again = np.hypot(*seen[0, [names.index("pn"), names.index("pe")]])
-        assert there_again == pytest.approx(np.hypot(0.2, 0.1)) and there[0]
-        assert not view.relative_to_target(np.hstack([base, 10.0 * away]))[2][0]
+        assert there_again == pytest.approx(np.hypot(0.2, 0.1)) and there.all()
+        far = view.relative_to_target(np.hstack([base, 10.0 * away * [1.0, 1.0, 1.0, 0.1]]))[2]
+        assert far[0].tolist() == [False, False, True]  # the heading is within reach
+
+
+def test_what_is_blown_back_returns_through_nearer_setpoints():
+    """Not one that comes nearer, nor one that is given a farther target, nor in a new flight."""
+    approach, every = Approach(2), np.array([True, True])
+
+    def reach(*ahead: float, which: np.ndarray = every) -> list[float]:
+        way = np.zeros((2, 4))
+        way[:, 0] = ahead
+        return approach.reach(way, which).tolist()
+
+    assert reach(1.0, 1.0) == [0.5, 0.5]
+    for away in np.linspace(0.0, 0.6, 7):  # the first is blown back, the second comes nearer
+        found = reach(1.0 + away, 1.0 - away)
+    assert found == pytest.approx([0.2, 0.5])
+    assert reach(1.375, 0.4) == pytest.approx([0.35, 0.5]), "half between"
+    assert reach(3.0, 2.0) == [0.5, 0.5], "new targets"
+    assert reach(3.2, 2.2) == [0.5, 0.5] and reach(3.4, 2.4) == pytest.approx([0.32, 0.32])
+    approach.reset(np.array([True, False]))
+    assert reach(3.4, 2.4) == pytest.approx([0.5, 0.32])
+    assert reach(9.0, 2.6, which=np.array([False, True]))[1] == pytest.approx(0.2)
+    assert reach(3.4, 2.6) == pytest.approx([0.5, 0.2]), "the first saw nothing before"
 
 
 def test_drawn_vehicles_are_judged_by_the_worst(onboard):

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from coax_env import hover_trim, load_vehicle
 from coax_env.env import hover
@@ -322,6 +323,32 @@ def test_a_heading_that_crosses_the_seam_brings_no_surprise(onboard):
         tracker.acted(-tracker.offset[None] / onboard.action_scale)
         assert -math.pi <= tracker.state[0, at] < math.pi
         assert abs((known - psi + math.pi) % (2.0 * math.pi) - math.pi) < 0.1, k
+
+
+def test_a_machine_that_yaws_is_predicted_as_the_model_flies_it():
+    """Drifting and tilted while it turns by 0.6 rad: what is fixed in the world turns in its axes."""
+    design = design_estimator(LAMA, sensors="mocap")
+    tracker = Tracker(design)
+    start = dict(u=0.02, v=0.03, r=2.0, phi=0.01, theta=-0.006, x=0.2, y=0.1)
+    flown = TRIM[0].copy()
+    for name, value in start.items():
+        flown[X[name]] += value
+        tracker.state[0, design.index(name)] = value
+    for _ in range(30):
+        tracker.acted(-tracker.offset[None] / design.action_scale)
+    flown = solve_ivp(
+        lambda _, x: derivative(x, TRIM[1], LAMA), (0.0, 0.3), flown, rtol=1e-9, atol=1e-12
+    ).y[:, -1]
+    moved = flown - TRIM[0]
+    psi = moved[X["psi"]]
+    north, east = moved[X["x"]], moved[X["y"]]
+    moved[X["x"]] = math.cos(psi) * north + math.sin(psi) * east
+    moved[X["y"]] = math.cos(psi) * east - math.sin(psi) * north
+    assert psi == pytest.approx(0.6, abs=0.01)
+    for name in ("u", "v", "phi", "theta", "x", "y", "psi"):
+        assert tracker.state[0, design.index(name)] == pytest.approx(
+            moved[X[name]], rel=0.02, abs=5e-4
+        ), name
 
 
 @pytest.mark.parametrize(("share", "named"), [(0.03, False), (0.07, True), (0.6, True)])

@@ -166,7 +166,8 @@ def in_world(states: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_euler("ZYX", states[..., [S.PSI, S.THETA, S.PHI]].reshape(-1, 3))
-    return turn.apply(states[..., VELOCITY].reshape(-1, 3)).reshape(*states.shape[:-1], 3)
+    velocities = np.array(states[..., VELOCITY].reshape(-1, 3))  # SciPy takes no read-only array
+    return turn.apply(velocities).reshape(*states.shape[:-1], 3)
 
 
 def squared_errors(

@@ -20,6 +20,7 @@ _FILTER_MEMBERS = (
     "float action[COAX_COMMANDS]; /* the last one */",
     "float asked[4]; /* the setpoint: x y z psi */",
     "float speed; /* asked for [m/s] */",
+    "float nearest, last; /* distances from the target [m] */",
     "int row; /* of the sensors' cycle */",
     "int started;",
 )

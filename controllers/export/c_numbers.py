@@ -9,13 +9,20 @@ import numpy as np
 from coax_env.env import hover
 from coax_env.env.period import DT
 from coax_env.model.sensors import slow_instruments, suite
-from controllers.estimator import WINDUP, EstimatorDesign, horizontal_pairs, integrated_readings
+from controllers.estimator import (
+    WINDUP,
+    EstimatorDesign,
+    axis_of,
+    horizontal_pairs,
+    integrated_readings,
+    turned_pairs,
+)
 from controllers.export.c_values import Fields, constant, literal, macro, structure, structures
 from controllers.lqr import LQG
 from controllers.pid import PID
 from controllers.policy import BEYOND, FEATURE_LIMIT, Policy
 from controllers.schedule import BRAKING, GATHERING, Schedule
-from controllers.target import REACH, TargetView
+from controllers.target import BLOWN_BACK, NEW_TARGET, REACH, RETURN, TargetView
 
 _ACTIVATIONS = {
     "tanh": "#define ACTIVATION(x) tanhf(x)",
@@ -114,6 +121,10 @@ def _common_numbers(sensors: str, trim: np.ndarray, scale: np.ndarray) -> list[s
         macro("HEIGHT_SIGN", view.up),
         macro("REACH_PLACE", REACH["place"]),
         macro("REACH_HEIGHT", REACH["height"]),
+        macro("REACH_RETURN", RETURN),
+        macro("BLOWN_FIRST", BLOWN_BACK[0]),
+        macro("BLOWN_LAST", BLOWN_BACK[1]),
+        macro("NEW_TARGET", NEW_TARGET),
         macro("REACH_HEADING", REACH["heading"]),
         macro("AT_NORTH", place("pn", "x")),
         macro("AT_EAST", place("pe", "y")),
@@ -144,6 +155,9 @@ def _filter_numbers(design: EstimatorDesign, points: Sequence[Fields]) -> list[s
         macro("CYCLE", len(design.gains)),
         macro("INTEGRALS", len(integrated)),
         *(macro(f"STATE_{name.upper()}", place(name, states)) for name in ("x", "y", "z", "psi")),
+        macro("STATE_R", place("r", states)),
+        macro("TURNED_PAIRS", len(turned_pairs(design))),
+        constant("TURNED", turned_pairs(design)),
         macro("READ_PSI", psi),
         macro("OBSERVED_PSI", int(design.reading_places[psi]) if psi >= 0 else 0),
         macro("PAIRS", len(horizontal_pairs(design))),
@@ -151,6 +165,7 @@ def _filter_numbers(design: EstimatorDesign, points: Sequence[Fields]) -> list[s
         constant("PLACE", design.reading_places),
         constant("FLAG", design.flag_places),
         constant("INTEGRATED", np.array([names.index(name) for name in integrated])),
+        constant("AXIS", np.array([axis_of(name) for name in integrated])),
         constant("MOST", WINDUP * np.array(list(integrated.values()))),
         constant("FIRST_STATE", design.first_state),
         structure("design_point", points[0]),

@@ -24,8 +24,22 @@ void coax_reset(coax_controller *c)
         c->action[j] = c->asked[j] = 0.0f;
     c->asked[DOWN] = -HOVER_HEIGHT;
     c->speed = 0.0f;
+    c->nearest = c->last = -1.0f; /* none yet: no distance is near it */
     c->row = 0;
     c->started = 0;
+}
+
+/* How far the setpoint may be away: less where the machine was blown back from where it has been. */
+static float reach(coax_controller *c, const float *way)
+{
+    const float distance = hypotf(way[FORWARD], way[RIGHT]);
+
+    if (isfinite(distance)) {
+        c->nearest = fabsf(distance - c->last) < NEW_TARGET ? fminf(c->nearest, distance) : distance;
+        c->last = distance;
+    }
+    return REACH_PLACE + within((c->last - c->nearest - BLOWN_FIRST) / (BLOWN_LAST - BLOWN_FIRST), 0.0f, 1.0f)
+                             * (REACH_RETURN - REACH_PLACE);
 }
 
 /* The setpoint has moved: so has the estimate, which is relative to it. */
@@ -101,9 +115,9 @@ static void correct(coax_controller *c, const blend *b, const float *seen, float
 }
 
 /* On by one control period under the action that was given. */
-static void predict(coax_controller *c, const blend *b, const float *reading, int there)
+static void predict(coax_controller *c, const blend *b, const float *reading, const int *there)
 {
-    float next[STATES] = {0.0f}, dx[STATES], du[COAX_COMMANDS];
+    float next[STATES] = {0.0f}, dx[STATES], moved[STATES], du[COAX_COMMANDS];
 
     for (int s = 0; s < b->count; s++) {
         const design_point *p = b->point[s];
@@ -111,20 +125,23 @@ static void predict(coax_controller *c, const blend *b, const float *reading, in
         for (int j = 0; j < COAX_COMMANDS; j++)
             du[j] = p->offset[j] + ACTION_SCALE[j] * c->action[j];
         for (int i = 0; i < STATES; i++) {
-            float sum = p->state_trim[i] + p->advance[i];
+            moved[i] = 0.0f;
             for (int j = 0; j < STATES; j++)
-                sum += p->A[i][j] * dx[j];
+                moved[i] += p->A[i][j] * dx[j];
             for (int j = 0; j < COAX_COMMANDS; j++)
-                sum += p->B[i][j] * du[j];
-            next[i] += b->weight[s] * sum;
+                moved[i] += p->B[i][j] * du[j];
         }
+        for (int k = 0; k < TURNED_PAIRS; k++) /* what yawing does to velocity, tilt and place */
+            turn(&moved[TURNED[k][0]], &moved[TURNED[k][1]], -PERIOD * dx[STATE_R]);
+        for (int i = 0; i < STATES; i++)
+            next[i] += b->weight[s] * (p->state_trim[i] + p->advance[i] + moved[i]);
     }
     for (int i = 0; i < STATES; i++)
         c->state[i] = next[i];
     if (STATE_PSI >= 0)
         c->state[STATE_PSI] = wrapped(c->state[STATE_PSI]);
     for (int k = 0; k < INTEGRALS; k++) {
-        if (there)
+        if (there[AXIS[k]])
             c->integral[k] += PERIOD * reading[INTEGRATED[k]];
         c->integral[k] = within(c->integral[k], -MOST[k], MOST[k]);
     }

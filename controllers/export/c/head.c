@@ -14,6 +14,7 @@
 
 enum { FORWARD, RIGHT, UP, TURN };
 enum { NORTH, EAST, DOWN, HEADING };
+enum { AXIS_PLACE, AXIS_HEIGHT, AXIS_HEADING, AXES }; /* of a setpoint */
 
 /* An angle [rad] in [-pi, pi). */
 static float wrapped(float angle)

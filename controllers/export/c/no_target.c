@@ -1,10 +1,12 @@
 
 /* These sensors show no position: there is no target but to hover. */
-static int see_from_target(const float *observation, const float *way, float *asked, float *seen)
+static void see_from_target(const float *observation, const float *way, float place, float *asked,
+                            float *seen, int *there)
 {
     (void)way;
+    (void)place;
     (void)asked;
     for (int k = 0; k < COAX_OBSERVED; k++)
         seen[k] = observation[k];
-    return 1;
+    there[AXIS_PLACE] = there[AXIS_HEIGHT] = there[AXIS_HEADING] = 1;
 }

@@ -35,12 +35,12 @@ void coax_step(coax_controller *c, const float observation[COAX_OBSERVED], const
                            0.5f / GAIN_HEIGHT_SUM, 0.5f / GAIN_HEADING_SUM};
     float held[COAX_OBSERVED], y[COAX_OBSERVED];
     float forward, right, pitch, roll, lift, twist, error[4], speed[3];
-    int there = 1;
+    int there[AXES] = {1, 1, 1};
 
     for (int k = 0; k < COAX_OBSERVED; k++) /* a reading that is no number: the last one that was */
         held[k] = c->last[k] = isfinite(observation[k]) ? observation[k] : c->last[k];
     if (way)
-        there = see_from_target(held, way, c->asked, y);
+        see_from_target(held, way, REACH_PLACE, c->asked, y, there);
     else
         for (int k = 0; k < COAX_OBSERVED; k++)
             y[k] = held[k];
@@ -57,7 +57,7 @@ void coax_step(coax_controller *c, const float observation[COAX_OBSERVED], const
     error[2] = HOVER_HEIGHT - y[AT_HEIGHT];
     error[3] = -wrapped(y[AT_HEADING]);
     for (int k = 0; k < 4; k++) {
-        if (there)
+        if (there[AXIS_PLACE] && there[AXIS_HEIGHT] && there[AXIS_HEADING])
             c->sum[k] += PERIOD * error[k];
         c->sum[k] = within(c->sum[k], -most[k], most[k]);
     }

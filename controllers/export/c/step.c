@@ -6,13 +6,13 @@ void coax_step(coax_controller *c, const float observation[COAX_OBSERVED], const
 {
     float seen[COAX_OBSERVED], reading[READINGS], before[4];
     const float *now = observation;
-    int there = 1;
+    int there[AXES] = {1, 1, 1};
     blend b;
 
     if (way) {
         for (int k = 0; k < 4; k++)
             before[k] = c->asked[k];
-        there = see_from_target(observation, way, c->asked, seen);
+        see_from_target(observation, way, reach(c, way), c->asked, seen, there);
         now = seen;
         if (c->started && isfinite(now[OBSERVED_PSI]))
             follow(c, before, c->asked[HEADING] + now[OBSERVED_PSI]);

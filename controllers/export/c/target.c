@@ -2,10 +2,10 @@
 /* --- the flight, seen from the target ------------------------------------------------------------- */
 
 /* A way, or its beginning where it is longer than a setpoint may be away at once. */
-static void within_reach(const float *way, float *first)
+static void within_reach(const float *way, float place, float *first)
 {
     const float distance = fmaxf(hypotf(way[FORWARD], way[RIGHT]), LEAST_DISTANCE);
-    const float share = fminf(1.0f, REACH_PLACE / distance);
+    const float share = fminf(1.0f, place / distance);
 
     first[FORWARD] = way[FORWARD] * share;
     first[RIGHT] = way[RIGHT] * share;
@@ -15,20 +15,23 @@ static void within_reach(const float *way, float *first)
 
 /* The observation as that of a hover at the target, or on the way to it.
  *
- * asked: the setpoint, x y z psi; without a way or a reading that it takes, it stays the last one.
- * Returns whether the setpoint is the target itself.
+ * place: how far the setpoint may be away [m]. asked: the setpoint, x y z psi; without a way or a
+ * reading that it takes, it stays the last one. there: whether it is the target itself in place, height
+ * and heading.
  */
-static int see_from_target(const float *observation, const float *way, float *asked, float *seen)
+static void see_from_target(const float *observation, const float *way, float place, float *asked,
+                            float *seen, int *there)
 {
     const float x = observation[AT_NORTH], y = observation[AT_EAST];
     const float z = HEIGHT_SIGN * observation[AT_HEIGHT], psi = observation[AT_HEADING];
     const float measured = x + y + z + psi, wanted = way[0] + way[1] + way[2] + way[3];
-    int there = 1;
+    there[AXIS_PLACE] = there[AXIS_HEIGHT] = there[AXIS_HEADING] = 1;
     if (isfinite(measured) && isfinite(wanted)) {
         float first[4];
-        within_reach(way, first);
-        for (int k = 0; k < 4; k++)
-            there = there && first[k] == way[k];
+        within_reach(way, place, first);
+        there[AXIS_PLACE] = first[FORWARD] == way[FORWARD] && first[RIGHT] == way[RIGHT];
+        there[AXIS_HEIGHT] = first[UP] == way[UP];
+        there[AXIS_HEADING] = first[TURN] == way[TURN];
         turn(&first[FORWARD], &first[RIGHT], psi);
         asked[NORTH] = x + first[FORWARD];
         asked[EAST] = y + first[RIGHT];
@@ -44,5 +47,4 @@ static int see_from_target(const float *observation, const float *way, float *as
     seen[AT_HEADING] = wrapped(psi - asked[HEADING]);
     if (AT_SPEED_NORTH >= 0)
         turn(&seen[AT_SPEED_NORTH], &seen[AT_SPEED_EAST], -asked[HEADING]);
-    return there;
 }
