@@ -811,6 +811,25 @@ def test_machines_are_flown_once(tmp_path):
         and "LQG, 1 machines" in machines.in_words(machines.summary(first))[0]
     )
     assert "machine 2" in machines.machines_page(first)
+    with pytest.raises(InputError, match="another world"):
+        list(machines.fly_machines([2], LAMA, tmp_path, 2, truth=True, wind=2.0))
+
+
+def test_machines_fly_to_a_position_in_wind(tmp_path):
+    """The same machine costs more there than hovering in still air, and the page says where it flew."""
+    from controllers import machines
+
+    out = {}
+    for name, world in (("still", {}), ("windy", {"task": "position", "wind": 4.0})):
+        flown = machines.fly_machines(
+            [2], "lama400d_outdoor", tmp_path / name, 2, truth=True, **world
+        )
+        out[name] = list(flown)
+    costs = {
+        name: found[0]["scores"]["lqg"]["corrected"]["mean_cost"] for name, found in out.items()
+    }
+    assert costs["windy"] > costs["still"]
+    assert "position, wind 4.0" in machines.machines_page(out["windy"])
 
 
 @pytest.mark.parametrize(("task", "sensors"), [("hover", "onboard"), ("position", "mocap")])
