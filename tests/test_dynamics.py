@@ -1040,8 +1040,11 @@ def test_no_two_compiled_functions_share_a_name():
     gc.collect()
     for thing in gc.get_objects():
         # its type, not isinstance: that asks a weak reference, whose object may be gone
-        if issubclass(type(thing), Dispatcher) and thing.py_func.__module__.startswith("coax_env"):
-            name = (thing.py_func.__module__, thing.py_func.__qualname__)
+        if not issubclass(type(thing), Dispatcher):
+            continue
+        module = thing.py_func.__module__ or ""  # None: no module of ours
+        if module.startswith("coax_env"):
+            name = (module, thing.py_func.__qualname__)
             assert names.setdefault(name, thing) is thing, name
     assert len(names) > 50
 
