@@ -86,10 +86,11 @@ def compare(
         InputError: no flight, no such parts, flights of two vehicles, or a log that contradicts itself.
     """
     report = reporter(progress)
-    flights = read_two(a, b, vehicle, waive)
-    if b is not None and of_one_flight(*(raw := (read(a), read(b)))):
-        machine = load_vehicle(vehicle or raw[0].vehicle)
-        return Comparison(difference(*raw, machine, settings, report), flights, {}, None)
+    first, second = read(a), None if b is None else read(b)
+    flights = read_two(first, second, vehicle, waive)
+    if second is not None and of_one_flight(first, second):
+        machine = load_vehicle(vehicle or first.vehicle)
+        return Comparison(difference(first, second, machine, settings, report), flights, {}, None)
     return of_two_flights(flights, settings, report)
 
 
