@@ -150,6 +150,7 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     nothing = SimpleNamespace()
     monkeypatch.setattr(evidence, "with_command_gains", gained)
     monkeypatch.setattr(evidence, "has_command_gains", lambda problem: problem.gains)
+    monkeypatch.setattr(evidence, "_is_white", lambda problem, fit: problem.white)
     monkeypatch.setattr(evidence, "converged", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "refined", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "linearise", lambda problem, fit: (fit, [], nothing))

@@ -17,6 +17,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, loss
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.whiteness import is_white
 
 
 @dataclass(frozen=True)
@@ -105,10 +106,10 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         it, and the lesser evidence of the two.
     """
     while True:
-        wider, trial = with_command_gains(problem, fit)
-        stated = has_command_gains(wider)
-        if not stated:  # colour spoils them for a model, not for the question
-            wider, trial = with_command_gains(problem, fit, coloured=True)
+        wider, trial = with_command_gains(problem, fit, coloured=True)
+        stated = has_command_gains(wider) and _is_white(
+            problem, fit
+        )  # colour spoils them for a model
         joint, alone = (wider, trial), (problem, fit)
         (first, start), (second, again) = (joint, alone) if stated else (alone, joint)
         pruned, quadratic, evidence = prune(first, start)
@@ -124,6 +125,11 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
             }
             return first, pruned, quadratic, lesser
         fit = _only(problem, fit, asked.active)
+
+
+def _is_white(problem: Problem, fit: Fit) -> bool:
+    """Whether the readings' innovations are."""
+    return is_white(problem.engine.filter(fit.values, fit.noise), problem.model.channels)
 
 
 def _only(problem: Problem, fit: Fit, causes: Collection[str]) -> Fit:
