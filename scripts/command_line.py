@@ -66,17 +66,25 @@ def add_waive(parser: Parser) -> None:
 def add_since(parser: Parser) -> None:
     """``--since``, of an edit of a log."""
     parser.add_argument(
-        "--since", type=_moment, metavar="RUN:T",
+        "--since", type=lambda text: named_number(text, ":", "RUN:T"), metavar="RUN:T",
         help="from this moment on [s]: earlier runs and earlier rows stay",
     )  # fmt: skip
 
 
-def _moment(text: str) -> tuple[str, float]:
-    run, _, t = text.rpartition(":")
+def named_number(text: str, separator: str, form: str) -> tuple[str, float]:
+    """A name and a number, as one word of the command line.
+
+    Args:
+        text: as typed. separator: the last one parts them. form: how it should read.
+
+    Raises:
+        ArgumentTypeError: it does not.
+    """
+    name, parted, number = text.rpartition(separator)
     try:
-        return run, float(t)
+        return (name if parted else text), float(number if parted else "")
     except ValueError:
-        raise argparse.ArgumentTypeError(f"should be RUN:T, found {text!r}") from None
+        raise argparse.ArgumentTypeError(f"should be {form}, found {text!r}") from None
 
 
 class Waived(argparse.Action):

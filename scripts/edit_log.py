@@ -32,11 +32,7 @@ def arguments() -> argparse.Namespace:
 
 
 def _edit(text: str) -> tuple[str, float]:
-    name, _, size = text.partition("=")
-    try:
-        return name, float(size)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"should be NAME=SIZE, found {text!r}") from None
+    return command_line.named_number(text, "=", "NAME=SIZE")
 
 
 if __name__ == "__main__":
