@@ -19,9 +19,9 @@ from injector_air import Air
 
 from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.settings import SETTINGS
-from study.judge import tied
+from study.judge import tied, wilson
 from study.onset_worth import worth_of_change
-from study.pairs import FAULTS, wilson
+from study.pairs import FAULTS
 from study.plan import sizes_of
 
 RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")

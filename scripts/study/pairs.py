@@ -16,7 +16,7 @@ from injector_craft import LAMA
 
 from coax_env.comparison.compare import compare
 from coax_env.diagnosis.settings import SETTINGS
-from study.judge import TIES
+from study.judge import TIES, wilson
 from study.plan import sizes_of
 
 RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
@@ -194,16 +194,6 @@ def judged(row: Mapping[str, Any]) -> dict[str, Any]:
 def _tied(names: set[str], truth: set[str]) -> bool:
     """Whether one name stands for another that was declared the same before the study."""
     return len(names) == len(truth) == 1 and any(names | truth <= tie for tie in TIES)
-
-
-def wilson(right: int, of: int) -> tuple[float, float]:
-    """95 % interval of a share (Wilson 1927)."""
-    if not of:
-        return 0.0, 1.0
-    z, p = 1.96, right / of
-    middle = (p + z * z / (2 * of)) / (1 + z * z / of)
-    half = z * math.sqrt(p * (1 - p) / of + z * z / (4 * of * of)) / (1 + z * z / of)
-    return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
 def text_of(rows: Sequence[Mapping[str, Any]]) -> str:
