@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from coax_env.comparison.candidates import numbers, plain, scored
-from coax_env.comparison.search import Changed, Weighed, alternatives, changes_found, pruned
+from coax_env.comparison.search import Changed, Weighed, alternatives, changes_found, standing
 from coax_env.comparison.shared import (
     joint_problem,
     joint_start,
@@ -126,7 +126,7 @@ def of_two_flights(
             break
     report("weighing the changes")
     state = replace(state, fit=with_drifts(state.problem, state.fit, settings))
-    state, quadratic, evidence = pruned(state)
+    state, quadratic, evidence = standing(state)
     found = alternatives(state, quadratic, evidence)
     white = _whiteness(state)
     entries = _changes(state, quadratic, evidence, found)

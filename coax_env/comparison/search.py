@@ -1,9 +1,11 @@
 """Which changes do two flights show? Forward by the quadratic, accepted by a refit, and backward."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 from coax_env.comparison.candidates import Numbers, Score, best_first, scored
+from coax_env.comparison.shared import with_pilots, without_pilots
 from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, short_memories
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import scores
@@ -60,6 +62,13 @@ class Changed:
             effects=tuple(e for e in self.effects if e != effect),
         )
 
+    def with_only(self, effects: Collection[str]) -> "Changed":
+        """With no others; nothing is fitted."""
+        kept = self
+        for effect in set(self.effects) - set(effects):
+            kept = kept.without(effect)
+        return kept
+
     def linearised(self) -> tuple["Changed", Quadratic]:
         """The quadratic over everything, and the fit with its objective."""
         wider = self.wider()
@@ -87,6 +96,10 @@ class Changed:
     def shaken_shortly(self) -> "Changed":
         """With `short_memories`."""
         return replace(self, fit=replace(self.fit, noise=short_memories(self.fit.noise)))
+
+    def converged(self) -> "Changed":
+        """Noise levels and what is free by turns until neither gains."""
+        return replace(self, fit=converged(self.problem, self.fit))
 
     def with_noise(self) -> "Changed":
         """Noise levels fitted, and what is free once more."""
@@ -122,17 +135,29 @@ def changes_found(state: Changed, clearer_than_effects: bool = False) -> Changed
 
 def _accepted(state: Changed, quadratic: Quadratic, found: Sequence[Score]) -> Changed | None:
     """The best few changes fitted, noise levels too; the best of them, where it pays."""
-    best, most = None, state.problem.settings.evidence
-    for score in found[:TRIED]:
-        if score.nats > WORTH_A_FIT:
-            begin = state.with_change(score.effect).at_optimum(quadratic)
-            trial = begin.shaken_shortly().fitted().with_noise()
-            gained = state.fit.objective - trial.fit.objective - score.occam
-            if gained > most:
-                best, most = trial, gained
-    if best is not None:
-        state.problem.report(f"{best.effects[-1]} changed: {most:.1f} nats")
-    return best
+    asked = [score for score in found[:TRIED] if score.nats > WORTH_A_FIT]
+    trials = {s.effect: _fitted_with(state, quadratic, s) for s in asked}
+    gains = {s.effect: _gained(state, trials[s.effect], s) for s in asked}
+    enough = state.problem.settings.evidence
+    if asked and max(gains.values()) <= enough < asked[0].nats:  # noise began too far away
+        best = max(asked, key=lambda s: gains[s.effect])
+        trials[best.effect] = trials[best.effect].converged()
+        gains[best.effect] = _gained(state.converged(), trials[best.effect], best)
+    effect = max(gains, key=gains.__getitem__, default=None)
+    if effect is None or gains[effect] <= enough:
+        return None
+    state.problem.report(f"{effect} changed: {gains[effect]:.1f} nats")
+    return trials[effect]
+
+
+def _fitted_with(state: Changed, quadratic: Quadratic, score: Score) -> Changed:
+    """With one more change and noise levels of its own, from short memories on."""
+    begin = state.with_change(score.effect).at_optimum(quadratic)
+    return begin.shaken_shortly().fitted().with_noise()
+
+
+def _gained(state: Changed, trial: Changed, score: Score) -> float:
+    return state.fit.objective - trial.fit.objective - score.occam
 
 
 def dropped(state: Changed, refused: set[str] | None = None) -> Changed:
@@ -173,34 +198,86 @@ class Weighed:
     lost: float
 
 
-def weighed(state: Changed, quadratic: Quadratic) -> dict[str, Weighed]:
+def standing(state: Changed) -> tuple[Changed, Quadratic, dict[str, Weighed]]:
+    """The changes that stand by the readings alone and with what commands show of the gusts.
+
+    As the names of a diagnosis do (diagnosis/evidence.py): alone, two pilots who see the gusts look
+    like two machines, of which one answers late; with the gains of their commands, like a damping.
+
+    Args:
+        state: after the search, its command gains free where they are to be stated.
+
+    Returns:
+        `pruned`, and of each change the lesser evidence.
+    """
+    while True:
+        first, quadratic, evidence = pruned(state)
+        for other in _asked_otherwise(first):
+            asked, _, again = pruned(other, clear=evidence)
+            if asked.effects != first.effects:
+                state = first.with_only(asked.effects)
+                break
+            evidence |= {e: min(evidence[e], w, key=lambda w: w.nats) for e, w in again.items()}
+        else:
+            return first, quadratic, evidence
+
+
+def _asked_otherwise(state: Changed) -> list[Changed]:
+    """The same changes, commands taken as given, and with all that they show, where that is more."""
+    if not state.effects:
+        return []
+    found = []
+    for problem, fit in (
+        without_pilots(state.problem, state.fit),
+        with_pilots(state.problem, state.fit, coloured=True),
+    ):
+        if len(problem.added) != len(state.problem.added):
+            found.append(replace(state, problem=problem, fit=fit))
+    return found
+
+
+def weighed(
+    state: Changed, quadratic: Quadratic, clear: Mapping[str, Weighed] = MappingProxyType({})
+) -> dict[str, Weighed]:
     """Each change against the refit without it: the less of that and of what the quadratic says.
 
     Args:
         state: converged.
         quadratic: linearised there.
+        clear: evidence known before; what is worth several thresholds by it is not asked again, unless
+            the quadratic doubts it.
     """
+    chosen = state.problem.settings
+    enough = chosen.clear_evidence * chosen.evidence
 
-    def one(effect: str) -> Weighed:
-        score = worth_of(state, quadratic, effect)
+    def one(effect: str, score: Score) -> Weighed:
         rest = state.without(effect).fitted().with_noise()
         lost = rest.fit.objective - state.fit.objective
-        if lost < 3.0 * state.problem.settings.evidence * score.inflation:
-            rest = replace(rest, fit=converged(rest.problem, rest.fit))
+        if lost < 3.0 * chosen.evidence * score.inflation:
+            rest = rest.converged()
             lost = rest.fit.objective - state.fit.objective
         return Weighed(
             min(lost, score.gained) / score.inflation - score.occam, score.inflation, lost
         )
 
-    return {effect: one(effect) for effect in state.effects}
+    scores = {e: worth_of(state, quadratic, e) for e in state.effects}
+    asked = (
+        e for e, s in scores.items() if s.nats < enough or e not in clear or clear[e].nats < enough
+    )
+    return {e: one(e, scores[e]) for e in asked}
 
 
-def pruned(state: Changed) -> tuple[Changed, Quadratic, dict[str, Weighed]]:
-    """Converged, without the changes whose evidence is gone by then."""
+def pruned(
+    state: Changed, clear: Mapping[str, Weighed] = MappingProxyType({})
+) -> tuple[Changed, Quadratic, dict[str, Weighed]]:
+    """Converged, without the changes whose evidence is gone by then.
+
+    Args:
+        state: after the search. clear: as `weighed`.
+    """
     while True:
-        state = replace(state, fit=converged(state.problem, state.fit))
-        state, quadratic = state.linearised()
-        evidence = weighed(state, quadratic)
+        state, quadratic = state.converged().linearised()
+        evidence = weighed(state, quadratic, clear)
         weakest = min(evidence, key=lambda e: evidence[e].nats, default=None)
         if weakest is None or evidence[weakest].nats >= state.problem.settings.evidence:
             return state, quadratic, evidence

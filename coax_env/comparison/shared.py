@@ -16,7 +16,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import Settings
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
-from coax_env.estimation.parted_engine import Part, PartedEngine, joint_noise, of_part
+from coax_env.estimation.parted_engine import AT, Part, PartedEngine, joint_noise, of_part
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.model import parameters as P
 from coax_env.progress import Progress
@@ -105,40 +105,67 @@ def with_drifts(problem: Problem, fit: Fit, settings: Settings) -> Fit:
     return with_latent_noise(replace(problem, settings=settings), fit) or fit
 
 
-def with_pilots(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+def with_pilots(problem: Problem, fit: Fit, coloured: bool = False) -> tuple[Problem, Fit]:
     """What each flight's commands show of its gusts, where that gains more than a tie.
 
     A pilot who sees the gusts looks like a machine that answers late: two pilots like a change.
 
     Args:
         problem, fit: after a search.
+        coloured: also of flights whose innovations are not white: to ask changes, not to be stated.
     """
     parts, added = [], []
     values: dict[str, float] = {}
     for part in parts_of(problem):
-        alone = replace(
-            problem,
-            model=machine(part.engine),
-            engine=part.engine,
-            added=tuple(
-                replace(f, name=f.name.partition("@")[0], value=0.0)
-                for f in problem.added
-                if f.name.endswith(of_part("", part.name))
-                and f.name.partition("@")[0] not in {g.name for g in problem.parameters}
-            ),
-            progress=None,
-        )
-        own = replace(fit, values=part.values(fit.values), noise=part.noise(fit.noise))
-        own = fitted(alone, own)
-        wider, trial = with_command_gains(alone, own)
-        if has_command_gains(wider):
-            part = replace(part, engine=wider.engine)
-            gains = [f for f in wider.added if f.name in P.COMMAND_GAINS]
-            added += [replace(f, name=of_part(f.name, part.name)) for f in gains]
-            values |= {of_part(f.name, part.name): trial.values[f.name] for f in gains}
+        if not _has_pilot(problem, part):
+            gains, values_of_part, engine = _pilot(problem, fit, part, coloured)
+            part = replace(part, engine=engine)
+            added += gains
+            values |= values_of_part
         parts.append(part)
     if not added:
         return problem, fit
-    problem.report("the commands carry information on the gusts")
     wider = replace(problem.with_free(added), engine=PartedEngine(parts))
     return wider, fitted(wider, fit.at(values))
+
+
+def without_pilots(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """With the commands taken as given; nothing is fitted.
+
+    Args:
+        problem, fit: as `with_pilots` returns them, or without any.
+    """
+    gains = {f.name for f in problem.added if f.name.partition(AT)[0] in P.COMMAND_GAINS}
+    return problem.with_fixed(gains), fit.at(dict.fromkeys(gains, 0.0))
+
+
+def _has_pilot(problem: Problem, part: Part) -> bool:
+    return any(of_part(n, part.name) in {f.name for f in problem.added} for n in P.COMMAND_GAINS)
+
+
+def _pilot(
+    problem: Problem, fit: Fit, part: Part, coloured: bool
+) -> tuple[list[FreeParameter], dict[str, float], Engine]:
+    """A flight's command gains, their values, its engine with input innovations; or none."""
+    shared = {g.name for g in problem.parameters}
+    own_numbers = [f for f in problem.added if f.name.endswith(of_part("", part.name))]
+    alone = replace(
+        problem,
+        model=machine(part.engine),
+        engine=part.engine,
+        added=tuple(
+            replace(f, name=plain, value=0.0)
+            for f in own_numbers
+            if (plain := f.name.partition(AT)[0]) not in shared
+        ),
+    )
+    own = replace(fit, values=part.values(fit.values), noise=part.noise(fit.noise))
+    wider, trial = with_command_gains(alone, fitted(alone, own), coloured)
+    if not has_command_gains(wider):
+        return [], {}, part.engine
+    gains = [f for f in wider.added if f.name in P.COMMAND_GAINS]
+    return (
+        [replace(f, name=of_part(f.name, part.name)) for f in gains],
+        {of_part(f.name, part.name): trial.values[f.name] for f in gains},
+        wider.engine,
+    )
