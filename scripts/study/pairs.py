@@ -69,14 +69,17 @@ class Pair:
 def planned(changed: bool, number: int, seed: int, whole: bool = False) -> Pair:
     """A pair, drawn from the study's seed, its kind and its number alone."""
     rng = np.random.default_rng([seed, int(changed), number])
-    faults = FAULTS[number % len(FAULTS)]
+    turn = number + number // len(
+        CHANGES
+    )  # every change meets every fault, in gusts and in still air
+    faults = FAULTS[turn % len(FAULTS)]
     change = {}
     if changed:
         effect = CHANGES[number % len(CHANGES)]
         change = {effect: sizes_of(effect, rng)}
         if effect == "swash_phase":
             change[effect]["per_rpm"] = 0.0
-    airs = (_air(rng, number), _air(rng, number))
+    airs = (_air(rng, turn), _air(rng, turn))
     dense = [float(d) for d in rng.choice(DENSITIES, 2)]
     pilots = [str(p) for p in rng.choice(["usual", "stabiliser", "slow_human"], 2)]
     faster = float(rng.uniform(1.0 - LARGEST_CHARGE, 1.0 + LARGEST_CHARGE))
@@ -93,9 +96,9 @@ def planned(changed: bool, number: int, seed: int, whole: bool = False) -> Pair:
     )
 
 
-def _air(rng: np.random.Generator, number: int) -> dict[str, Any]:
+def _air(rng: np.random.Generator, turn: int) -> dict[str, Any]:
     """Still air in every other pair, else gusts of any strength and memory."""
-    if number % 2 == 0:
+    if turn % 2 == 0:
         return {"gusts": "none"}
     scale = float(rng.uniform(0.5, 1.5))
     return {
