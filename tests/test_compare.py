@@ -1,8 +1,10 @@
 """Two flights of one machine: what changed is named, and "the same" is the answer where nothing did."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,20 +12,23 @@ from shared_flights import shared_flight
 from study import pairs
 
 import coax_env
-from coax_env.comparison.candidates import scored
+from coax_env.comparison import search
+from coax_env.comparison.candidates import Score, scored
 from coax_env.comparison.compare import compare
 from coax_env.comparison.information import Information
 from coax_env.comparison.logbook import logbook, over_time
+from coax_env.comparison.search import Changed
 from coax_env.comparison.two_flights import ROTOR_SPEED, MachineModel, read_two
 from coax_env.comparison.two_logs import of_one_flight
-from coax_env.diagnosis.problem import Problem
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.settings import SETTINGS
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.parted_engine import Part, PartedEngine, joint_noise
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.state_space import FreeParameter
+from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.logs.edits import edited
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
 from coax_env.model.vehicle_file import load_vehicle
@@ -137,6 +142,83 @@ def test_a_changes_score_is_its_log_bayes_factor():
     spread = s**2 + 1.0 / information  # of z under the change; without it 1 / information
     exact = 0.5 * z**2 * (information - 1.0 / spread) - 0.5 * np.log(spread * information)
     assert score.nats == pytest.approx(exact, rel=1e-12)
+
+
+# --- a change stands by both likelihoods --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Stands for a problem: what is free in it."""
+
+    added: tuple[str, ...]
+
+    def with_fixed(self, names: set[str]) -> "Numbers":
+        return self
+
+
+def standing_of(monkeypatch, effects: tuple[str, ...], alone, joint, stated: bool) -> Any:
+    """The changes that `standing` leaves, with evidence by set of changes of each likelihood [nats]."""
+
+    def pruned(state: Changed, clear=()):
+        table = alone if state.problem.added == ("own",) else joint
+        while state.effects:
+            nats = table[frozenset(state.effects)]
+            weakest = min(state.effects, key=nats.__getitem__)
+            if nats[weakest] >= 14.0:
+                return state, None, {e: search.Weighed(nats[e], 1.0, nats[e]) for e in nats}
+            state = state.with_only(set(state.effects) - {weakest})
+        return state, None, {}
+
+    def with_gains(problem, fit, coloured=False):
+        return Numbers(("own", "gain")), fit
+
+    def without_gains(problem, fit):
+        return Numbers(("own",)), fit
+
+    monkeypatch.setattr(search, "pruned", pruned)
+    monkeypatch.setattr(search, "with_pilots", with_gains)
+    monkeypatch.setattr(search, "without_pilots", without_gains)
+    problem, fit = (with_gains if stated else without_gains)(None, Fit((), {}, Noise({})))
+    state, _, evidence = search.standing(Changed(problem, fit, effects, dict.fromkeys(effects, ())))
+    assert state.problem.added == problem.added and set(evidence) == set(state.effects)
+    return {e: evidence[e].nats for e in state.effects}
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_change_stands_by_the_readings_and_by_what_commands_show(monkeypatch, stated):
+    """A late servo that one of them does not carry leaves; the other change is asked again."""
+    alone = {frozenset({"servo_delay", "mass"}): {"servo_delay": 18.0, "mass": 90.0}}
+    joint = {frozenset({"servo_delay", "mass"}): {"servo_delay": -3.0, "mass": 70.0}}
+    for table, mass in ((alone, 87.0), (joint, 77.0)):
+        table[frozenset({"mass"})] = {"mass": mass}
+    for tables in ((alone, joint), (joint, alone)):
+        found = standing_of(monkeypatch, ("servo_delay", "mass"), *tables, stated)
+        assert found == {"mass": 77.0}
+
+
+@pytest.mark.parametrize(
+    ("begun", "ended", "worth", "named"),
+    [(-50.0, -80.0, 60.0, True), (-50.0, -30.0, 60.0, False), (-50.0, -80.0, 10.0, False)],
+)
+def test_a_change_is_refused_with_its_noise_fitted_to_the_end(
+    monkeypatch, begun, ended, worth, named
+):
+    """Noise levels begin far from where they end: a centre of gravity worth 52 nats was refused so."""
+    problem = SimpleNamespace(settings=SETTINGS, report=lambda text: None)
+    turn = Fit((), {}, Noise({}))
+
+    class Begun(Changed):
+        def converged(self) -> Changed:
+            return replace(self, fit=replace(self.fit, objective=ended if self.effects else -45.0))
+
+    def proposed(state: Changed, quadratic, score: Score) -> Changed:
+        return Begun(problem, replace(turn, objective=begun + 20.0), (score.effect,), {})
+
+    monkeypatch.setattr(search, "_fitted_with", proposed)
+    state = Begun(problem, replace(turn, objective=-40.0), (), {})
+    found = search._accepted(state, None, [Score("cg_offset", worth + 5.0, 5.0, {}, {})])
+    assert (found is not None) == named
 
 
 # --- what is refused --------------------------------------------------------------------------------
