@@ -2,6 +2,7 @@
 
 import gc
 import subprocess
+from pathlib import Path
 
 import numba
 import pytest
@@ -11,6 +12,7 @@ from numba.extending import overload
 from coax_env.estimation import compile_ahead, frozen_gains, kalman, noise_score
 from coax_env.kernel import compilation
 from coax_env.kernel.compilation import compiled_when_called
+from coax_env.kernel.numba_internals import PackagedCacheLocator
 
 
 def test_what_only_python_calls_is_compiled_when_it_is_called(tmp_path, monkeypatch):
@@ -25,6 +27,16 @@ def test_what_only_python_calls_is_compiled_when_it_is_called(tmp_path, monkeypa
     assert doubled(1.5) == 3.0 and doubled.prepare() is doubled.prepare()
     assert list(tmp_path.rglob("*doubled*.nbc"))
     assert not (tmp_path / "with a user's effect").exists()
+
+
+def test_a_copy_of_the_package_loads_what_was_compiled_for_the_other(tmp_path):
+    """The place in the cache is the file's in the package; a user's own file keeps its whole path."""
+    package = Path(compilation.__file__).parents[1]
+    place = PackagedCacheLocator.get_suitable_cache_subpath
+    assert place(str(package / "model" / "dynamics.py")) == "coax_env_model"
+    assert place(str(tmp_path / "a" / "own.py")) != place(str(tmp_path / "b" / "own.py"))
+    used = [d for d in compilation.CACHE_DIR.iterdir() if d.name.startswith("coax_env_")]
+    assert used and not any(len(d.name) > 40 for d in used), "a hash of a path"
 
 
 def probed(x):

@@ -3,25 +3,25 @@
 numba's own cache looks at the file of the function being compiled, not at the files of the functions
 it calls: edit a callee in another module and the old machine code still runs.
 So the cache folder here is named by a hash over every source that takes part in the kernel; any edit
-gives a new folder, and the old one is left to age.
+gives a new folder, and the old one is left to age. Where the package lies does not matter: copies that
+are the same to the last byte share what was compiled.
 """
 
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import cache, wraps
 from pathlib import Path
 from typing import Any
 
 import numba
 
-from coax_env.kernel.numba_internals import compile_uncollected
+from coax_env.kernel.numba_internals import PACKAGE, cached_in, compile_uncollected
 
 compile_uncollected()
 
-PACKAGE = Path(__file__).parents[1]
 COMPILED_ROOMS = ("kernel", "model")
 
 
@@ -67,14 +67,8 @@ def include(path: Path) -> None:
     CACHE_DIR = _cache_root() / source_hash(tuple(_included))
 
 
-@contextmanager
-def _own_cache(folder: Path | None = None) -> Iterator[None]:
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(folder or CACHE_DIR)
-    try:
-        yield
-    finally:
-        numba.config.CACHE_DIR = before
+def _own_cache(folder: Path | None = None) -> AbstractContextManager[None]:
+    return cached_in(str(folder or CACHE_DIR))
 
 
 def name_apart(function: Callable, *values: Any) -> Callable:

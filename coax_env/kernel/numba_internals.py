@@ -7,12 +7,14 @@ that the tests have run with. `context` and `builder` are those that numba hands
 
 import gc
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from llvmlite import ir
-from numba import types
-from numba.core import cgutils, event
+from numba import config, types
+from numba.core import caching, cgutils, event
 from numba.core.imputils import impl_ret_borrowed
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, Signature, infer_global, signature
@@ -28,6 +30,47 @@ unpack_tuple = cgutils.unpack_tuple
 """``unpack_tuple(builder, value, count)``: a tuple's elements."""
 if_unlikely = cgutils.if_unlikely
 """``with if_unlikely(builder, condition):`` code for what hardly ever happens."""
+
+
+PACKAGE = Path(__file__).parents[1]
+
+
+class PackagedCacheLocator(caching.UserProvidedCacheLocator):
+    """A function's place in the cache by its file's place in the package, wherever the package lies.
+
+    numba's own has the folder's path in it: a copy, a wheel and a checkout would each compile what
+    is the same to the last byte. A user's own file keeps numba's place.
+    """
+
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file: str) -> str:
+        """Folder within the cache.
+
+        Args:
+            py_file: path of the source.
+        """
+        folder = Path(py_file).resolve().parent
+        if folder.is_relative_to(PACKAGE):
+            return "_".join(folder.relative_to(PACKAGE.parent).parts)
+        return super().get_suitable_cache_subpath(py_file)
+
+
+@contextmanager
+def cached_in(folder: str) -> Iterator[None]:
+    """What is decorated meanwhile is cached there, each source in a folder of its own.
+
+    Args:
+        folder: named by the content of all sources.
+    """
+    names = ("CACHE_DIR", "CACHE_LOCATOR_CLASSES")
+    before = {name: getattr(config, name) for name in names}
+    config.CACHE_DIR = folder
+    config.CACHE_LOCATOR_CLASSES = f"{__name__}.{PackagedCacheLocator.__name__}"
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(config, name, value)
 
 
 class _Uncollected(event.Listener):
