@@ -39,7 +39,8 @@ def main() -> None:
     options = arguments()
     log = read_flight(options.flight)
     with command_line.progress("edits") as report_progress:
-        rows = check(log, options.vehicle, dict(options.edit), report_progress, options.since)
+        before = before_edits(log, options.vehicle, report_progress)
+        rows = check(log, before, dict(options.edit), report_progress, options.since)
     write_json(options.out / "edits.json", rows)
     show(rows)
     if options.since is not None:
@@ -77,9 +78,26 @@ def _edit(text: str) -> tuple[str, float]:
         raise argparse.ArgumentTypeError(f"should be NAME=SIZE, found {text!r}") from None
 
 
+def before_edits(
+    log: "Flight", vehicle: str | None, report_progress: Callable[[str], None]
+) -> "Before":
+    """The model of a flight as it was logged.
+
+    Args:
+        log: the flight as read.
+        vehicle: shipped name or path; None: the card's.
+        report_progress: called with a line of text.
+    """
+    from coax_env import load_vehicle
+    from coax_env.diagnosis.changes import Before, calm, fitted_model
+
+    machine = load_vehicle(vehicle or log.vehicle).in_air(log.air)
+    return Before.of(*fitted_model(calm(log, machine), machine, progress=report_progress))
+
+
 def check(
     log: "Flight",
-    vehicle: str | None,
+    before: "Before",
     edits: Mapping[str, float],
     report_progress: Callable[[str], None],
     since: tuple[str, float] | None = None,
@@ -87,20 +105,16 @@ def check(
     """Every edit of a flight, one at a time, and what the difference says.
 
     Args:
-        log: the flight as read.
-        vehicle: shipped name or path; None: the card's.
+        log: the flight as read. before: `before_edits` of it.
         edits: name -> size.
         report_progress: called with a line of text.
         since: run and time [s] from which on each edit holds; None: in the whole flight.
     """
-    from coax_env import load_vehicle
-    from coax_env.diagnosis.changes import Before, calm, changes, fitted_model
+    from coax_env.diagnosis.changes import calm, changes
     from coax_env.estimation.helicopter import record_of
     from coax_env.logs.edits import edited
 
-    machine = load_vehicle(vehicle or log.vehicle).in_air(log.air)
-    flight = calm(log, machine)
-    before = Before.of(*fitted_model(flight, machine, progress=report_progress))
+    flight = calm(log, before.problem.model.vehicle)
     rows = []
     for name, size in edits.items():
         report_progress(f"{name} {size:g}")
