@@ -477,9 +477,9 @@ def test_the_causes_are_those_of_the_sound_flight(tmp_path):
 @pytest.mark.slow
 @pytest.mark.needs_shared_flights
 def test_the_second_coax_is_read_cut_and_diagnosed():
-    """25 Hz, 21 gaps, one of 1.3 s, which cuts its run in two."""
-    result = diagnose(shared_flight("skybotix_second"), hold_out=["4x5ft_1"])
+    """25 Hz, 21 gaps, one of 1.3 s, which cuts its run in two; two of its four runs, for time."""
+    flight = read_flight(shared_flight("skybotix_second")).select(("4x5ft_1", "15ft_1"))
+    result = diagnose(flight, hold_out=["4x5ft_1"])
     assert result.findings["gain"]["held_out"] == ["4x5ft_1"]
-    names = [run.name for run in result.flight.runs]
-    assert names == ["4x5ft_1", "4x5ft_1 (2)", "4x5ft_2", "15ft_1", "15ft_2"]
+    assert [run.name for run in result.flight.runs] == ["4x5ft_1", "4x5ft_1 (2)", "15ft_1"]
     assert "4x5ft_1: cut at a gap of 1.29 s, 20.3 s" in result.remarks
