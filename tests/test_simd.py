@@ -6,7 +6,6 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from corrected import FOUR, NINE
@@ -15,6 +14,7 @@ import coax_env
 from coax_env.env import fleet
 from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.kernel import simd
+from coax_env.kernel.compilation import compiled
 from coax_env.kernel.random_streams import normals_of
 from coax_env.kernel.simd import SIMD_WIDTH, simd_view, simd_view_uint64
 from coax_env.model import effects
@@ -46,27 +46,27 @@ EVERY = tuple(
 step_every, measure_every = step_and_measure_with(EVERY, "every")
 
 
-@numba.njit
+@compiled(makes_arrays=True)
 def _step_registers(x, u, p, work, out):
     step_any(simd_view(x), simd_view(u), 0.01, simd_view(p), simd_view(work), simd_view(out))
 
 
-@numba.njit
+@compiled(makes_arrays=True)
 def _measure_registers(x, u, p, work, out):
     measure_any(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
 
 
-@numba.njit(error_model="numpy")
+@compiled(makes_arrays=True)
 def _step_every(x, u, p, work, out):
     step_every(simd_view(x), simd_view(u), 0.01, simd_view(p), simd_view(work), simd_view(out))
 
 
-@numba.njit(error_model="numpy")
+@compiled(makes_arrays=True)
 def _measure_every(x, u, p, work, out):
     measure_every(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
 
 
-@numba.njit
+@compiled(makes_arrays=True)
 def _seldom_needed(x, power, tangent, sine, angle):
     for i in range(len(x)):
         simd_view(power)[i] = (1.0 + abs(simd_view(x)[i])) ** simd_view(x)[i]
@@ -75,31 +75,31 @@ def _seldom_needed(x, power, tangent, sine, angle):
         simd_view(angle)[i] = math.atan2(simd_view(x)[i], math.copysign(2.0, -simd_view(x)[i]))
 
 
-@numba.njit
+@compiled(makes_arrays=True)
 def _sine_and_cosine(x, sine, cosine):
     for i in range(len(x)):
         simd_view(sine)[i], simd_view(cosine)[i] = simd.sine_and_cosine(simd_view(x)[i])
 
 
-@numba.njit
+@compiled(makes_arrays=True)
 def _sine_and_cosine_of_numbers(x, sine, cosine):
     for i in range(len(x)):
         sine[i], cosine[i] = simd.sine_and_cosine(x[i])
 
 
-@numba.njit
+@compiled(makes_arrays=True)
 def _exponential(x, out):
     for i in range(len(x)):
         simd_view(out)[i] = math.exp(simd_view(x)[i])
 
 
-@numba.njit
+@compiled(makes_arrays=True)
 def _logarithm(x, out):
     for i in range(len(x)):
         simd_view(out)[i] = math.log(simd_view(x)[i])
 
 
-@numba.njit
+@compiled(makes_arrays=True)
 def _normals(bits, first, second):
     for i in range(len(bits)):
         simd_view(first)[i], simd_view(second)[i] = normals_of(simd_view_uint64(bits)[i])
@@ -406,13 +406,13 @@ def test_few_helicopters_are_not_worth_a_variant():
         assert CoaxVectorEnv(count, vehicle).fleet._side_by_side is expected
 
 
-@numba.njit
+@compiled(makes_arrays=True)
 def _branching(x, f, p, e):
     if x[S.R] > 0.0:
         f[0] += p[e]
 
 
-@numba.njit
+@compiled(makes_arrays=True)
 def _selecting(x, f, p, e):
     f[0] += simd.select(x[S.R] > 0.0, p[e], 0.0)
 
