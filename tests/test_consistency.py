@@ -165,6 +165,7 @@ def test_and_where_positions_are_logged(tmp_path, tmp_path_factory, what):
     said_right(planted(sound, tmp_path / "f", columns), right)
 
 
+@pytest.mark.slow
 def test_a_log_of_another_world_gets_all_its_lines_at_once(tmp_path):
     """Body x forward, y left, z up; yaw from the east, counted the other way round: as ROS has it."""
     turned = ("q", "r", "ay", "az", "theta")
@@ -289,6 +290,7 @@ def test_a_check_can_be_waived(tmp_path):
         refuse_disagreement(flight, vehicle, ("theta-qq",))
 
 
+@pytest.mark.slow
 def test_every_fault_can_be_waived_by_its_name(tmp_path):
     known = names()
     for what in ("down accelerometer taken for g", "swash as pulse widths", "rotors swapped"):

@@ -815,6 +815,7 @@ def test_machines_are_flown_once(tmp_path):
         list(machines.fly_machines([2], LAMA, tmp_path, 2, truth=True, wind=2.0))
 
 
+@pytest.mark.slow
 def test_machines_fly_to_a_position_in_wind(tmp_path):
     """The same machine costs more there than hovering in still air, and the page says where it flew."""
     from controllers import machines
