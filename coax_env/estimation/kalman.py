@@ -37,7 +37,7 @@ from coax_env.estimation.sparse import (
 )
 from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled, compiled_when_called, pointer
-from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
+from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks, transpose
 
 _A = float64[::1]
 _M = float64[:, ::1]
@@ -485,21 +485,24 @@ def _grow(assumed, dt, w):
 @compiled(**REORDER)
 def _predict(places, w):
     """P = F P F' + Q as F (F P)', and the mean of the step; `places` are those of Q's entries."""
-    nx = w.x.size
     multiply(w.F, w.P, w.FP)
-    for i in range(nx):
-        for j in range(nx):
-            w.PF[j, i] = w.FP[i, j]
+    transpose(w.FP, w.x.size, w.PF)
     multiply(w.F, w.PF, w.P)
-    for i in range(nx):
-        for j in range(i):
-            w.P[j, i] = w.P[i, j]
+    for i in range(w.x.size):
         w.x[i] = w.x_next[i]
     for e in range(w.Q.size):
         i, j = places[e, 0], places[e, 1]
         w.P[i, j] += w.Q[e]
         if i != j:
             w.P[j, i] += w.Q[e]
+
+
+@compiled(**REORDER)
+def _make_symmetric(P, nx):
+    """The lower half into the upper one: rounding parts them, and what differs may grow."""
+    for i in range(nx):
+        for j in range(i):
+            P[j, i] = P[i, j]
 
 
 # --- the pass ---------------------------------------------------------------------------------------
@@ -541,6 +544,7 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
         z, u, dt = run.z[k], run.u[k], run.dt[k]
         fresh = k % refresh == 0
         if fresh:
+            _make_symmetric(w.P, w.x.size)
             _linearise(model, u, dt, p, w)
             _take_H(w)
             if keep:
