@@ -29,7 +29,7 @@ from coax_env.diagnosis.input_innovations import has_command_gains, with_command
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import Settings
-from coax_env.estimation.beginnings import Beginning
+from coax_env.estimation.beginnings import Asked, Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
 from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.helicopter import Moment
@@ -163,7 +163,9 @@ def scored(state: Changing) -> list[Scored]:
     table = _Table.of(state, names)
     records = problem.engine.records
     rows = rows_of(records)
-    found = problem.engine.beginnings(fit.values, fit.noise, problem.parameters, rows, table.row_of)
+    found = problem.engine.beginnings(
+        fit.values, fit.noise, problem.parameters, rows, table.row_of, table.asked
+    )
     every = [
         (Moment(record.whole, float(record.t[row])), result)
         for record, of_run, results in zip(records, rows, found, strict=True)
@@ -289,14 +291,19 @@ class _Table:
         numbers, and the groups' matrices, row by row.
         """
         later = self.later[b.record]
-        across = b.across[:, self.rest] + later[:, self.rest]
+        across = b.across + later[:, self.rest]
         weights = across @ self.inverse
         slope = b.slope + self.slope_later[b.record] - weights @ self.pull
         i, j = self.pairs
-        of_rest = across[i]
-        own = b.own[i, j] + later[i, j] - np.einsum("pr,pr->p", of_rest, weights[j])
-        crossed = b.across[i, j] + later[i, j] - np.einsum("pr,pr->p", of_rest, self.always[1][j])
+        of_rest, behind = across[i], later[i, j]
+        own = b.own + behind - np.einsum("pr,pr->p", of_rest, weights[j])
+        crossed = b.crossed + behind - np.einsum("pr,pr->p", of_rest, self.always[1][j])
         return slope, own, crossed
+
+    @property
+    def asked(self) -> Asked:
+        """What it takes of a beginning."""
+        return Asked(self.rest, *self.pairs)
 
     @cached_property
     def always(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

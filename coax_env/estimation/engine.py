@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from coax_env.estimation import frozen_gains, kalman, noise_score
-from coax_env.estimation.beginnings import Answers, Beginning
+from coax_env.estimation.beginnings import Asked, Beginning, Moved, Sums, beginnings_pass
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.sparse import add_gram, aligned, padded
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
@@ -27,6 +27,7 @@ REFRESH = 4  # rows between new Jacobians, at least
 REFRESH_SECONDS = 0.04  # [s] in which they change little: more rows of a log faster than 100 Hz
 BLOCK = 2.0  # [s] of the blocks whose scores are taken as independent
 BLOCKS_AT_ONCE = 5  # whose signatures are held at a time: 7 MB at 100 Hz with every parameter
+NONE_KEPT = frozen_gains.Kept(np.zeros((0, 0, 0), np.float32), np.zeros(0, np.int64))
 DIVERGED = 1e6  # whitened innovations [std] that only a diverging mean has
 
 
@@ -301,7 +302,7 @@ class Engine:
                 edges, before = _block_edges(run)
                 blocks = np.zeros((edges.size - 1, len(free)))
                 if np.isfinite(run.log_likelihood):
-                    work = self._signatures(i, run, at, p, moves, by_channel)[0]
+                    work = self._signatures(i, run, at, p, moves, by_channel)
                     probed = self._probed_signatures(i, run, moves, by_channel)
                     e = run.innovations[np.isfinite(run.innovations)]
                     for first in range(0, edges.size - 1, BLOCKS_AT_ONCE):
@@ -311,7 +312,11 @@ class Engine:
                         J[:, count:] = 0.0
                         J[:, count] = e[since:until]
                         J[:, np.flatnonzero(moves.probed)] = probed[since:until]
-                        work(frozen_gains.Portion(int(own[0]), int(own[-1]), int(since)), J)
+                        work(
+                            frozen_gains.Portion(int(own[0]), int(own[-1]), int(since)),
+                            J,
+                            NONE_KEPT,
+                        )
                         for b, (a, z) in enumerate(pairwise(before[own] - since), first):
                             products = np.zeros((width, width))
                             add_gram(J[a:z], count, products)
@@ -353,19 +358,16 @@ class Engine:
         p: np.ndarray,
         moves: _Moves,
         by_channel: np.ndarray,
-    ) -> tuple[
-        Callable[[frozen_gains.Portion, np.ndarray], None], Callable[[np.ndarray], np.ndarray]
-    ]:
+    ) -> Callable[[frozen_gains.Portion, np.ndarray, frozen_gains.Kept], None]:
         """Derivatives of a run's whitened innovations where a small step does.
 
         Returns:
-            what puts those of a portion of the run, one after the other, into columns of J, and adds
-            their squares, by channel, to rows of `by_channel`; and what puts the state's derivatives
-            behind that portion into columns of (nx, k).
+            what puts those of a portion of the run, one after the other, into columns of J, adds their
+            squares, by channel, to rows of `by_channel`, and keeps the state's derivatives.
         """
         columns = np.flatnonzero(~moves.probed)
         if not columns.size:
-            return lambda portion, J: None, lambda out: out
+            return lambda portion, J, kept: None
         columns = columns[np.argsort(~moves.reading_only[columns], kind="stable")]
         vectors = [moves.vectors[k] for k in columns]
         sets, which = [run.inputs], np.zeros(columns.size, np.int64)
@@ -381,7 +383,9 @@ class Engine:
         s = aligned(self.compiled.exact.size, padded(columns.size + 1))
         trace = _trace(run, at)
 
-        def of_portion(portion: frozen_gains.Portion, J: np.ndarray) -> None:
+        def of_portion(
+            portion: frozen_gains.Portion, J: np.ndarray, kept: frozen_gains.Kept
+        ) -> None:
             frozen_gains.signature_pass(
                 self.compiled,
                 self.intervals[i],
@@ -393,13 +397,10 @@ class Engine:
                 s,
                 J,
                 by_channel,
+                kept,
             )
 
-        def of_state(out: np.ndarray) -> np.ndarray:
-            out[:, columns] = s[:, : columns.size]
-            return out
-
-        return of_portion, of_state
+        return of_portion
 
     def beginnings(
         self,
@@ -408,6 +409,7 @@ class Engine:
         free: Sequence[FreeParameter],
         rows: Sequence[np.ndarray],
         work: Callable[[Beginning], Any],
+        asked: Asked,
     ) -> list[list[Any]]:
         """What free parameters would do if they moved from some row of a run on; see beginnings.py.
 
@@ -418,7 +420,8 @@ class Engine:
             noise: levels of process and reading noise.
             free: the parameters.
             rows: of each record, rising.
-            work: is given each row's Beginning, the last row of a record first.
+            work: is given each row's Beginning.
+            asked: what is wanted of each, in places of `free`.
 
         Returns:
             what `work` returned, record by record and row by row.
@@ -431,7 +434,8 @@ class Engine:
                 run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
                 if not np.isfinite(run.log_likelihood):
                     return []
-                return self._beginnings_of_run(i, run, at, p, moves, rows[i], work)[::-1]
+                found = self._beginnings_of_run(i, run, at, p, moves, rows[i], asked)
+                return [work(b) for b in found]
 
         return self._each(one)
 
@@ -443,33 +447,30 @@ class Engine:
         p: np.ndarray,
         moves: _Moves,
         rows: np.ndarray,
-        work: Callable[[Beginning], Any],
-    ) -> list[Any]:
+        asked: Asked,
+    ) -> Iterator[Beginning]:
         k, nx = len(moves.vectors), self.compiled.exact.size
-        there = np.isfinite(run.innovations)
-        before = np.append(0, np.cumsum(there.sum(1)))
-        by_channel = np.zeros((k, there.shape[1]))
-        signatures, derivatives = self._signatures(i, run, at, p, moves, by_channel)
-        edges = np.unique([0, *rows, there.shape[0]])
-        J, states, portions = np.zeros((int(before[-1]), k)), [], []
-        J[:, moves.probed] = self._probed_signatures(i, run, moves, by_channel)
-        for first, last in pairwise(edges):
-            portions.append(frozen_gains.Portion(int(first), int(last), int(before[first])))
-            states.append(derivatives(np.zeros((nx, k))).astype(np.float32))
-            signatures(portions[-1], J[before[first] : before[last]])
+        width, n = padded(k + 1), run.innovations.shape[0]
+        readings = int(np.isfinite(run.innovations).sum())
+        by_channel = np.zeros((k, run.innovations.shape[1]))
+        J = aligned(readings, width)
+        kept = frozen_gains.Kept(
+            np.zeros((rows.size, nx, width), np.float32), np.full(n, -1, np.int64)
+        )
+        kept.places[rows] = np.arange(rows.size)
+        signatures = self._signatures(i, run, at, p, moves, by_channel)
+        signatures(frozen_gains.Portion(0, n, 0), J, kept)
+        J[:, np.flatnonzero(moves.probed)] = self._probed_signatures(i, run, moves, by_channel)
         wild = ~np.isfinite(J).all(0)
-        J[:, wild] = 0.0
-        e = run.innovations[there]
-        answers, slope, own = Answers(nx, k), np.zeros(k), np.zeros((k, k))
-        found, asked = [], set(rows.tolist())
-        for portion, s in zip(portions[::-1], states[::-1], strict=True):
-            here = slice(portion.reading, before[portion.last])
-            answers.back(_trace(run, at), self._refresh[i], portion, J[here])
-            slope, own = slope + e[here] @ J[here], own + J[here].T @ J[here]
-            if portion.first in asked:
-                s[:, wild] = 0.0
-                found.append(work(Beginning(i, portion.first, *answers.since(s, slope, own))))
-        return found
+        J[:, wild], kept.s[:, :, wild] = 0.0, 0.0
+        a, r, pairs = rows.size, asked.beside.size, asked.first.size
+        sums = Sums(
+            np.zeros((a, width)), np.zeros((a, r, width)), np.zeros((a, pairs)),
+            np.zeros((a, pairs)),
+        )  # fmt: skip
+        beginnings_pass(_trace(run, at), self._refresh[i], Moved(J, kept), asked, sums)
+        for row, slope, across, *of_pairs in zip(rows, *sums, strict=True):
+            yield Beginning(i, int(row), slope[:k], across[:, :k].T, *of_pairs)
 
     def _inputs(self, run: RunPass, p: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """A run's inputs with the parameters `vector`, known those with `p`."""

@@ -11,7 +11,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import boolean, float64, int64, types
+from numba import boolean, float32, float64, int64, types
 
 from coax_env.estimation.kalman import (
     _A,
@@ -114,6 +114,15 @@ class Portion(NamedTuple):
     reading: int
 
 
+class Kept(NamedTuple):
+    """The state's derivatives at some rows, before their readings: s (rows kept, nx, k or more), and
+    places: (n,) where in it a row's stand, or -1; empty: of none.
+    """
+
+    s: np.ndarray
+    places: np.ndarray
+
+
 class _Signatures(NamedTuple):
     """The arrays that a signature pass works in: a row for each state or reading, a column for each
     parameter, as many as are `padded`.
@@ -138,6 +147,7 @@ class _Signatures(NamedTuple):
 
 
 MOVES = types.NamedTuple([_M, _A, boolean[::1], float64[:, :, ::1], _N, _N], Moves)
+KEPT = types.NamedTuple([float32[:, :, ::1], _N], Kept)
 PORTION = types.NamedUniTuple(int64, 3, Portion)
 
 
@@ -258,10 +268,10 @@ def _propagate(exact, F, w):
 
 
 @compiled_when_called(
-    types.void(MODEL, _A, TRACE, _A, MOVES, int64, PORTION, _M, _M, _M),
+    types.void(MODEL, _A, TRACE, _A, MOVES, int64, PORTION, _M, _M, _M, KEPT),
     makes_arrays=True, **REORDER,
 )  # fmt: skip
-def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channel):
+def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channel, kept):
     """Derivatives of the whitened innovations in many parameters at once, gains frozen.
 
     What `mean_pass` gives with a parameter moved a little, to first order: with s the state's
@@ -283,6 +293,7 @@ def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channe
             return at the one after its last; zeros where the run begins.
         J: derivatives, out, one row for each reading of the portion, in the order of the innovations.
         by_channel: (k or more, m) their squares, added.
+        kept: Kept, out.
     """
     n, m = trace.e.shape
     nx, k_all = model.exact.size, moves.steps.size
@@ -305,6 +316,11 @@ def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channe
     F_slot = -1
     reading = portion.reading
     for row in range(portion.first, portion.last):
+        at = kept.places[row] if kept.places.size else -1
+        if at >= 0:
+            for j in range(nx):
+                for k in range(k_all):
+                    kept.s[at, j, moves.columns[k]] = s[j, k]
         if row % refresh == 0 or row == portion.first:
             unpack(trace.gains.H, row // refresh, H)
         if model.has_lanes:
