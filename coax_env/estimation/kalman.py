@@ -653,6 +653,19 @@ def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
     return _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w)
 
 
+@compiled_when_called(types.void(MODEL, _M, _A, _A, _M), makes_arrays=True)
+def read(model, states, u, p, out):
+    """Readings of states, each by itself.
+
+    Args:
+        model: a CompiledModel. states: (s, nx). u: (nu,) the input of them all.
+        p: (np,) the model's parameters. out: (s, m) readings.
+    """
+    work = np.zeros(model.work_size)
+    for s in range(states.shape[0]):
+        model.measure(states[s], u, p, work, out[s])
+
+
 @compiled_when_called(boolean(MODEL, _A, _M, _A, _A, int64, _N, _A), makes_arrays=True)
 def fly_open_loop(model, dt, u, x, p, first, targets, out):
     """Predict alone: fly from row `first` with the recorded inputs; read each channel at its own row.
