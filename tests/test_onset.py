@@ -43,10 +43,8 @@ def all_of(k: int) -> Asked:
 
 def known(found: _Table, record: int, slope, across, own=None) -> Beginning:
     """What a table takes of a beginning, of full matrices; own: as across where it is left out."""
-    at = found.asked
     own = across if own is None else own
-    pairs = at.first, at.second
-    return Beginning(record, 5, slope, across[:, at.beside], across[pairs], own[pairs])
+    return Beginning(record, 5, slope, across[:, found.rest], across[found.pairs], own[found.pairs])
 
 
 def test_a_steps_gain_is_that_of_the_refit_without_it():
@@ -64,12 +62,9 @@ def test_a_steps_gain_is_that_of_the_refit_without_it():
     slope, bend = 5.0 * (ahead - back), 100.0 * (2.0 * here - ahead - back)
     engine = Engine(Pendulum(), [record])
     free = [prior("stiffness", 1.0), prior("bias", 1.0)]
-    (found,) = engine.beginnings(
-        TRUTH, NOISE, free, [np.array([60, row])], lambda b: (b.row, b.slope[1], b.own[3]),
-        all_of(2),
-    )  # fmt: skip
-    assert found[1][0] == row
-    assert found[1][1:] == pytest.approx((-slope, bend), rel=1e-4)
+    *_, ((_, found),) = engine.beginnings(TRUTH, NOISE, free, [np.array([60, row])], all_of(2))
+    assert found.row == row
+    assert (found.slope[1], found.own[3]) == pytest.approx((-slope, bend), rel=1e-4)
     assert 0.5 * slope**2 / bend > 10.0  # and it is seen
 
 
@@ -78,10 +73,9 @@ def test_the_best_of_all_moments_is_the_planted_one():
     row, late = 170, np.arange(300) >= 170
     record = replace(record, z=record.z + 0.3 * late[:, None] * [0.0, 1.0, 0.0])
     rows = np.arange(50, 280)
-    (gains,) = Engine(Pendulum(), [record]).beginnings(
-        TRUTH, NOISE, [prior("bias", 1.0)], [rows], lambda b: 0.5 * b.slope[0] ** 2 / b.own[0],
-        all_of(1),
-    )  # fmt: skip
+    engine = Engine(Pendulum(), [record])
+    *_, (found,) = engine.beginnings(TRUTH, NOISE, [prior("bias", 1.0)], [rows], all_of(1))
+    gains = [0.5 * b.slope[0] ** 2 / b.own[0] for b in found]
     assert abs(rows[int(np.argmax(gains))] - row) <= 3
 
 
@@ -112,10 +106,9 @@ def test_moved_from_a_row_on_is_the_model_that_changes_there(short):
     own = [f for e in names for f in model.effect_parameters(e)]
     free = [*model.base_parameters()[:3], *own]
     values = {**model.bare_values, **{f.name: f.value for f in own}}
-    _, (b,) = Engine(model, records).beginnings(
-        values, noise, free, [np.empty(0, np.int64), np.array([row])], lambda b: b,
-        all_of(len(free)),
-    )  # fmt: skip
+    *_, (_, (b,)) = Engine(model, records).beginnings(
+        values, noise, free, [np.empty(0, np.int64), np.array([row])], all_of(len(free))
+    )
     information = b.own.reshape(len(free), len(free))
     there = Engine(changing(model, records, names, row), records)
     _, lin = there.linearise(values, noise, free)
@@ -131,10 +124,9 @@ def test_what_begins_and_what_always_was_share_the_rows_from_there_on(short):
     names, row = ("swash_offset", "gyro_bias"), 200
     own = [f for e in names for f in model.effect_parameters(e)]
     values = {**model.bare_values, **{f.name: f.value for f in own}}
-    _, (b,) = Engine(model, records).beginnings(
-        values, noise, own, [np.empty(0, np.int64), np.array([row])], lambda b: b,
-        all_of(len(own)),
-    )  # fmt: skip
+    *_, (_, (b,)) = Engine(model, records).beginnings(
+        values, noise, own, [np.empty(0, np.int64), np.array([row])], all_of(len(own))
+    )
     same = {of_part(f.name, BEFORE): values[f.name] for f in own}
     there = Engine(changing(model, records, names, row), records)
     _, lin = there.linearise({**values, **same}, noise, [*own, *map(before, own)])
@@ -738,7 +730,7 @@ def test_what_commands_explain_is_not_worth_a_fit(monkeypatch, gains):
     monkeypatch.setattr(onset, "with_command_gains", lambda p, fit, coloured: (p, fit))
     monkeypatch.setattr(onset, "has_command_gains", lambda p: gains)
     monkeypatch.setattr(onset, "linearise", lambda p, fit: (fit, [], None))
-    monkeypatch.setattr(onset, "scored", lambda state: with_gains)
+    monkeypatch.setattr(onset, "scored", lambda state: (state, with_gains))
     fit = Fit((), {}, NOISE_OF_ALL)
     steady = Changing(SimpleNamespace(settings=SETTINGS), fit, None, {})  # type: ignore[arg-type]
     kept = onset._beside_commands(steady, found)

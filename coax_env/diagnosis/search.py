@@ -80,7 +80,7 @@ def _nearest(problem: Problem, fit: Fit, quadratic: Quadratic, kept: Collection[
     """
     _, most = most_gains(problem, quadratic, fit.active, {})
     near = {e for e, gain in most.items() if gain > problem.settings.tie}.union(kept)
-    return replace(problem, own={e: own for e, own in problem.own.items() if e in near})
+    return problem.of_candidates(near)
 
 
 @dataclass

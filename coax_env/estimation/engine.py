@@ -6,10 +6,11 @@ identification, effects' parameters free is diagnosis.
 
 import math
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -28,6 +29,8 @@ REFRESH_SECONDS = 0.04  # [s] in which they change little: more rows of a log fa
 BLOCK = 2.0  # [s] of the blocks whose scores are taken as independent
 BLOCKS_AT_ONCE = 5  # whose signatures are held at a time: 7 MB at 100 Hz with every parameter
 NONE_KEPT = frozen_gains.Kept(np.zeros((0, 0, 0), np.float32), np.zeros(0, np.int64))
+OF_GAINS = ("gains", "per_sigma", "H")  # what takes most of a pass' memory
+REMEMBERED = 4  # passes at which something was linearised or a fit ended; ours
 DIVERGED = 1e6  # whitened innovations [std] that only a diverging mean has
 
 
@@ -111,6 +114,23 @@ class _Moves:
 
 
 @dataclass(frozen=True)
+class _LinearisedRun:
+    """One run's part of `Linearised`, its blocks' slopes with it.
+
+    run, at: its pass. J: (readings, padded) signatures of its last blocks, k of them, then the
+    innovations. wild: (k,) whose signatures were not finite.
+    """
+
+    run: RunPass
+    at: PassJacobians
+    J: np.ndarray
+    wild: np.ndarray
+    information: np.ndarray
+    by_channel: np.ndarray
+    blocks: np.ndarray
+
+
+@dataclass(frozen=True)
 class NoiseScore:
     """Log-likelihood [nats] (-inf where a filter diverged) and its slopes in the noise.
 
@@ -160,6 +180,7 @@ class Engine:
         self._refresh = [_rows_between_jacobians(dt) for dt in self.intervals]
         self._readings = [int((~np.isnan(r.z)).sum()) for r in self.records]
         self._buffers: list[_Buffers] = []  # that no thread works with
+        self._flown: deque[tuple[np.ndarray, Noise, list[RunPass]]] = deque(maxlen=REMEMBERED)
 
     def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
         """Work done on every run (or those in `which`), the longest first so that no thread waits."""
@@ -200,6 +221,10 @@ class Engine:
             start_rows: per record, rows at which to keep the filtered covariance.
         """
         p = self.model.vector(values, noise)
+        if not keep and which is None and start_rows is None:
+            for vector, of_noise, passes in tuple(self._flown):
+                if np.array_equal(vector, p) and of_noise == noise:
+                    return passes
 
         def one(i: int) -> RunPass:
             starts = None if start_rows is None else start_rows[i]
@@ -207,6 +232,14 @@ class Engine:
             return self._filter_run(i, p, noise, buffers, start_rows=starts)[0]
 
         return self._each(one, which)
+
+    def _remember(self, p: np.ndarray, noise: Noise, passes: Sequence[RunPass]) -> None:
+        """Passes of all records, whose end others will ask for again; without their gains."""
+        bare = [
+            replace(run, **{name: np.empty_like(getattr(run, name)[:0]) for name in OF_GAINS})
+            for run in passes
+        ]
+        self._flown.append((p, noise, bare))
 
     def _reading_variances(self, noise: Noise) -> np.ndarray:
         return np.array([noise.reading.get(c, 1.0) for c in self.model.channels]) ** 2
@@ -293,48 +326,71 @@ class Engine:
         p = self.model.vector(values, noise)
         moves = self._moves(values, noise, free)
 
-        def one(i: int) -> tuple[Any, ...]:
+        def one(i: int) -> _LinearisedRun:
             with self._borrowed_buffers() as buffers:
-                run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
-                count, width = len(free), padded(len(free) + 1)
-                information = np.zeros((width, width))
-                by_channel = np.zeros((len(free), run.innovations.shape[1]))
-                edges, before = _block_edges(run)
-                blocks = np.zeros((edges.size - 1, len(free)))
-                if np.isfinite(run.log_likelihood):
-                    work = self._signatures(i, run, at, p, moves, by_channel)
-                    probed = self._probed_signatures(i, run, moves, by_channel)
-                    e = run.innovations[np.isfinite(run.innovations)]
-                    for first in range(0, edges.size - 1, BLOCKS_AT_ONCE):
-                        own = edges[first : first + BLOCKS_AT_ONCE + 1]
-                        since, until = before[own[0]], before[own[-1]]
-                        J = buffers.array("J", (int(until - since), width))
-                        J[:, count:] = 0.0
-                        J[:, count] = e[since:until]
-                        J[:, np.flatnonzero(moves.probed)] = probed[since:until]
-                        work(
-                            frozen_gains.Portion(int(own[0]), int(own[-1]), int(since)),
-                            J,
-                            NONE_KEPT,
-                        )
-                        for b, (a, z) in enumerate(pairwise(before[own] - since), first):
-                            products = np.zeros((width, width))
-                            add_gram(J[a:z], count, products)
-                            blocks[b] = products[:count, count]
-                            information += products
-                information = information[:count, :count]
-                information = np.triu(information) + np.triu(information, 1).T
-                wild = ~np.isfinite(np.diag(information))
-                information[wild] = information[:, wild] = 0.0
-                by_channel[wild] = 0.0
-                blocks[:, wild] = 0.0
-            return run, information, blocks.sum(0), by_channel, blocks
+                return self._linearise_run(i, p, noise, moves, buffers, BLOCKS_AT_ONCE)
 
-        passes, *parts, blocks = zip(*self._each(one), strict=True)
-        information, slope, by_channel = (np.array(part) for part in parts)
-        return list(passes), Linearised(
-            tuple(f.name for f in free), information, slope, by_channel, np.concatenate(blocks)
+        return self._gathered(p, noise, free, self._each(one))
+
+    def _gathered(
+        self,
+        p: np.ndarray,
+        noise: Noise,
+        free: Sequence[FreeParameter],
+        found: Sequence[_LinearisedRun],
+    ) -> tuple[list[RunPass], Linearised]:
+        """The passes, and the linearisations of all runs."""
+        passes = [one.run for one in found]
+        self._remember(p, noise, passes)
+        return passes, Linearised(
+            tuple(f.name for f in free),
+            np.array([one.information for one in found]),
+            np.array([one.blocks.sum(0) for one in found]),
+            np.array([one.by_channel for one in found]),
+            np.concatenate([one.blocks for one in found]),
         )
+
+    def _linearise_run(
+        self,
+        i: int,
+        p: np.ndarray,
+        noise: Noise,
+        moves: _Moves,
+        buffers: _Buffers,
+        at_once: int,
+        kept: frozen_gains.Kept = NONE_KEPT,
+    ) -> _LinearisedRun:
+        """One run filtered and linearised, the signatures of so many blocks at once in memory."""
+        run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
+        count, edges, before = len(moves.vectors), *_block_edges(run)
+        width = padded(count + 1)
+        products, blocks = np.zeros((width, width)), np.zeros((edges.size - 1, count))
+        by_channel = np.zeros((count, run.innovations.shape[1]))
+        J = np.zeros((0, width))
+        if np.isfinite(run.log_likelihood):
+            signatures = self._signatures(i, run, at, p, moves, by_channel)
+            probed = self._probed_signatures(i, run, moves, by_channel)
+            e = run.innovations[np.isfinite(run.innovations)]
+            for first in range(0, edges.size - 1, at_once):
+                own = edges[first : first + at_once + 1]
+                since, until = before[own[0]], before[own[-1]]
+                J = buffers.array("J", (int(until - since), width))
+                J[:, count:] = 0.0
+                J[:, count] = e[since:until]
+                J[:, np.flatnonzero(moves.probed)] = probed[since:until]
+                signatures(frozen_gains.Portion(int(own[0]), int(own[-1]), int(since)), J, kept)
+                for b, (a, z) in enumerate(pairwise(before[own] - since), first):
+                    of_block = np.zeros((width, width))
+                    add_gram(J[a:z], count, of_block)
+                    blocks[b] = of_block[:count, count]
+                    products += of_block
+        information = products[:count, :count]
+        information = np.triu(information) + np.triu(information, 1).T
+        wild = ~np.isfinite(np.diag(information))
+        information[wild] = information[:, wild] = 0.0
+        by_channel[wild] = 0.0
+        blocks[:, wild] = 0.0
+        return _LinearisedRun(run, at, J, wild, information, by_channel, blocks)
 
     def _moves(
         self, values: Mapping[str, float], noise: Noise, free: Sequence[FreeParameter]
@@ -408,69 +464,61 @@ class Engine:
         noise: Noise,
         free: Sequence[FreeParameter],
         rows: Sequence[np.ndarray],
-        work: Callable[[Beginning], Any],
         asked: Asked,
-    ) -> list[list[Any]]:
-        """What free parameters would do if they moved from some row of a run on; see beginnings.py.
+    ) -> tuple[list[RunPass], Linearised, list[list[Beginning]]]:
+        """`linearise`, and what free parameters would do if they moved from some row of a run on.
 
-        Of a parameter that needs a finite step (`probe`) its past is not taken out of the state.
+        See beginnings.py. Of a parameter that needs a finite step (`probe`) its past is not taken out
+        of the state.
 
         Args:
             values: of all parameters, by name.
             noise: levels of process and reading noise.
             free: the parameters.
             rows: of each record, rising.
-            work: is given each row's Beginning.
-            asked: what is wanted of each, in places of `free`.
+            asked: what is wanted of each row, in places of `free`.
 
         Returns:
-            what `work` returned, record by record and row by row.
+            as `linearise`, and the rows' beginnings by record; none where the filter diverged.
         """
         p = self.model.vector(values, noise)
         moves = self._moves(values, noise, free)
 
-        def one(i: int) -> list[Any]:
+        def one(i: int) -> tuple[_LinearisedRun, list[Beginning]]:
+            n, nx = self.records[i].t.size, self.compiled.exact.size
+            s = np.zeros((rows[i].size, nx, padded(len(free) + 1)), np.float32)
+            kept = frozen_gains.Kept(s, np.full(n, -1, np.int64))
+            kept.places[rows[i]] = np.arange(rows[i].size)
             with self._borrowed_buffers() as buffers:
-                run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
-                if not np.isfinite(run.log_likelihood):
-                    return []
-                found = self._beginnings_of_run(i, run, at, p, moves, rows[i], asked)
-                return [work(b) for b in found]
+                found = self._linearise_run(i, p, noise, moves, buffers, n, kept)
+                begun = self._beginnings_of_run(i, found, rows[i], kept, asked)
+            return replace(found, J=found.J[:0].copy()), begun
 
-        return self._each(one)
+        found, begun = zip(*self._each(one), strict=True)
+        return *self._gathered(p, noise, free, found), list(begun)
 
     def _beginnings_of_run(
         self,
         i: int,
-        run: RunPass,
-        at: PassJacobians,
-        p: np.ndarray,
-        moves: _Moves,
+        of: _LinearisedRun,
         rows: np.ndarray,
+        kept: frozen_gains.Kept,
         asked: Asked,
-    ) -> Iterator[Beginning]:
-        k, nx = len(moves.vectors), self.compiled.exact.size
-        width, n = padded(k + 1), run.innovations.shape[0]
-        readings = int(np.isfinite(run.innovations).sum())
-        by_channel = np.zeros((k, run.innovations.shape[1]))
-        J = aligned(readings, width)
-        kept = frozen_gains.Kept(
-            np.zeros((rows.size, nx, width), np.float32), np.full(n, -1, np.int64)
-        )
-        kept.places[rows] = np.arange(rows.size)
-        signatures = self._signatures(i, run, at, p, moves, by_channel)
-        signatures(frozen_gains.Portion(0, n, 0), J, kept)
-        J[:, np.flatnonzero(moves.probed)] = self._probed_signatures(i, run, moves, by_channel)
-        wild = ~np.isfinite(J).all(0)
-        J[:, wild], kept.s[:, :, wild] = 0.0, 0.0
-        a, r, pairs = rows.size, asked.beside.size, asked.first.size
+    ) -> list[Beginning]:
+        if not np.isfinite(of.run.log_likelihood):
+            return []
+        k, width = of.wild.size, of.J.shape[1]
+        of.J[:, :k][:, of.wild] = kept.s[:, :, :k][:, :, of.wild] = 0.0
+        a, pairs = rows.size, asked.first.size
         sums = Sums(
-            np.zeros((a, width)), np.zeros((a, r, width)), np.zeros((a, pairs)),
+            np.zeros((a, width)), np.zeros((a, asked.beside.size, width)), np.zeros((a, pairs)),
             np.zeros((a, pairs)),
         )  # fmt: skip
-        beginnings_pass(_trace(run, at), self._refresh[i], Moved(J, kept), asked, sums)
-        for row, slope, across, *of_pairs in zip(rows, *sums, strict=True):
-            yield Beginning(i, int(row), slope[:k], across[:, :k].T, *of_pairs)
+        beginnings_pass(_trace(of.run, of.at), self._refresh[i], Moved(of.J, kept), asked, sums)
+        return [
+            Beginning(i, int(row), slope[:k], across[:, :k].T, crossed, own)
+            for row, slope, across, crossed, own in zip(rows, *sums, strict=True)
+        ]
 
     def _inputs(self, run: RunPass, p: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """A run's inputs with the parameters `vector`, known those with `p`."""
@@ -600,6 +648,7 @@ class Engine:
                 progress(f"fit: step {count}, gained {gained:.1f} nats")
             if gained < tolerance or count == iterations:
                 passes = self.filter(values, noise)
+                self._remember(self.model.vector(values, noise), noise, passes)
                 break
             passes, lin = self.linearise(values, noise, free)
         return Estimate(
