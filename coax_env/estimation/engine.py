@@ -21,6 +21,7 @@ from coax_env.estimation.beginnings import Asked, Beginning, Moved, Sums, beginn
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.sparse import add_gram, aligned, padded
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
+from coax_env.kernel.simd import SIMD_WIDTH
 from coax_env.progress import Progress
 
 GATE = 8.0  # std of an innovation beyond which a reading counts as an outlier; ours
@@ -369,7 +370,7 @@ class Engine:
         J = np.zeros((0, width))
         if np.isfinite(run.log_likelihood):
             signatures = self._signatures(i, run, at, p, moves, by_channel)
-            probed = self._probed_signatures(i, run, moves, by_channel)
+            probed = self._probed_signatures(i, run, p, moves, by_channel)
             e = run.innovations[np.isfinite(run.innovations)]
             for first in range(0, edges.size - 1, at_once):
                 own = edges[first : first + at_once + 1]
@@ -528,22 +529,44 @@ class Engine:
         return self.model.inputs(run.record, vector)
 
     def _probed_signatures(
-        self, i: int, run: RunPass, moves: _Moves, by_channel: np.ndarray
+        self, i: int, run: RunPass, p: np.ndarray, moves: _Moves, by_channel: np.ndarray
     ) -> np.ndarray:
         """The same where a finite step is needed, by a mean pass each: (readings, probed)."""
         there = np.isfinite(run.innovations)
         channel, e = np.nonzero(there)[1], run.innovations[there]
         columns = np.flatnonzero(moves.probed)
         found = np.zeros((e.size, columns.size))
-        probed = np.zeros(there.shape)
-        for column, k in enumerate(columns):
-            if self._frozen(i, run, moves.vectors[k], probed):
-                change = probed[there] - e
-                if np.abs(change).max(initial=0.0) < DIVERGED:
-                    change /= moves.steps[k]
-                    found[:, column] = change
-                    by_channel[k] = np.bincount(channel, change**2, by_channel.shape[1])
+        moved = self._moved_innovations(i, run, p, [moves.vectors[k] for k in columns])
+        for column, (k, innovations) in enumerate(zip(columns, moved, strict=True)):
+            change = innovations - e
+            if np.abs(change).max(initial=0.0) < DIVERGED:
+                change /= moves.steps[k]
+                found[:, column] = change
+                by_channel[k] = np.bincount(channel, change**2, by_channel.shape[1])
         return found
+
+    def _moved_innovations(
+        self, i: int, run: RunPass, p: np.ndarray, vectors: Sequence[np.ndarray]
+    ) -> Iterator[np.ndarray]:
+        """Innovations (readings,) with other parameters, gains frozen; not finite where it diverged."""
+        there = np.isfinite(run.innovations)
+        if not self.compiled.has_lanes:
+            e = np.zeros(there.shape)
+            for vector in vectors:
+                yield e[there] if self._frozen(i, run, vector, e) else np.full(there.sum(), np.nan)
+            return
+        data = kalman.RunData(self.intervals[i], run.inputs, run.record.z)
+        gains = kalman.Gains(run.gains, run.per_sigma, run.H)
+        for first in range(0, len(vectors), SIMD_WIDTH):
+            some = vectors[first : first + SIMD_WIDTH]
+            lanes = [*some, *[p] * (SIMD_WIDTH - len(some))]
+            e = np.zeros((int(there.sum()), SIMD_WIDTH))
+            frozen_gains.mean_passes(
+                self.compiled, data, self.starts[i][0], p, np.array(lanes).T.copy(),
+                np.array([self._inputs(run, p, vector) for vector in lanes]),
+                gains, self._refresh[i], e,
+            )  # fmt: skip
+            yield from e.T[: len(some)]
 
     def descend(
         self,

@@ -90,6 +90,57 @@ def mean_pass(model, run, x0, p, gains, refresh, e):
     return True
 
 
+@compiled_when_called(
+    types.void(MODEL, RUN_DATA, _A, _A, _M, float64[:, :, ::1], GAINS, int64, _M),
+    makes_arrays=True, **REORDER,
+)  # fmt: skip
+def mean_passes(model, run, x0, p, moved, u, gains, refresh, e):
+    """`mean_pass` of SIMD_WIDTH parameter vectors at once; not finite where one diverged.
+
+    Args:
+        model: a CompiledModel that has lanes. run: RunData. x0: (nx,) first state. p: (np,) the
+            parameters of the filter pass.
+        moved: (np, SIMD_WIDTH) parameters, a column each. u: (SIMD_WIDTH, n, nu) their inputs.
+        gains, refresh: of the filter pass.
+        e: (readings, SIMD_WIDTH) whitened innovations, out, in the order of the filter's.
+    """
+    n, m = run.z.shape
+    nx, nu = x0.size, u.shape[2]
+    lanes = lanes_of(nx, nu, p, model.work_size, m)
+    x, out, shown = simd_blocks(lanes.x), simd_blocks(lanes.out), simd_blocks(e)
+    predicted = aligned(nx, SIMD_WIDTH)
+    before = simd_blocks(predicted)
+    in_every_lane(x0, lanes.x)
+    H = with_places(np.zeros((m, padded(nx))), nx)
+    reading = np.uint64(0)
+    for k in range(n):
+        if k % refresh == 0:
+            unpack(gains.H, k // refresh, H)
+        for lane in range(SIMD_WIDTH):
+            for i in range(nu):
+                lanes.u[i, lane] = u[lane, k, i]
+        model.measure_of_lanes(lanes.x, lanes.u, moved, lanes.work, lanes.out)
+        for j in range(nx):
+            before[j] = x[j]
+        for i in range(m):
+            if math.isnan(run.z[k, i]):
+                continue
+            residuals = run.z[k, i] - out[i]
+            if model.wraps[i]:
+                residuals = wrap_angle(residuals)
+            for c in range(H.counts[i]):
+                a = H.places[i, c]
+                residuals -= H.values[i, a] * (x[a] - before[a])
+            shown[reading] = residuals * gains.per_sigma[reading]
+            for j in range(nx):
+                x[j] += float64(gains.K[reading, j]) * residuals
+            reading += ONE
+        if k < n - 1:
+            model.step_of_lanes(lanes.x, lanes.u, run.dt[k], moved, lanes.work, lanes.out)
+            for j in range(nx):
+                x[j] = out[j]
+
+
 class Moves(NamedTuple):
     """The parameters whose signatures are wanted, k of them, each moved by itself.
 

@@ -57,8 +57,8 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 
 @pointer(LANES_STEP.signature)
-def _no_drift(x, u, dt, p, work, out):
-    """What stands for `drift_of_lanes` where a model has none."""
+def _no_motion(x, u, dt, p, work, out):
+    """What stands for `step_of_lanes` and `drift_of_lanes` where a model has none."""
 
 
 @pointer(LANES_MEASURE.signature)
@@ -69,7 +69,7 @@ def _no_readings(x, u, p, work, out):
 class CompiledModel(NamedTuple):
     """What compiled code needs of a model; see state_space.Model for each.
 
-    has_lanes: whether it has `side_by_side`, the two `_of_lanes`.
+    has_lanes: whether it has `side_by_side`, the three `_of_lanes`.
     """
 
     step: Any
@@ -81,8 +81,9 @@ class CompiledModel(NamedTuple):
     work_size: int
     noise_places: np.ndarray
     has_lanes: bool
-    drift_of_lanes: Any
+    step_of_lanes: Any
     measure_of_lanes: Any
+    drift_of_lanes: Any
 
     @classmethod
     def of(cls, model: Any) -> "CompiledModel":
@@ -98,7 +99,7 @@ class CompiledModel(NamedTuple):
             int(model.work_size),
             np.ascontiguousarray(model.noise_places, np.int64),
             side_by_side is not None,
-            *(side_by_side or (_no_drift, _no_readings)),
+            *(side_by_side or (_no_motion, _no_readings, _no_motion)),
         )
 
 
@@ -238,7 +239,7 @@ def in_every_lane(values, out):
 
 MODEL = types.NamedTuple(
     [STEP, MEASURE, STEP, boolean[::1], boolean[::1], _A, int64, int64[:, ::1], boolean, LANES_STEP,
-     LANES_MEASURE], CompiledModel
+     LANES_MEASURE, LANES_STEP], CompiledModel
 )  # fmt: skip
 RUN_DATA = types.NamedTuple([_A, _M, _M], RunData)
 VARIANCES = types.NamedTuple([_A, _M, _A, _A, _A], Variances)
