@@ -19,6 +19,7 @@ PASSES = (
     frozen_gains.signature_pass,
     noise_score.score_pass,
     frozen_gains.mean_pass,
+    frozen_gains.mean_passes,
     kalman.fly_open_loop,
     kalman.read,
     beginnings.beginnings_pass,
