@@ -35,7 +35,7 @@ from coax_env.estimation.sparse import (
 )
 from coax_env.estimation.state_space import Record
 from coax_env.kernel.angles import wrap_angles
-from coax_env.kernel.simd import SIMD_WIDTH
+from coax_env.kernel.simd import SIMD_WIDTH, transpose
 
 GATE = 8.0
 H = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
@@ -252,6 +252,15 @@ def test_rows_are_combined_by_their_weights():
     out = np.full(padded(40), np.nan)
     combine(weights, B, 5, out)
     np.testing.assert_allclose(out, weights[:5].astype(float) @ B[:5], atol=1e-13)
+
+
+@pytest.mark.parametrize("n", [2, 4, 5, 29])
+def test_a_matrix_is_transposed_and_nothing_beside_it(n):
+    rng = np.random.default_rng(n)
+    A, out = rng.normal(size=(n, padded(n))), np.full((n, padded(n)), 7.0)
+    transpose(A, n, out)
+    np.testing.assert_array_equal(out[:, :n], A[:, :n].T)
+    assert np.all(out[:, n:] == 7.0)
 
 
 def test_a_stored_matrix_comes_back_with_its_non_zeros():

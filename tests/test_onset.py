@@ -18,7 +18,7 @@ from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.onset import Changing, _Table, rows_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.estimation.beginnings import Beginning
+from coax_env.estimation.beginnings import Asked, Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, Moment, record_of
@@ -36,6 +36,17 @@ RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
 # --- every moment at once ---------------------------------------------------------------------------
 
 
+def all_of(k: int) -> Asked:
+    """Every column and every pair of k parameters, row by row."""
+    return Asked(np.arange(k), np.repeat(np.arange(k), k), np.tile(np.arange(k), k))
+
+
+def known(found: _Table, record: int, slope, across, own=None) -> Beginning:
+    """What a table takes of a beginning, of full matrices; own: as across where it is left out."""
+    own = across if own is None else own
+    return Beginning(record, 5, slope, across[:, found.rest], across[found.pairs], own[found.pairs])
+
+
 def test_a_steps_gain_is_that_of_the_refit_without_it():
     # a gyro's bias from a row on is a log with that bias taken off from there on
     record, row = swing(3, n=200), 120
@@ -51,11 +62,9 @@ def test_a_steps_gain_is_that_of_the_refit_without_it():
     slope, bend = 5.0 * (ahead - back), 100.0 * (2.0 * here - ahead - back)
     engine = Engine(Pendulum(), [record])
     free = [prior("stiffness", 1.0), prior("bias", 1.0)]
-    (found,) = engine.beginnings(
-        TRUTH, NOISE, free, [np.array([60, row])], lambda b: (b.row, b.slope[1], b.own[1, 1])
-    )
-    assert found[1][0] == row
-    assert found[1][1:] == pytest.approx((-slope, bend), rel=1e-4)
+    *_, ((_, found),) = engine.beginnings(TRUTH, NOISE, free, [np.array([60, row])], all_of(2))
+    assert found.row == row
+    assert (found.slope[1], found.own[3]) == pytest.approx((-slope, bend), rel=1e-4)
     assert 0.5 * slope**2 / bend > 10.0  # and it is seen
 
 
@@ -64,9 +73,9 @@ def test_the_best_of_all_moments_is_the_planted_one():
     row, late = 170, np.arange(300) >= 170
     record = replace(record, z=record.z + 0.3 * late[:, None] * [0.0, 1.0, 0.0])
     rows = np.arange(50, 280)
-    (gains,) = Engine(Pendulum(), [record]).beginnings(
-        TRUTH, NOISE, [prior("bias", 1.0)], [rows], lambda b: 0.5 * b.slope[0] ** 2 / b.own[0, 0]
-    )
+    engine = Engine(Pendulum(), [record])
+    *_, (found,) = engine.beginnings(TRUTH, NOISE, [prior("bias", 1.0)], [rows], all_of(1))
+    gains = [0.5 * b.slope[0] ** 2 / b.own[0] for b in found]
     assert abs(rows[int(np.argmax(gains))] - row) <= 3
 
 
@@ -97,15 +106,16 @@ def test_moved_from_a_row_on_is_the_model_that_changes_there(short):
     own = [f for e in names for f in model.effect_parameters(e)]
     free = [*model.base_parameters()[:3], *own]
     values = {**model.bare_values, **{f.name: f.value for f in own}}
-    _, (b,) = Engine(model, records).beginnings(
-        values, noise, free, [np.empty(0, np.int64), np.array([row])], lambda b: b
+    *_, (_, (b,)) = Engine(model, records).beginnings(
+        values, noise, free, [np.empty(0, np.int64), np.array([row])], all_of(len(free))
     )
+    information = b.own.reshape(len(free), len(free))
     there = Engine(changing(model, records, names, row), records)
     _, lin = there.linearise(values, noise, free)
-    unit = 1.0 / np.sqrt(np.diag(b.own)[3:])
+    unit = 1.0 / np.sqrt(np.diag(information)[3:])
     assert lin.slope[1, 3:] * unit == pytest.approx(b.slope[3:] * unit, abs=0.02)
     exact = lin.information[1, 3:, 3:] * np.outer(unit, unit)
-    assert b.own[3:, 3:] * np.outer(unit, unit) == pytest.approx(exact, abs=0.01)
+    assert information[3:, 3:] * np.outer(unit, unit) == pytest.approx(exact, abs=0.01)
 
 
 def test_what_begins_and_what_always_was_share_the_rows_from_there_on(short):
@@ -114,8 +124,8 @@ def test_what_begins_and_what_always_was_share_the_rows_from_there_on(short):
     names, row = ("swash_offset", "gyro_bias"), 200
     own = [f for e in names for f in model.effect_parameters(e)]
     values = {**model.bare_values, **{f.name: f.value for f in own}}
-    _, (b,) = Engine(model, records).beginnings(
-        values, noise, own, [np.empty(0, np.int64), np.array([row])], lambda b: b
+    *_, (_, (b,)) = Engine(model, records).beginnings(
+        values, noise, own, [np.empty(0, np.int64), np.array([row])], all_of(len(own))
     )
     same = {of_part(f.name, BEFORE): values[f.name] for f in own}
     there = Engine(changing(model, records, names, row), records)
@@ -125,6 +135,7 @@ def test_what_begins_and_what_always_was_share_the_rows_from_there_on(short):
     whole = across + information[k:, :k] + information[k:, k:]
     unit = np.outer(np.diag(information[:k, :k]) ** -0.5, np.diag(whole) ** -0.5)
     assert b.across * unit == pytest.approx(across * unit, abs=0.02)
+    assert b.crossed.reshape(k, k) == pytest.approx(b.across)
     assert np.abs(information[:k, k:] * unit).max() > 0.05, "and the past is felt"
 
 
@@ -146,7 +157,7 @@ def test_a_changes_worth_is_what_the_joint_quadratic_gains(least):
         [np.array(own)], [np.zeros(2)], (np.array([3, 3, 4, 4]), np.array([3, 4, 3, 4])),
         np.array([0, 2, 1, 3]),
     )  # fmt: skip
-    row = table.row_of(Beginning(0, 7, begins @ e, begins @ always.T, begins @ begins.T))
+    row = table.row_of(known(table, 0, begins @ e, begins @ always.T, begins @ begins.T))
     (nats,), (move,) = table.worth(0, *(np.array([part]) for part in row[:2]))
     gained = 0.5 * (h @ np.linalg.solve(H, h) - pull @ np.linalg.solve(alone, pull))
     occam = 0.5 * (np.linalg.slogdet(H)[1] - np.linalg.slogdet(alone)[1] - 2.0 * np.log(0.7))
@@ -426,8 +437,7 @@ def test_a_changes_score_is_the_log_of_the_ratio_of_two_evidences(row, ends):
     parts = q.parts
     assert parts is not None
     share = (0.7, 0.2)[row]
-    here = Beginning(1, 10, share * parts.slope[1], share * parts.information[1],
-                     share * parts.information[1])  # fmt: skip
+    here = known(found, 1, share * parts.slope[1], share * parts.information[1])
     acts = np.array([1.0, 1.0 - share, 0.0] if ends else [0.0, share, 1.0])
     information = np.einsum("r,rij->ij", acts, parts.information)
     slope = acts @ parts.slope
@@ -449,7 +459,7 @@ def test_a_constant_causes_score_is_that_of_what_ends_behind_the_flight():
     """All of its information: what ends in the last run, with nothing of it left from there on."""
     found, _, _ = table({"mass": 0.3}, SLOPES)
     size = len(NAMES)
-    nothing = Beginning(2, 10, np.zeros(size), np.zeros((size, size)), np.zeros((size, size)))
+    nothing = known(found, 2, np.zeros(size), np.zeros((size, size)))
     for k, (nats, _) in enumerate(worths(found, nothing, ends=True)):
         assert found.worth_of_constant(k) == pytest.approx(nats, rel=1e-9)
 
@@ -458,7 +468,7 @@ def test_a_change_that_is_too_small_to_matter_is_worth_nothing():
     found, q, _ = table({}, 1e-6 * SLOPES)
     parts = q.parts
     assert parts is not None
-    here = Beginning(2, 5, parts.slope[2], parts.information[2], parts.information[2])
+    here = known(found, 2, parts.slope[2], parts.information[2])
     assert [nats for nats, _ in worths(found, here)] == [-math.inf, -math.inf]
 
 
@@ -467,7 +477,7 @@ def test_a_change_stays_within_what_physics_gives():
     found, q, _ = table({}, -SLOPES)
     parts = q.parts
     assert parts is not None
-    here = Beginning(0, 0, parts.slope[0], parts.information[0], parts.information[0])
+    here = known(found, 0, parts.slope[0], parts.information[0])
     nats, x = worths(found, here)[1]
     assert x == pytest.approx([0.0], abs=1e-12) and nats == -math.inf
 
@@ -720,7 +730,7 @@ def test_what_commands_explain_is_not_worth_a_fit(monkeypatch, gains):
     monkeypatch.setattr(onset, "with_command_gains", lambda p, fit, coloured: (p, fit))
     monkeypatch.setattr(onset, "has_command_gains", lambda p: gains)
     monkeypatch.setattr(onset, "linearise", lambda p, fit: (fit, [], None))
-    monkeypatch.setattr(onset, "scored", lambda state: with_gains)
+    monkeypatch.setattr(onset, "scored", lambda state: (state, with_gains))
     fit = Fit((), {}, NOISE_OF_ALL)
     steady = Changing(SimpleNamespace(settings=SETTINGS), fit, None, {})  # type: ignore[arg-type]
     kept = onset._beside_commands(steady, found)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from coax_env.diagnosis import search as module
-from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import Score
 from coax_env.diagnosis.search import _forward, _Memory, search
 from coax_env.diagnosis.settings import SETTINGS
@@ -62,6 +62,7 @@ def moves(monkeypatch):
     monkeypatch.setattr(module, "drop", drop)
     monkeypatch.setattr(module, "with_latent_noise", latent)
     monkeypatch.setattr(module, "noise_fitted", noise_fitted)
+    monkeypatch.setattr(module, "_nearest", lambda problem, *given: problem)
     monkeypatch.setattr(module, "swaps", lambda *given: iter(()))
     monkeypatch.setattr(module, "trials", lambda *given: ([], []))
     monkeypatch.setattr(module, "scores", lambda p, fit, q, banned: [
@@ -130,6 +131,30 @@ def test_a_coloured_drop_ends_the_additions(moves):
     given["add"] = ["rotor_drag"]
     fit, _ = search(PROBLEM, begin)
     assert done == [*END, "noise", "drop, coloured"] and fit.active == ()
+
+
+def test_few_candidates_are_linearised_between_additions_and_all_before_the_end(moves, monkeypatch):
+    given, done = moves
+    few: Any = SimpleNamespace(**vars(PROBLEM))
+    seen: list[Any] = []
+    linearise = module.linearise
+    monkeypatch.setattr(module, "_nearest", lambda *given: few)
+    monkeypatch.setattr(module, "linearise", lambda p, fit: seen.append(p) or linearise(p, fit))
+    given["scores"] = [[score("wind", 30.0)], [], [score("rotor_drag", 20.0)]]
+    given["add"] = ["wind", "rotor_drag"]
+    fit, _ = search(PROBLEM, FIT)
+    assert fit.active == ("wind", "rotor_drag")
+    assert [p is few for p in seen] == [False, True, False, True, False]
+    of_few = ["noise", "drop?", "drop?"]
+    assert done == ["drop?", "add wind", *of_few, "add rotor_drag", *of_few, *END[1:]]
+
+
+def test_near_are_those_that_may_gain_more_than_a_tie_and_what_is_kept(monkeypatch):
+    gains = {"wind": 6.1, "rotor_drag": 5.9, "gyro_bias": -1.0}
+    monkeypatch.setattr(module, "most_gains", lambda *given: (0.0, gains))
+    problem = Problem(None, None, (), dict.fromkeys([*gains, "servo_lag"], ()))  # type: ignore[arg-type]
+    near = module._nearest(problem, FIT, None, ["servo_lag"])  # type: ignore[arg-type]
+    assert near.candidates == ("wind", "servo_lag")
 
 
 def test_after_three_additions_that_did_not_hold_no_more_are_made(moves):

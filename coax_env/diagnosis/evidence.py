@@ -81,7 +81,8 @@ def prune(
     """
     while True:
         fit = refined(problem, converged(problem, fit))
-        fit, _, quadratic = linearise(problem, fit)
+        beside = problem if fit.active else problem.of_candidates(())  # for whom could they stand?
+        fit, _, quadratic = linearise(beside, fit)
         doubtful = [e for e in fit.active if _is_doubtful(problem, fit, quadratic, e)]
         rest = [e for e in fit.active if e not in doubtful and e not in clear]
         removals: dict[str, Removal] = {}

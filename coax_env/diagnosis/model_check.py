@@ -143,8 +143,8 @@ def scaled_errors(problem: Problem, fit: Fit, phase: float) -> np.ndarray:
     rows = [_rows_ahead(record.t, own) for record, own in zip(records, starts, strict=True)]
     passes = blind.filter(fit.values, fit.noise, start_rows=[np.unique(r[r >= 0]) for r in rows])
     found = [
-        _scaled(problem, fit, run, dt, record.z, own)
-        for run, dt, record, own in zip(passes, blind.intervals, records, rows, strict=True)
+        _scaled(problem, fit, run, record.z, own)
+        for run, record, own in zip(passes, records, rows, strict=True)
     ]
     return np.concatenate(found)
 
@@ -176,7 +176,7 @@ def _rows_ahead(t: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 def _scaled(
-    problem: Problem, fit: Fit, run: RunPass, dt: np.ndarray, z: np.ndarray, rows: np.ndarray
+    problem: Problem, fit: Fit, run: RunPass, z: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
     """Errors of one run's predictions over their std, (starts, horizons, 18)."""
     engine = problem.engine
@@ -187,21 +187,21 @@ def _scaled(
     slot = {int(row): k for k, row in enumerate(run.start_rows)}
     result = np.full((*rows.shape, len(CHANNELS)), np.nan)
 
-    def read(x: np.ndarray, row: int) -> np.ndarray:
-        out = np.full(len(CHANNELS), np.nan)
-        here = np.full(len(CHANNELS), row)
-        kalman.fly_open_loop(engine.compiled, dt, inputs, x.copy(), p, row, here, out)
+    def read(states: np.ndarray, row: int) -> np.ndarray:
+        out = np.full((len(states), len(CHANNELS)), np.nan)
+        kalman.read(engine.compiled, states, inputs[row], p, out)
         return out
 
     for s, h in zip(*np.nonzero(rows >= 0), strict=True):
         row = int(rows[s, h])
         x, P = run.states[row], run.start_covariances[slot[row]]
-        known = read(x, row)
-        H = np.array([(read(x + unit, row) - known) for unit in np.diag(scale)]).T / scale
+        known, *moved = read(np.vstack([x, x + np.diag(scale)]), row)
+        H = (np.array(moved) - known).T / scale
         std = np.sqrt(np.einsum("ij,jk,ik->i", H, P, H) + reading**2)
         late = _late_rows(run.record.t, z, row)
+        last = {int(k): read(run.states[k : k + 1], k)[0] for k in np.unique(late[late >= 0])}
         for c in np.flatnonzero(late >= 0):
-            error = z[late[c], c] - read(run.states[late[c]], int(late[c]))[c]
+            error = z[late[c], c] - last[int(late[c])][c]
             if CHANNELS[c] in ANGLES:
                 error = math.remainder(error, 2.0 * math.pi)
             result[s, h, c] = error / std[c]

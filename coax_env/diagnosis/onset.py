@@ -29,9 +29,9 @@ from coax_env.diagnosis.input_innovations import has_command_gains, with_command
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import Settings
-from coax_env.estimation.beginnings import Beginning
+from coax_env.estimation.beginnings import Asked, Beginning
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
-from coax_env.estimation.engine import Engine, RunPass
+from coax_env.estimation.engine import Engine, RunPass, objective
 from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
@@ -152,25 +152,33 @@ class Scored:
     beside: float
 
 
-def scored(state: Changing) -> list[Scored]:
+def scored(state: Changing) -> tuple[Changing, list[Scored]]:
     """Effects that may have begun, changed or ended, by what that is worth at any moment, best first.
 
     Args:
-        state: a fit, and the quadratic at it.
+        state: a fit, wherever its quadratic was taken.
+
+    Returns:
+        the state with its objective and the quadratic at it, and the effects.
     """
     problem, fit = state.problem, state.fit
     names = {e: _own(problem, e) for e in may_begin(problem, fit, state.onsets)}
-    table = _Table.of(state, names)
     records = problem.engine.records
     rows = rows_of(records)
-    found = problem.engine.beginnings(fit.values, fit.noise, problem.parameters, rows, table.row_of)
+    everything = problem.parameters
+    passes, lin, found = problem.engine.beginnings(
+        fit.values, fit.noise, everything, rows, _asked(problem, fit, names)
+    )
+    fit = replace(fit, objective=objective(passes, problem.free(fit.active), fit.values))
+    state = replace(state, fit=fit, quadratic=Quadratic.of(lin, everything, fit.values))
+    table = _Table.of(state, names)
     every = [
-        (Moment(record.whole, float(record.t[row])), result)
-        for record, of_run, results in zip(records, rows, found, strict=True)
-        for row, result in zip(of_run, results, strict=False)  # none where the filter diverged
+        (Moment(record.whole, float(record.t[b.row])), table.row_of(b))
+        for record, of_run in zip(records, found, strict=True)
+        for b in of_run
     ]
     if not every:
-        return []
+        return state, []
     slopes, information, crossed = (
         np.array(part) for part in zip(*(r for _, r in every), strict=True)
     )
@@ -190,7 +198,7 @@ def scored(state: Changing) -> list[Scored]:
                 moment = every[at][0]
                 of_effect.append(Scored(effect, total, moment, move, ends, total - always))
         best += sorted(of_effect, key=lambda s: -s.nats)[:1]
-    return sorted(best, key=lambda s: -s.nats)
+    return state, sorted(best, key=lambda s: -s.nats)
 
 
 def may_begin(problem: Problem, fit: Fit, onsets: Collection[str]) -> list[str]:
@@ -226,6 +234,17 @@ def rows_of(records: Sequence[Record]) -> list[np.ndarray]:
     return found
 
 
+def _asked(problem: Problem, fit: Fit, names: Mapping[str, Sequence[str]]) -> Asked:
+    """What a score takes of every row: beside what is free, and pairs of each effect's numbers."""
+    places = {f.name: k for k, f in enumerate(problem.parameters)}
+    groups = [np.array([places[n] for n in own], np.int64) for own in names.values()]
+    return Asked(
+        np.array([places[n] for n in problem.free_names(fit.active)], np.int64),
+        np.concatenate([np.repeat(c, c.size) for c in groups]),
+        np.concatenate([np.tile(c, c.size) for c in groups]),
+    )
+
+
 @dataclass(frozen=True)
 class _Table:
     """What the score of a change takes that does not depend on its moment.
@@ -255,8 +274,8 @@ class _Table:
         """At a fit, for effects with these numbers."""
         problem, quadratic = state.problem, state.quadratic
         assert quadratic.parts is not None
-        free = problem.free_names(state.fit.active)
-        rest = quadratic.index(free)
+        asked = _asked(problem, state.fit, names)
+        rest = asked.beside
         pull = quadratic.g + quadratic.precision * (quadratic.at - quadratic.mean)
         known = quadratic.G[np.ix_(rest, rest)] + np.diag(quadratic.precision[rest])
         groups = [quadratic.index(own) for own in names.values()]
@@ -273,10 +292,7 @@ class _Table:
             pull[rest],
             groups,
             [np.array([sizes[n] for n in own]) for own in names.values()],
-            (
-                np.concatenate([np.repeat(c, c.size) for c in groups]),
-                np.concatenate([np.tile(c, c.size) for c in groups]),
-            ),
+            (asked.first, asked.second),
             np.concatenate(
                 [first + np.arange(c.size**2).reshape(c.size, c.size).T.ravel()
                  for first, c in zip(firsts, groups, strict=False)]
@@ -289,13 +305,13 @@ class _Table:
         numbers, and the groups' matrices, row by row.
         """
         later = self.later[b.record]
-        across = b.across[:, self.rest] + later[:, self.rest]
+        across = b.across + later[:, self.rest]
         weights = across @ self.inverse
         slope = b.slope + self.slope_later[b.record] - weights @ self.pull
         i, j = self.pairs
-        of_rest = across[i]
-        own = b.own[i, j] + later[i, j] - np.einsum("pr,pr->p", of_rest, weights[j])
-        crossed = b.across[i, j] + later[i, j] - np.einsum("pr,pr->p", of_rest, self.always[1][j])
+        of_rest, behind = across[i], later[i, j]
+        own = b.own + behind - np.einsum("pr,pr->p", of_rest, weights[j])
+        crossed = b.crossed + behind - np.einsum("pr,pr->p", of_rest, self.always[1][j])
         return slope, own, crossed
 
     @cached_property
@@ -362,9 +378,8 @@ def _next(state: Changing, runs: Sequence[str]) -> tuple[Changing, Onset] | None
     """The change that is worth most once fitted, where it pays."""
     chosen = state.problem.settings
     best = None
-    fit, _, quadratic = linearise(state.problem, without_drifts(state.fit))
-    steady = replace(state, fit=fit, quadratic=quadratic)
-    near = _standing(scored(steady), chosen)
+    steady, found = scored(replace(state, fit=without_drifts(state.fit)))
+    near = _standing(found, chosen)
     if near and near[0].nats < chosen.clear_evidence * chosen.evidence:
         near = _beside_commands(steady, near)
     for candidate in near[: chosen.most_trials]:
@@ -392,8 +407,7 @@ def _beside_commands(steady: Changing, near: Sequence[Scored]) -> list[Scored]:
     wider, fit = with_command_gains(steady.problem, steady.fit, coloured=True)
     if not has_command_gains(wider):
         return list(near)
-    fit, _, quadratic = linearise(wider, fit)
-    again = scored(Changing(wider, fit, quadratic, steady.onsets))
+    _, again = scored(replace(steady, problem=wider, fit=fit))
     stand = {s.effect for s in _standing(again, steady.problem.settings)}
     return [s for s in near if s.effect in stand]
 

@@ -110,6 +110,10 @@ class Problem:
         """Without some of those."""
         return replace(self, added=tuple(f for f in self.added if f.name not in names))
 
+    def of_candidates(self, names: Collection[str]) -> "Problem":
+        """With these of the candidates alone."""
+        return replace(self, own={e: own for e, own in self.own.items() if e in names})
+
     def with_model(self, model: HeliModel) -> "Problem":
         """Of another model of the same machine."""
         return replace(

@@ -111,6 +111,8 @@ def _resting_on_unseen(
     An interval covers what is in the model. A usual accelerometer scale is worth nothing on flights
     that never leave 1 g, and is then in the accelerometer's bias.
     """
+    if not fit.active:
+        return []
     chosen = problem.settings
     free = problem.free_names(fit.active)
     std = np.sqrt(np.diag(quadratic.covariance(free)))

@@ -5,16 +5,19 @@ At each point the log-posterior is quadratic in all parameters at once, bare one
 of its parameters is large enough to matter in prediction; everything is re-linearised after each move,
 and what is active is dropped or swapped where the data no longer carry it (Miller 2002, Subset
 Selection in Regression, ch. 3; with log Bayes factors in place of F).
+
+On the way from one addition to the next only those candidates are linearised that were near the
+threshold the time before. Before anything else is tried, and at the end, all of them are.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, stepped, with_latent_noise
 from coax_env.diagnosis.moves import Proposal, accepted, add, drop, swaps, trials
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.scores import Score, scores
+from coax_env.diagnosis.scores import Score, most_gains, scores
 from coax_env.estimation.engine import RunPass
 from coax_env.estimation.quadratic import Quadratic
 
@@ -27,26 +30,32 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
     """
     chosen = problem.settings
     memory = _Memory()
+    near = problem  # with the candidates that are linearised
     complete = False  # nothing is left to add
     just_fitted = False
     for _ in range(4 * chosen.most_causes):
-        fit, passes, quadratic = linearise(problem, fit)
-        step_gain = -quadratic.best(problem.free_names(fit.active))[0]
-        candidates = scores(problem, fit, quadratic, memory.banned)
+        fit, passes, quadratic = linearise(near, fit)
+        step_gain = -quadratic.best(near.free_names(fit.active))[0]
+        candidates = scores(near, fit, quadratic, memory.banned)
         fit = _noting_strongest(fit, ((c.evidence, c.effect) for c in candidates))
         strong = [c for c in candidates if c.evidence > chosen.evidence]
         clear = strong and strong[0].nats > chosen.add_before_fitted * step_gain
         converged = step_gain <= chosen.step_gain or just_fitted
         if not converged and (complete or not clear):
-            fit = stepped(problem, fit, passes, quadratic)
-            fit = fitted(problem, fit, chosen.most_steps, chosen.step_gain)
+            fit = stepped(near, fit, passes, quadratic)
+            fit = fitted(near, fit, chosen.most_steps, chosen.step_gain)
+            near = near if strong else problem
             just_fitted = True
             continue
         just_fitted = False
         moved = None
         if not complete:
-            moved = _backward(problem, fit, quadratic, memory) if converged else None
-            moved = moved or _forward(problem, fit, passes, quadratic, strong, memory)
+            moved = _backward(near, fit, quadratic, memory) if converged else None
+            moved = moved or _forward(near, fit, passes, quadratic, strong, memory)
+        if moved is None and near is not problem:
+            near, just_fitted = problem, converged
+            continue
+        if not complete:
             moved = moved or _swap(problem, fit, quadratic, memory)
             moved = moved or _trial(problem, fit, quadratic, candidates, memory)
             moved = moved or with_latent_noise(problem, fit)
@@ -54,9 +63,24 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
             complete = True
             moved = drop(problem, fit, quadratic, coloured=True)
         if moved is None:
-            break
+            return fit, quadratic
+        near = _nearest(near, fit, quadratic, moved.active)
         fit = noise_fitted(problem, moved)
+    fit, _, quadratic = linearise(problem, fit)
     return fit, quadratic
+
+
+def _nearest(problem: Problem, fit: Fit, quadratic: Quadratic, kept: Collection[str]) -> Problem:
+    """The problem with those of its candidates alone that may gain more than a tie, and some others.
+
+    Args:
+        problem, fit: what may be free, and where.
+        quadratic: linearised at the fit.
+        kept: effects that stay candidates.
+    """
+    _, most = most_gains(problem, quadratic, fit.active, {})
+    near = {e for e, gain in most.items() if gain > problem.settings.tie}.union(kept)
+    return problem.of_candidates(near)
 
 
 @dataclass

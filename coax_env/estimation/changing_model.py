@@ -70,34 +70,50 @@ def _pointers(motion: Motion, name: str) -> tuple[Any, Any, Any]:
     )
 
 
-def _drift_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """As `helicopter._drift_of_lanes`, with the row's block: the same row in every lane."""
-    inputs = u.shape[0] - 1
+@compiled(inline="always")
+def _block_of_lanes(u: Any, p: Any) -> Any:
+    """As `_block`: the row is the same in every lane."""
     size = int(p[p.shape[0] - 1, 0])
-    first = int(u[inputs, 0]) * size
-    u_, p_, out_ = simd_view(u)[:inputs], simd_view(p)[first : first + size], simd_view(out)
-    _drift_of_registers(simd_view(x), u_, dt, p_, simd_view(work), out_)
-    _take_in_innovations(u_, p_, out_)
+    first = int(u[u.shape[0] - 1, 0]) * size
+    return first, first + size
+
+
+def _step_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """As `helicopter._step_of_lanes`, with the row's block."""
+    first, end = _block_of_lanes(u, p)
+    u_, p_, out_ = simd_view(u)[: u.shape[0] - 1], simd_view(p)[first:end], simd_view(out)
+    _start_of_step(simd_view(x), u_, p_, out_)
+    _step_of_registers(out_, u_, dt, p_, simd_view(work), out_)
 
 
 def _measure_of_lanes(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     """`_measure` of as many."""
-    inputs = u.shape[0] - 1
-    size = int(p[p.shape[0] - 1, 0])
-    first = int(u[inputs, 0]) * size
-    u_, p_ = simd_view(u)[:inputs], simd_view(p)[first : first + size]
+    first, end = _block_of_lanes(u, p)
+    u_, p_ = simd_view(u)[: u.shape[0] - 1], simd_view(p)[first:end]
     _measure_of_registers(simd_view(x), u_, p_, simd_view(work), simd_view(out))
 
 
-_drift_of_registers: Any = None  # put in by `_side_by_side`, as in helicopter.py
+def _drift_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`_drift_and_readings` of as many."""
+    first, end = _block_of_lanes(u, p)
+    u_, p_, out_ = simd_view(u)[: u.shape[0] - 1], simd_view(p)[first:end], simd_view(out)
+    _drift_of_registers(simd_view(x), u_, dt, p_, simd_view(work), out_)
+    _take_in_innovations(u_, p_, out_)
+
+
+_step_of_registers: Any = None  # put in by `_side_by_side`, as in helicopter.py
 _measure_of_registers: Any = None
+_drift_of_registers: Any = None
 _take_in_innovations = helicopter._take_in_innovations
+_start_of_step = helicopter._start_of_step
 
 
 @cache
 def _side_by_side() -> Any:
-    """Pointers to the two; None where the helicopter has none."""
-    return helicopter.lanes_of_registers(_drift_of_lanes, _measure_of_lanes, "changing")
+    """Pointers to the three; None where the helicopter has none."""
+    return helicopter.lanes_of_registers(
+        Motion(_step_of_lanes, _measure_of_lanes, _drift_of_lanes), "changing"
+    )
 
 
 class ChangingModel(HeliModel):

@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 
-from coax_env.estimation import frozen_gains, kalman, noise_score
+from coax_env.estimation import beginnings, frozen_gains, kalman, noise_score
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.kernel import compilation
 from coax_env.model.dynamics import hover_trim
@@ -19,7 +19,10 @@ PASSES = (
     frozen_gains.signature_pass,
     noise_score.score_pass,
     frozen_gains.mean_pass,
+    frozen_gains.mean_passes,
     kalman.fly_open_loop,
+    kalman.read,
+    beginnings.beginnings_pass,
 )
 
 

@@ -6,20 +6,22 @@ identification, effects' parameters free is diagnosis.
 
 import math
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from coax_env.estimation import frozen_gains, kalman, noise_score
-from coax_env.estimation.beginnings import Answers, Beginning
+from coax_env.estimation.beginnings import Asked, Beginning, Moved, Sums, beginnings_pass
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.sparse import add_gram, aligned, padded
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
+from coax_env.kernel.simd import SIMD_WIDTH
 from coax_env.progress import Progress
 
 GATE = 8.0  # std of an innovation beyond which a reading counts as an outlier; ours
@@ -27,6 +29,9 @@ REFRESH = 4  # rows between new Jacobians, at least
 REFRESH_SECONDS = 0.04  # [s] in which they change little: more rows of a log faster than 100 Hz
 BLOCK = 2.0  # [s] of the blocks whose scores are taken as independent
 BLOCKS_AT_ONCE = 5  # whose signatures are held at a time: 7 MB at 100 Hz with every parameter
+NONE_KEPT = frozen_gains.Kept(np.zeros((0, 0, 0), np.float32), np.zeros(0, np.int64))
+OF_GAINS = ("gains", "per_sigma", "H")  # what takes most of a pass' memory
+REMEMBERED = 4  # passes at which something was linearised or a fit ended; ours
 DIVERGED = 1e6  # whitened innovations [std] that only a diverging mean has
 
 
@@ -110,6 +115,23 @@ class _Moves:
 
 
 @dataclass(frozen=True)
+class _LinearisedRun:
+    """One run's part of `Linearised`, its blocks' slopes with it.
+
+    run, at: its pass. J: (readings, padded) signatures of its last blocks, k of them, then the
+    innovations. wild: (k,) whose signatures were not finite.
+    """
+
+    run: RunPass
+    at: PassJacobians
+    J: np.ndarray
+    wild: np.ndarray
+    information: np.ndarray
+    by_channel: np.ndarray
+    blocks: np.ndarray
+
+
+@dataclass(frozen=True)
 class NoiseScore:
     """Log-likelihood [nats] (-inf where a filter diverged) and its slopes in the noise.
 
@@ -159,6 +181,7 @@ class Engine:
         self._refresh = [_rows_between_jacobians(dt) for dt in self.intervals]
         self._readings = [int((~np.isnan(r.z)).sum()) for r in self.records]
         self._buffers: list[_Buffers] = []  # that no thread works with
+        self._flown: deque[tuple[np.ndarray, Noise, list[RunPass]]] = deque(maxlen=REMEMBERED)
 
     def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
         """Work done on every run (or those in `which`), the longest first so that no thread waits."""
@@ -199,6 +222,10 @@ class Engine:
             start_rows: per record, rows at which to keep the filtered covariance.
         """
         p = self.model.vector(values, noise)
+        if not keep and which is None and start_rows is None:
+            for vector, of_noise, passes in tuple(self._flown):
+                if np.array_equal(vector, p) and of_noise == noise:
+                    return passes
 
         def one(i: int) -> RunPass:
             starts = None if start_rows is None else start_rows[i]
@@ -206,6 +233,14 @@ class Engine:
             return self._filter_run(i, p, noise, buffers, start_rows=starts)[0]
 
         return self._each(one, which)
+
+    def _remember(self, p: np.ndarray, noise: Noise, passes: Sequence[RunPass]) -> None:
+        """Passes of all records, whose end others will ask for again; without their gains."""
+        bare = [
+            replace(run, **{name: np.empty_like(getattr(run, name)[:0]) for name in OF_GAINS})
+            for run in passes
+        ]
+        self._flown.append((p, noise, bare))
 
     def _reading_variances(self, noise: Noise) -> np.ndarray:
         return np.array([noise.reading.get(c, 1.0) for c in self.model.channels]) ** 2
@@ -292,44 +327,71 @@ class Engine:
         p = self.model.vector(values, noise)
         moves = self._moves(values, noise, free)
 
-        def one(i: int) -> tuple[Any, ...]:
+        def one(i: int) -> _LinearisedRun:
             with self._borrowed_buffers() as buffers:
-                run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
-                count, width = len(free), padded(len(free) + 1)
-                information = np.zeros((width, width))
-                by_channel = np.zeros((len(free), run.innovations.shape[1]))
-                edges, before = _block_edges(run)
-                blocks = np.zeros((edges.size - 1, len(free)))
-                if np.isfinite(run.log_likelihood):
-                    work = self._signatures(i, run, at, p, moves, by_channel)[0]
-                    probed = self._probed_signatures(i, run, moves, by_channel)
-                    e = run.innovations[np.isfinite(run.innovations)]
-                    for first in range(0, edges.size - 1, BLOCKS_AT_ONCE):
-                        own = edges[first : first + BLOCKS_AT_ONCE + 1]
-                        since, until = before[own[0]], before[own[-1]]
-                        J = buffers.array("J", (int(until - since), width))
-                        J[:, count:] = 0.0
-                        J[:, count] = e[since:until]
-                        J[:, np.flatnonzero(moves.probed)] = probed[since:until]
-                        work(frozen_gains.Portion(int(own[0]), int(own[-1]), int(since)), J)
-                        for b, (a, z) in enumerate(pairwise(before[own] - since), first):
-                            products = np.zeros((width, width))
-                            add_gram(J[a:z], count, products)
-                            blocks[b] = products[:count, count]
-                            information += products
-                information = information[:count, :count]
-                information = np.triu(information) + np.triu(information, 1).T
-                wild = ~np.isfinite(np.diag(information))
-                information[wild] = information[:, wild] = 0.0
-                by_channel[wild] = 0.0
-                blocks[:, wild] = 0.0
-            return run, information, blocks.sum(0), by_channel, blocks
+                return self._linearise_run(i, p, noise, moves, buffers, BLOCKS_AT_ONCE)
 
-        passes, *parts, blocks = zip(*self._each(one), strict=True)
-        information, slope, by_channel = (np.array(part) for part in parts)
-        return list(passes), Linearised(
-            tuple(f.name for f in free), information, slope, by_channel, np.concatenate(blocks)
+        return self._gathered(p, noise, free, self._each(one))
+
+    def _gathered(
+        self,
+        p: np.ndarray,
+        noise: Noise,
+        free: Sequence[FreeParameter],
+        found: Sequence[_LinearisedRun],
+    ) -> tuple[list[RunPass], Linearised]:
+        """The passes, and the linearisations of all runs."""
+        passes = [one.run for one in found]
+        self._remember(p, noise, passes)
+        return passes, Linearised(
+            tuple(f.name for f in free),
+            np.array([one.information for one in found]),
+            np.array([one.blocks.sum(0) for one in found]),
+            np.array([one.by_channel for one in found]),
+            np.concatenate([one.blocks for one in found]),
         )
+
+    def _linearise_run(
+        self,
+        i: int,
+        p: np.ndarray,
+        noise: Noise,
+        moves: _Moves,
+        buffers: _Buffers,
+        at_once: int,
+        kept: frozen_gains.Kept = NONE_KEPT,
+    ) -> _LinearisedRun:
+        """One run filtered and linearised, the signatures of so many blocks at once in memory."""
+        run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
+        count, edges, before = len(moves.vectors), *_block_edges(run)
+        width = padded(count + 1)
+        products, blocks = np.zeros((width, width)), np.zeros((edges.size - 1, count))
+        by_channel = np.zeros((count, run.innovations.shape[1]))
+        J = np.zeros((0, width))
+        if np.isfinite(run.log_likelihood):
+            signatures = self._signatures(i, run, at, p, moves, by_channel)
+            probed = self._probed_signatures(i, run, p, moves, by_channel)
+            e = run.innovations[np.isfinite(run.innovations)]
+            for first in range(0, edges.size - 1, at_once):
+                own = edges[first : first + at_once + 1]
+                since, until = before[own[0]], before[own[-1]]
+                J = buffers.array("J", (int(until - since), width))
+                J[:, count:] = 0.0
+                J[:, count] = e[since:until]
+                J[:, np.flatnonzero(moves.probed)] = probed[since:until]
+                signatures(frozen_gains.Portion(int(own[0]), int(own[-1]), int(since)), J, kept)
+                for b, (a, z) in enumerate(pairwise(before[own] - since), first):
+                    of_block = np.zeros((width, width))
+                    add_gram(J[a:z], count, of_block)
+                    blocks[b] = of_block[:count, count]
+                    products += of_block
+        information = products[:count, :count]
+        information = np.triu(information) + np.triu(information, 1).T
+        wild = ~np.isfinite(np.diag(information))
+        information[wild] = information[:, wild] = 0.0
+        by_channel[wild] = 0.0
+        blocks[:, wild] = 0.0
+        return _LinearisedRun(run, at, J, wild, information, by_channel, blocks)
 
     def _moves(
         self, values: Mapping[str, float], noise: Noise, free: Sequence[FreeParameter]
@@ -353,19 +415,16 @@ class Engine:
         p: np.ndarray,
         moves: _Moves,
         by_channel: np.ndarray,
-    ) -> tuple[
-        Callable[[frozen_gains.Portion, np.ndarray], None], Callable[[np.ndarray], np.ndarray]
-    ]:
+    ) -> Callable[[frozen_gains.Portion, np.ndarray, frozen_gains.Kept], None]:
         """Derivatives of a run's whitened innovations where a small step does.
 
         Returns:
-            what puts those of a portion of the run, one after the other, into columns of J, and adds
-            their squares, by channel, to rows of `by_channel`; and what puts the state's derivatives
-            behind that portion into columns of (nx, k).
+            what puts those of a portion of the run, one after the other, into columns of J, adds their
+            squares, by channel, to rows of `by_channel`, and keeps the state's derivatives.
         """
         columns = np.flatnonzero(~moves.probed)
         if not columns.size:
-            return lambda portion, J: None, lambda out: out
+            return lambda portion, J, kept: None
         columns = columns[np.argsort(~moves.reading_only[columns], kind="stable")]
         vectors = [moves.vectors[k] for k in columns]
         sets, which = [run.inputs], np.zeros(columns.size, np.int64)
@@ -381,7 +440,9 @@ class Engine:
         s = aligned(self.compiled.exact.size, padded(columns.size + 1))
         trace = _trace(run, at)
 
-        def of_portion(portion: frozen_gains.Portion, J: np.ndarray) -> None:
+        def of_portion(
+            portion: frozen_gains.Portion, J: np.ndarray, kept: frozen_gains.Kept
+        ) -> None:
             frozen_gains.signature_pass(
                 self.compiled,
                 self.intervals[i],
@@ -393,13 +454,10 @@ class Engine:
                 s,
                 J,
                 by_channel,
+                kept,
             )
 
-        def of_state(out: np.ndarray) -> np.ndarray:
-            out[:, columns] = s[:, : columns.size]
-            return out
-
-        return of_portion, of_state
+        return of_portion
 
     def beginnings(
         self,
@@ -407,69 +465,61 @@ class Engine:
         noise: Noise,
         free: Sequence[FreeParameter],
         rows: Sequence[np.ndarray],
-        work: Callable[[Beginning], Any],
-    ) -> list[list[Any]]:
-        """What free parameters would do if they moved from some row of a run on; see beginnings.py.
+        asked: Asked,
+    ) -> tuple[list[RunPass], Linearised, list[list[Beginning]]]:
+        """`linearise`, and what free parameters would do if they moved from some row of a run on.
 
-        Of a parameter that needs a finite step (`probe`) its past is not taken out of the state.
+        See beginnings.py. Of a parameter that needs a finite step (`probe`) its past is not taken out
+        of the state.
 
         Args:
             values: of all parameters, by name.
             noise: levels of process and reading noise.
             free: the parameters.
             rows: of each record, rising.
-            work: is given each row's Beginning, the last row of a record first.
+            asked: what is wanted of each row, in places of `free`.
 
         Returns:
-            what `work` returned, record by record and row by row.
+            as `linearise`, and the rows' beginnings by record; none where the filter diverged.
         """
         p = self.model.vector(values, noise)
         moves = self._moves(values, noise, free)
 
-        def one(i: int) -> list[Any]:
+        def one(i: int) -> tuple[_LinearisedRun, list[Beginning]]:
+            n, nx = self.records[i].t.size, self.compiled.exact.size
+            s = np.zeros((rows[i].size, nx, padded(len(free) + 1)), np.float32)
+            kept = frozen_gains.Kept(s, np.full(n, -1, np.int64))
+            kept.places[rows[i]] = np.arange(rows[i].size)
             with self._borrowed_buffers() as buffers:
-                run, at = self._filter_run(i, p, noise, _Buffers(), buffers)
-                if not np.isfinite(run.log_likelihood):
-                    return []
-                return self._beginnings_of_run(i, run, at, p, moves, rows[i], work)[::-1]
+                found = self._linearise_run(i, p, noise, moves, buffers, n, kept)
+                begun = self._beginnings_of_run(i, found, rows[i], kept, asked)
+            return replace(found, J=found.J[:0].copy()), begun
 
-        return self._each(one)
+        found, begun = zip(*self._each(one), strict=True)
+        return *self._gathered(p, noise, free, found), list(begun)
 
     def _beginnings_of_run(
         self,
         i: int,
-        run: RunPass,
-        at: PassJacobians,
-        p: np.ndarray,
-        moves: _Moves,
+        of: _LinearisedRun,
         rows: np.ndarray,
-        work: Callable[[Beginning], Any],
-    ) -> list[Any]:
-        k, nx = len(moves.vectors), self.compiled.exact.size
-        there = np.isfinite(run.innovations)
-        before = np.append(0, np.cumsum(there.sum(1)))
-        by_channel = np.zeros((k, there.shape[1]))
-        signatures, derivatives = self._signatures(i, run, at, p, moves, by_channel)
-        edges = np.unique([0, *rows, there.shape[0]])
-        J, states, portions = np.zeros((int(before[-1]), k)), [], []
-        J[:, moves.probed] = self._probed_signatures(i, run, moves, by_channel)
-        for first, last in pairwise(edges):
-            portions.append(frozen_gains.Portion(int(first), int(last), int(before[first])))
-            states.append(derivatives(np.zeros((nx, k))).astype(np.float32))
-            signatures(portions[-1], J[before[first] : before[last]])
-        wild = ~np.isfinite(J).all(0)
-        J[:, wild] = 0.0
-        e = run.innovations[there]
-        answers, slope, own = Answers(nx, k), np.zeros(k), np.zeros((k, k))
-        found, asked = [], set(rows.tolist())
-        for portion, s in zip(portions[::-1], states[::-1], strict=True):
-            here = slice(portion.reading, before[portion.last])
-            answers.back(_trace(run, at), self._refresh[i], portion, J[here])
-            slope, own = slope + e[here] @ J[here], own + J[here].T @ J[here]
-            if portion.first in asked:
-                s[:, wild] = 0.0
-                found.append(work(Beginning(i, portion.first, *answers.since(s, slope, own))))
-        return found
+        kept: frozen_gains.Kept,
+        asked: Asked,
+    ) -> list[Beginning]:
+        if not np.isfinite(of.run.log_likelihood):
+            return []
+        k, width = of.wild.size, of.J.shape[1]
+        of.J[:, :k][:, of.wild] = kept.s[:, :, :k][:, :, of.wild] = 0.0
+        a, pairs = rows.size, asked.first.size
+        sums = Sums(
+            np.zeros((a, width)), np.zeros((a, asked.beside.size, width)), np.zeros((a, pairs)),
+            np.zeros((a, pairs)),
+        )  # fmt: skip
+        beginnings_pass(_trace(of.run, of.at), self._refresh[i], Moved(of.J, kept), asked, sums)
+        return [
+            Beginning(i, int(row), slope[:k], across[:, :k].T, crossed, own)
+            for row, slope, across, crossed, own in zip(rows, *sums, strict=True)
+        ]
 
     def _inputs(self, run: RunPass, p: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """A run's inputs with the parameters `vector`, known those with `p`."""
@@ -479,22 +529,44 @@ class Engine:
         return self.model.inputs(run.record, vector)
 
     def _probed_signatures(
-        self, i: int, run: RunPass, moves: _Moves, by_channel: np.ndarray
+        self, i: int, run: RunPass, p: np.ndarray, moves: _Moves, by_channel: np.ndarray
     ) -> np.ndarray:
         """The same where a finite step is needed, by a mean pass each: (readings, probed)."""
         there = np.isfinite(run.innovations)
         channel, e = np.nonzero(there)[1], run.innovations[there]
         columns = np.flatnonzero(moves.probed)
         found = np.zeros((e.size, columns.size))
-        probed = np.zeros(there.shape)
-        for column, k in enumerate(columns):
-            if self._frozen(i, run, moves.vectors[k], probed):
-                change = probed[there] - e
-                if np.abs(change).max(initial=0.0) < DIVERGED:
-                    change /= moves.steps[k]
-                    found[:, column] = change
-                    by_channel[k] = np.bincount(channel, change**2, by_channel.shape[1])
+        moved = self._moved_innovations(i, run, p, [moves.vectors[k] for k in columns])
+        for column, (k, innovations) in enumerate(zip(columns, moved, strict=True)):
+            change = innovations - e
+            if np.abs(change).max(initial=0.0) < DIVERGED:
+                change /= moves.steps[k]
+                found[:, column] = change
+                by_channel[k] = np.bincount(channel, change**2, by_channel.shape[1])
         return found
+
+    def _moved_innovations(
+        self, i: int, run: RunPass, p: np.ndarray, vectors: Sequence[np.ndarray]
+    ) -> Iterator[np.ndarray]:
+        """Innovations (readings,) with other parameters, gains frozen; not finite where it diverged."""
+        there = np.isfinite(run.innovations)
+        if not self.compiled.has_lanes:
+            e = np.zeros(there.shape)
+            for vector in vectors:
+                yield e[there] if self._frozen(i, run, vector, e) else np.full(there.sum(), np.nan)
+            return
+        data = kalman.RunData(self.intervals[i], run.inputs, run.record.z)
+        gains = kalman.Gains(run.gains, run.per_sigma, run.H)
+        for first in range(0, len(vectors), SIMD_WIDTH):
+            some = vectors[first : first + SIMD_WIDTH]
+            lanes = [*some, *[p] * (SIMD_WIDTH - len(some))]
+            e = np.zeros((int(there.sum()), SIMD_WIDTH))
+            frozen_gains.mean_passes(
+                self.compiled, data, self.starts[i][0], p, np.array(lanes).T.copy(),
+                np.array([self._inputs(run, p, vector) for vector in lanes]),
+                gains, self._refresh[i], e,
+            )  # fmt: skip
+            yield from e.T[: len(some)]
 
     def descend(
         self,
@@ -599,6 +671,7 @@ class Engine:
                 progress(f"fit: step {count}, gained {gained:.1f} nats")
             if gained < tolerance or count == iterations:
                 passes = self.filter(values, noise)
+                self._remember(self.model.vector(values, noise), noise, passes)
                 break
             passes, lin = self.linearise(values, noise, free)
         return Estimate(

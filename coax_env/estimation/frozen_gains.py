@@ -11,7 +11,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import boolean, float64, int64, types
+from numba import boolean, float32, float64, int64, types
 
 from coax_env.estimation.kalman import (
     _A,
@@ -90,6 +90,57 @@ def mean_pass(model, run, x0, p, gains, refresh, e):
     return True
 
 
+@compiled_when_called(
+    types.void(MODEL, RUN_DATA, _A, _A, _M, float64[:, :, ::1], GAINS, int64, _M),
+    makes_arrays=True, **REORDER,
+)  # fmt: skip
+def mean_passes(model, run, x0, p, moved, u, gains, refresh, e):
+    """`mean_pass` of SIMD_WIDTH parameter vectors at once; not finite where one diverged.
+
+    Args:
+        model: a CompiledModel that has lanes. run: RunData. x0: (nx,) first state. p: (np,) the
+            parameters of the filter pass.
+        moved: (np, SIMD_WIDTH) parameters, a column each. u: (SIMD_WIDTH, n, nu) their inputs.
+        gains, refresh: of the filter pass.
+        e: (readings, SIMD_WIDTH) whitened innovations, out, in the order of the filter's.
+    """
+    n, m = run.z.shape
+    nx, nu = x0.size, u.shape[2]
+    lanes = lanes_of(nx, nu, p, model.work_size, m)
+    x, out, shown = simd_blocks(lanes.x), simd_blocks(lanes.out), simd_blocks(e)
+    predicted = aligned(nx, SIMD_WIDTH)
+    before = simd_blocks(predicted)
+    in_every_lane(x0, lanes.x)
+    H = with_places(np.zeros((m, padded(nx))), nx)
+    reading = np.uint64(0)
+    for k in range(n):
+        if k % refresh == 0:
+            unpack(gains.H, k // refresh, H)
+        for lane in range(SIMD_WIDTH):
+            for i in range(nu):
+                lanes.u[i, lane] = u[lane, k, i]
+        model.measure_of_lanes(lanes.x, lanes.u, moved, lanes.work, lanes.out)
+        for j in range(nx):
+            before[j] = x[j]
+        for i in range(m):
+            if math.isnan(run.z[k, i]):
+                continue
+            residuals = run.z[k, i] - out[i]
+            if model.wraps[i]:
+                residuals = wrap_angle(residuals)
+            for c in range(H.counts[i]):
+                a = H.places[i, c]
+                residuals -= H.values[i, a] * (x[a] - before[a])
+            shown[reading] = residuals * gains.per_sigma[reading]
+            for j in range(nx):
+                x[j] += float64(gains.K[reading, j]) * residuals
+            reading += ONE
+        if k < n - 1:
+            model.step_of_lanes(lanes.x, lanes.u, run.dt[k], moved, lanes.work, lanes.out)
+            for j in range(nx):
+                x[j] = out[j]
+
+
 class Moves(NamedTuple):
     """The parameters whose signatures are wanted, k of them, each moved by itself.
 
@@ -112,6 +163,15 @@ class Portion(NamedTuple):
     first: int
     last: int
     reading: int
+
+
+class Kept(NamedTuple):
+    """The state's derivatives at some rows, before their readings: s (rows kept, nx, k or more), and
+    places: (n,) where in it a row's stand, or -1; empty: of none.
+    """
+
+    s: np.ndarray
+    places: np.ndarray
 
 
 class _Signatures(NamedTuple):
@@ -138,6 +198,7 @@ class _Signatures(NamedTuple):
 
 
 MOVES = types.NamedTuple([_M, _A, boolean[::1], float64[:, :, ::1], _N, _N], Moves)
+KEPT = types.NamedTuple([float32[:, :, ::1], _N], Kept)
 PORTION = types.NamedUniTuple(int64, 3, Portion)
 
 
@@ -258,10 +319,10 @@ def _propagate(exact, F, w):
 
 
 @compiled_when_called(
-    types.void(MODEL, _A, TRACE, _A, MOVES, int64, PORTION, _M, _M, _M),
+    types.void(MODEL, _A, TRACE, _A, MOVES, int64, PORTION, _M, _M, _M, KEPT),
     makes_arrays=True, **REORDER,
 )  # fmt: skip
-def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channel):
+def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channel, kept):
     """Derivatives of the whitened innovations in many parameters at once, gains frozen.
 
     What `mean_pass` gives with a parameter moved a little, to first order: with s the state's
@@ -283,6 +344,7 @@ def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channe
             return at the one after its last; zeros where the run begins.
         J: derivatives, out, one row for each reading of the portion, in the order of the innovations.
         by_channel: (k or more, m) their squares, added.
+        kept: Kept, out.
     """
     n, m = trace.e.shape
     nx, k_all = model.exact.size, moves.steps.size
@@ -305,6 +367,11 @@ def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channe
     F_slot = -1
     reading = portion.reading
     for row in range(portion.first, portion.last):
+        at = kept.places[row] if kept.places.size else -1
+        if at >= 0:
+            for j in range(nx):
+                for k in range(k_all):
+                    kept.s[at, j, moves.columns[k]] = s[j, k]
         if row % refresh == 0 or row == portion.first:
             unpack(trace.gains.H, row // refresh, H)
         if model.has_lanes:

@@ -85,11 +85,17 @@ def _take_in_innovations(u: Any, p: Any, x: Any) -> None:
     x[S.GUST_Z] += p[P.COMMAND_GAIN_FORCE_Z] * lift
 
 
-def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """`dynamics.step` after the input innovations are taken in, in the engine's form."""
+@compiled()
+def _start_of_step(x: Any, u: Any, p: Any, out: Any) -> None:
+    """A state (29,) with the input innovations taken in."""
     for i in range(N_FULL):
         out[i] = x[i]
     _take_in_innovations(u, p, out)
+
+
+def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`dynamics.step` after the input innovations are taken in, in the engine's form."""
+    _start_of_step(x, u, p, out)
     dynamics.step(out, u, dt, p, work, out)
 
 
@@ -125,12 +131,20 @@ class Moment:
     t: float
 
 
-_drift_of_registers: Any = None  # what stands for them is compiled when it is first needed
+_step_of_registers: Any = None  # what stands for them is compiled when it is first needed
 _measure_of_registers: Any = None
+_drift_of_registers: Any = None
+
+
+def _step_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """`_step` of SIMD_WIDTH states, inputs and vehicles, a column each."""
+    u_, p_, out_ = simd_view(u), simd_view(p), simd_view(out)
+    _start_of_step(simd_view(x), u_, p_, out_)
+    _step_of_registers(out_, u_, dt, p_, simd_view(work), out_)
 
 
 def _drift_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """`_drift_and_readings` of SIMD_WIDTH states, inputs and vehicles, a column each."""
+    """`_drift_and_readings` of as many."""
     u_, p_, out_ = simd_view(u), simd_view(p), simd_view(out)
     _drift_of_registers(simd_view(x), u_, dt, p_, simd_view(work), out_)
     _take_in_innovations(u_, p_, out_)
@@ -141,24 +155,26 @@ def _measure_of_lanes(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     _measure_of_registers(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
 
 
-def lanes_of_registers(drift_of_lanes: Any, measure_of_lanes: Any, kind: str) -> Any:
-    """Pointers to two functions that call `_drift_of_registers` and `_measure_of_registers`.
+def lanes_of_registers(motion: Motion, kind: str) -> Any:
+    """Pointers to a motion that calls `_step_of_registers` and its like.
 
     Args:
-        drift_of_lanes, measure_of_lanes: not compiled. kind: what tells them from others.
+        motion: not compiled. kind: what tells it from others.
 
     Returns:
-        both; None where a user's effect does not compile for registers.
+        the three; None where a user's effect does not compile for registers.
     """
-    drift, measure = dynamics.drift_and_measure_of_registers()
-    names = {"_drift_of_registers": drift, "_measure_of_registers": measure}
+    step, measure, drift = dynamics.motion_of_registers()
+    names = {
+        "_step_of_registers": step,
+        "_measure_of_registers": measure,
+        "_drift_of_registers": drift,
+    }
+    signatures = (LANES_STEP, LANES_MEASURE, LANES_STEP)
     try:
         return tuple(
             pointer(signature.signature)(under_names(function, names, kind))
-            for signature, function in (
-                (LANES_STEP, drift_of_lanes),
-                (LANES_MEASURE, measure_of_lanes),
-            )
+            for signature, function in zip(signatures, motion, strict=True)
         )
     except numba.core.errors.NumbaError:
         return None
@@ -166,8 +182,10 @@ def lanes_of_registers(drift_of_lanes: Any, measure_of_lanes: Any, kind: str) ->
 
 @cache
 def _side_by_side() -> Any:
-    """Pointers to the helicopter's own two."""
-    return lanes_of_registers(_drift_of_lanes, _measure_of_lanes, "all_effects")
+    """Pointers to the helicopter's own three."""
+    return lanes_of_registers(
+        Motion(_step_of_lanes, _measure_of_lanes, _drift_of_lanes), "all_effects"
+    )
 
 
 def _small_changes() -> np.ndarray:
@@ -200,7 +218,7 @@ class HeliModel:
 
     @property
     def side_by_side(self) -> Any:
-        """`drift_and_readings` and `measure` of SIMD_WIDTH at once, or None.
+        """`step`, `measure` and `drift_and_readings` of SIMD_WIDTH at once, or None.
 
         They are the helicopter's own: a model that moves in another way has none of them, unless it
         says which.

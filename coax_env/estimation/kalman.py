@@ -37,7 +37,7 @@ from coax_env.estimation.sparse import (
 )
 from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled, compiled_when_called, pointer
-from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
+from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks, transpose
 
 _A = float64[::1]
 _M = float64[:, ::1]
@@ -57,8 +57,8 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 
 @pointer(LANES_STEP.signature)
-def _no_drift(x, u, dt, p, work, out):
-    """What stands for `drift_of_lanes` where a model has none."""
+def _no_motion(x, u, dt, p, work, out):
+    """What stands for `step_of_lanes` and `drift_of_lanes` where a model has none."""
 
 
 @pointer(LANES_MEASURE.signature)
@@ -69,7 +69,7 @@ def _no_readings(x, u, p, work, out):
 class CompiledModel(NamedTuple):
     """What compiled code needs of a model; see state_space.Model for each.
 
-    has_lanes: whether it has `side_by_side`, the two `_of_lanes`.
+    has_lanes: whether it has `side_by_side`, the three `_of_lanes`.
     """
 
     step: Any
@@ -81,8 +81,9 @@ class CompiledModel(NamedTuple):
     work_size: int
     noise_places: np.ndarray
     has_lanes: bool
-    drift_of_lanes: Any
+    step_of_lanes: Any
     measure_of_lanes: Any
+    drift_of_lanes: Any
 
     @classmethod
     def of(cls, model: Any) -> "CompiledModel":
@@ -98,7 +99,7 @@ class CompiledModel(NamedTuple):
             int(model.work_size),
             np.ascontiguousarray(model.noise_places, np.int64),
             side_by_side is not None,
-            *(side_by_side or (_no_drift, _no_readings)),
+            *(side_by_side or (_no_motion, _no_readings, _no_motion)),
         )
 
 
@@ -238,7 +239,7 @@ def in_every_lane(values, out):
 
 MODEL = types.NamedTuple(
     [STEP, MEASURE, STEP, boolean[::1], boolean[::1], _A, int64, int64[:, ::1], boolean, LANES_STEP,
-     LANES_MEASURE], CompiledModel
+     LANES_MEASURE, LANES_STEP], CompiledModel
 )  # fmt: skip
 RUN_DATA = types.NamedTuple([_A, _M, _M], RunData)
 VARIANCES = types.NamedTuple([_A, _M, _A, _A, _A], Variances)
@@ -485,21 +486,24 @@ def _grow(assumed, dt, w):
 @compiled(**REORDER)
 def _predict(places, w):
     """P = F P F' + Q as F (F P)', and the mean of the step; `places` are those of Q's entries."""
-    nx = w.x.size
     multiply(w.F, w.P, w.FP)
-    for i in range(nx):
-        for j in range(nx):
-            w.PF[j, i] = w.FP[i, j]
+    transpose(w.FP, w.x.size, w.PF)
     multiply(w.F, w.PF, w.P)
-    for i in range(nx):
-        for j in range(i):
-            w.P[j, i] = w.P[i, j]
+    for i in range(w.x.size):
         w.x[i] = w.x_next[i]
     for e in range(w.Q.size):
         i, j = places[e, 0], places[e, 1]
         w.P[i, j] += w.Q[e]
         if i != j:
             w.P[j, i] += w.Q[e]
+
+
+@compiled(**REORDER)
+def _make_symmetric(P, nx):
+    """The lower half into the upper one: rounding parts them, and what differs may grow."""
+    for i in range(nx):
+        for j in range(i):
+            P[j, i] = P[i, j]
 
 
 # --- the pass ---------------------------------------------------------------------------------------
@@ -541,6 +545,7 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
         z, u, dt = run.z[k], run.u[k], run.dt[k]
         fresh = k % refresh == 0
         if fresh:
+            _make_symmetric(w.P, w.x.size)
             _linearise(model, u, dt, p, w)
             _take_H(w)
             if keep:
@@ -647,6 +652,19 @@ def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
     for j in range(nx):
         w.per_change[j] = 1.0 / model.scale[j]
     return _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w)
+
+
+@compiled_when_called(types.void(MODEL, _M, _A, _A, _M), makes_arrays=True)
+def read(model, states, u, p, out):
+    """Readings of states, each by itself.
+
+    Args:
+        model: a CompiledModel. states: (s, nx). u: (nu,) the input of them all.
+        p: (np,) the model's parameters. out: (s, m) readings.
+    """
+    work = np.zeros(model.work_size)
+    for s in range(states.shape[0]):
+        model.measure(states[s], u, p, work, out[s])
 
 
 @compiled_when_called(boolean(MODEL, _A, _M, _A, _A, int64, _N, _A), makes_arrays=True)

@@ -18,14 +18,14 @@ from coax_env.estimation.sparse import (
     with_places,
 )
 from coax_env.kernel.compilation import compiled, compiled_when_called
-from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
+from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks, transpose
 
 FEW = 4
 """Non-zeros of a reading's Jacobian of which each is taken by itself; ours."""
 
 
 @compiled(**REORDER)
-def _reading_back(b, e, per_sigma, gain, H, K, NK, r, N):
+def reading_back(b, e, per_sigma, gain, H, K, NK, r, N):
     """Across reading `b`: with A = I - K H, r = A' r + H' e / s and N = A' N A + H' H / s^2.
 
     N loses the symmetric part of twice H' w, w = N K - H' (K' N K + 1 / s^2) / 2.
@@ -120,9 +120,7 @@ def _row_back(w):
         for c in range(w.F.counts[i]):
             w.r[i] += w.F.values[i, w.F.places[i, c]] * w.r_next[w.F.places[i, c]]
     multiply(w.F, w.N, w.B)
-    for i in range(nx):
-        for j in range(nx):
-            w.NF[j, i] = w.B[i, j]
+    transpose(w.B, nx, w.NF)
     multiply(w.F, w.NF, w.N)
 
 
@@ -231,7 +229,7 @@ def score_pass(dt, trace, places, q, decay, gate, refresh, block, out):
         for b in range(m - 1, -1, -1):
             if not math.isnan(e[k, b]):
                 reading -= 1
-                shown, expected = _reading_back(
+                shown, expected = reading_back(
                     b, e[k, b], gains.per_sigma[reading], gains.K[reading], H, K, NK, w.r, w.N
                 )  # fmt: skip
                 if path.beyond[reading] > 0.0:

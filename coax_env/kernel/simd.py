@@ -34,6 +34,7 @@ from coax_env.kernel.simd_rows import (
     simd_scratch,
     simd_view,
     simd_view_uint64,
+    transpose,
 )
 from coax_env.kernel.simd_types import SIMD_WIDTH
 
@@ -57,4 +58,5 @@ __all__ = [
     "simd_view_uint64",
     "sine_and_cosine",
     "sines_and_cosines",
+    "transpose",
 ]

@@ -173,3 +173,27 @@ def scatter(block, which, some, rows):
                 block, (to, to + SIMD_WIDTH, to + 2 * SIMD_WIDTH, to + 3 * SIMD_WIDTH),
                 rows, (a + k, b + k, c + k, d + k),
             )  # fmt: skip
+
+
+@compiled()
+def transpose(matrix, n, out):
+    """The first n rows and columns of a matrix, transposed.
+
+    Args:
+        matrix: (n, at least n). n: how many. out: (n, at least n).
+    """
+    if n < 4:
+        for i in range(n):
+            for j in range(n):
+                out[j, i] = matrix[i, j]
+        return
+    long, wide = matrix.shape[1], out.shape[1]
+    for row in range(0, n, 4):
+        i = min(row, n - 4)  # the last four may overlap those before
+        for column in range(0, n, 4):
+            j = min(column, n - 4)
+            since, to = i * long + j, j * wide + i
+            _transpose(
+                matrix, (since, since + long, since + 2 * long, since + 3 * long),
+                out, (to, to + wide, to + 2 * wide, to + 3 * wide),
+            )  # fmt: skip

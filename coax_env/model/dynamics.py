@@ -599,11 +599,11 @@ def _stages_with(used: Collection[str] | None = None) -> dict[str, Any]:
 
 
 @cache
-def drift_and_measure_of_registers() -> tuple[Any, Any]:
-    """`drift_and_readings` and `measure` with every effect, to be called with SIMD registers."""
-    names = _stages_with()
-    drift, measure = inlined((_drift_and_readings, _measure), names, "of_registers", forced=False)
-    return drift, measure
+def motion_of_registers() -> tuple[Any, Any, Any]:
+    """`step`, `measure`, `drift_and_readings` with every effect, to be called with SIMD registers."""
+    motion = (_step, _measure, _drift_and_readings)
+    step, measure, drift = inlined(motion, _stages_with(), "of_registers", forced=False)
+    return step, measure, drift
 
 
 def step_and_measure_with(used: Collection[str], kind: str) -> tuple[Any, Any]:
