@@ -43,6 +43,7 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
         converged = step_gain <= chosen.step_gain or just_fitted
         if not converged and (complete or not clear):
             fit = stepped(near, fit, passes, quadratic)
+            del passes  # gains of every row: gone before others are made
             fit = fitted(near, fit, chosen.most_steps, chosen.step_gain)
             near = near if strong else problem
             just_fitted = True
@@ -52,6 +53,7 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
         if not complete:
             moved = _backward(near, fit, quadratic, memory) if converged else None
             moved = moved or _forward(near, fit, passes, quadratic, strong, memory)
+        del passes
         if moved is None and near is not problem:
             near, just_fitted = problem, converged
             continue

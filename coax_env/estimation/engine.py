@@ -18,6 +18,7 @@ import numpy as np
 
 from coax_env.estimation import frozen_gains, kalman, noise_score
 from coax_env.estimation.beginnings import Asked, Beginning, Moved, Sums, beginnings_pass
+from coax_env.estimation.freed_memory import return_freed_memory
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.sparse import add_gram, aligned, padded
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
@@ -31,6 +32,8 @@ BLOCK = 2.0  # [s] of the blocks whose scores are taken as independent
 BLOCKS_AT_ONCE = 5  # whose signatures are held at a time: 7 MB at 100 Hz with every parameter
 NONE_KEPT = frozen_gains.Kept(np.zeros((0, 0, 0), np.float32), np.zeros(0, np.int64))
 OF_GAINS = ("gains", "per_sigma", "H")  # what takes most of a pass' memory
+MANY_ROWS = 50_000
+"""Rows, 500 s at 100 Hz, from which on what was freed goes back before a linearisation; ours."""
 REMEMBERED = 4  # passes at which something was linearised or a fit ended; ours
 DIVERGED = 1e6  # whitened innovations [std] that only a diverging mean has
 
@@ -326,6 +329,8 @@ class Engine:
         """
         p = self.model.vector(values, noise)
         moves = self._moves(values, noise, free)
+        if sum(record.t.size for record in self.records) > MANY_ROWS:
+            return_freed_memory()
 
         def one(i: int) -> _LinearisedRun:
             with self._borrowed_buffers() as buffers:
@@ -667,6 +672,7 @@ class Engine:
                 break
             moves = dict(zip(names, step.tolist(), strict=True))
             values, gained = self.descend(passes, free, values, noise, moves)
+            del passes  # gains of every row: gone before others are made
             if progress:
                 progress(f"fit: step {count}, gained {gained:.1f} nats")
             if gained < tolerance or count == iterations:
