@@ -32,6 +32,27 @@ def test_kinds_differ_in_when_the_fault_is_there_alone():
     assert begins.fault["torque_balance"]["scale"] == pytest.approx(-0.042747877270685714)
 
 
+def test_whole_flights_begin_in_the_middle_of_a_middle_run():
+    """And the others where they did before there were whole ones."""
+    runs = onsets.lengths(True)
+    assert len(runs) == 12 and sum(runs.values()) == 210.0
+    names = list(runs)
+    for number in range(40):
+        plan = onsets.planned("begins", number, 8, whole=True)
+        run, t = plan.since
+        assert 3 <= names.index(run) < 9 and 3.0 <= t <= runs[run] - 3.0
+        assert plan.name == f"onset-begins-{number:04d}-whole"
+    assert onsets.planned("begins", 13, 8).since == ("lat_3211", 5.83)
+
+
+def test_a_moment_of_a_whole_flight_is_judged_in_its_own_flown_time():
+    """The end of a heave of 14 s and the start of the yaw behind it."""
+    whole = row("begins", [("gyro_bias", {"run": "yaw_3211", "t": 0.1, "std": 0.2})])
+    whole["plan"] |= {"whole": True, "since": ["heave_3211", 13.8]}
+    j = onsets.judged(whole)
+    assert j["error"] == pytest.approx(0.3) and j["held"]
+
+
 @pytest.mark.parametrize(
     ("t", "std", "run", "held"),
     [(5.3, 0.2, "lat_3211", True), (5.3, 0.15, "lat_3211", False), (0.1, 4.0, "heave_3211", True)],
