@@ -20,6 +20,7 @@ from injector_air import Air
 
 from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.helicopter import Moment
 from study.judge import tied, wilson
 from study.onset_worth import worth_of_change
 from study.pairs import FAULTS
@@ -126,12 +127,11 @@ def fly_and_diagnose(plan: Planned) -> dict[str, Any]:
             began = time.process_time()
             findings = diagnose(folder, hold_out=[]).findings
             row |= {"causes": findings["causes"], "seconds": time.process_time() - began}
-            if plan.kind in ("begins", "ends"):
+            if plan.kind in CHANGES:
                 before, after = stages(plan)
                 off = {effect: dict.fromkeys(sizes, 0.0) for effect, sizes in after.items()}
-                row["worth"] = worth_of_change(
-                    folder, before or off, after, plan.others, plan.since
-                )
+                moment = Moment(*plan.since, GROWING if plan.kind == "grows" else 0.0)
+                row["worth"] = worth_of_change(folder, before or off, after, plan.others, moment)
     except Exception:
         return row | {"error": traceback.format_exc()}
     return row
@@ -150,15 +150,17 @@ def judged(row: Mapping[str, Any]) -> dict[str, Any]:
     mine = [c for c in causes if any(tied(c["effect"], e) for e in plan["fault"])]
     changed = [c for c in mine if c["since"]] if plan["kind"] in CHANGES else []
     error = None
-    held = False
+    held = grows = False
     if changed:
         since = changed[0]["since"]
         before = flown_before(plan.get("whole", False))
         error = abs(before[since["run"]] + since["t"] - before[plan["since"][0]] - plan["since"][1])
         held = error <= 1.96 * since["std"]
+        grows = since["grown"] is not None
     return {
         "named": bool(mine),
         "since": bool(changed),
+        "grows": grows,
         "should_show": row.get("worth", 0.0) > 2.0 * SETTINGS.evidence,
         "error": error,
         "held": held,
@@ -202,14 +204,14 @@ def text_of(rows: Sequence[Mapping[str, Any]]) -> str:
 def _of_change(kind: str, of: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[bool]]]:
     """Figures of one kind in which something changes."""
     shown = [j for j in of if j["should_show"]]
-    figures = [(f"{kind}: named", [j["named"] for j in of]),
-               (f"{kind}: with its moment", [j["since"] for j in of])]  # fmt: skip
-    if kind != "grows":
-        figures += [(f"{kind}, should show: named", [j["named"] for j in shown]),
-                    (f"{kind}, should show: with its moment", [j["since"] for j in shown]),
-                    (f"{kind}: the moment within its 95 % interval",
-                     [j["held"] for j in of if j["since"]])]  # fmt: skip
-    return [*figures, (f"{kind}: a false name", [bool(j["false"]) for j in of]),
+    dated = [j for j in of if j["since"]]
+    return [(f"{kind}: named", [j["named"] for j in of]),
+            (f"{kind}: with its moment", [j["since"] for j in of]),
+            (f"{kind}, should show: named", [j["named"] for j in shown]),
+            (f"{kind}, should show: with its moment", [j["since"] for j in shown]),
+            (f"{kind}: the moment within its 95 % interval", [j["held"] for j in dated]),
+            (f"{kind}: said to grow", [j["grows"] for j in dated]),
+            (f"{kind}: a false name", [bool(j["false"]) for j in of]),
             (f"{kind}: a false moment", [bool(j["false_since"]) for j in of])]  # fmt: skip
 
 
@@ -223,7 +225,8 @@ def _line(words: str, right: Sequence[bool]) -> str:
 
 def _is_off(row: Mapping[str, Any], j: Mapping[str, Any]) -> bool:
     kind = row["plan"]["kind"]
-    missed = kind in CHANGES and not (j["since"] and (j["held"] or kind == "grows"))
+    right = j["since"] and j["held"] and j["grows"] == (kind == "grows")
+    missed = kind in CHANGES and not right
     return bool(missed or j["false"] or j["false_since"])
 
 
