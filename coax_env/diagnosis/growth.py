@@ -1,9 +1,9 @@
 """Does a cause that begins in flight come at once, or does it grow?
 
 What grows has a share of its size that goes from 0 to 1 evenly between two times (changing_model.py).
-The two are fitted beside all other numbers, from the length about the step's moment that is likeliest
-and from the longest that may be, and both models pay for their times alike: of all times of the flight
-each was as likely.
+The two are fitted beside all other numbers, from several lengths about the step's moment, since a short
+growth is not far from a step and a likelihood of its own. Both models pay for their times alike: of all
+times of the flight each was as likely.
 """
 
 import math
@@ -23,8 +23,11 @@ from coax_env.estimation.changing_model import (
 from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.quadratic import Quadratic
 
-LENGTHS = tuple(0.5 * 2.0**k for k in range(9))
-"""s over which something may grow, where a fit of it begins: up to two minutes; ours."""
+LENGTHS = (0.5, 2.0, 8.0, 32.0, 128.0)
+"""s over which something may grow, where fits of it begin; ours."""
+WORSE = 100.0
+"""nats by which growth with a step's numbers may be worse than the step, to be fitted; ours. One that
+was fitted was 128 worse before and 30 better then."""
 
 
 @dataclass(frozen=True)
@@ -64,60 +67,49 @@ class Growth:
 def growing(
     problem: Problem, step: Fit, effect: str, moment: Moment, width: float
 ) -> tuple[Problem, Fit, Growth] | None:
-    """A change as one that grows; None where it comes as fast as a step, or is worse by a tie.
+    """A change as one that grows; None where it would come as fast as a step, or all are far worse.
 
     Args:
         problem, step: with the change at its moment, fitted.
         effect, moment: that changes, and when.
         width: s that the posterior of this moment is wide.
     """
-    wider = with_moment(problem, effect, replace(moment, grows=LENGTHS[0]))
     step = fitted(problem, noise_fitted(problem, step), steps=2)
-    tried = [_fitted(with_free, begun, effect) for with_free, begun in
-             _starts(problem, wider, step, effect, moment)]  # fmt: skip
-    found = [t for t in tried if t[2].grown - t[2].begins > 1.01 * SHORTEST]
-    if not found:
+
+    def judged(wider: Problem, fit: Fit) -> tuple[Problem, Fit, Growth]:
+        fit, _, quadratic = linearise(wider, fit)
+        own = growth_at(wider, fit, quadratic, effect)
+        price = math.log(width / own.width(problem.seconds))
+        return wider, fit, replace(own, nats=step.objective - fit.objective - price)
+
+    tried = [judged(wider, fitted(wider, begun, steps=6))
+             for wider, begun in _starts(problem, step, effect, moment)]  # fmt: skip
+    tried = [t for t in tried if t[2].grown - t[2].begins > 1.01 * SHORTEST]
+    if not tried:
         return None
-
-    def nats(fit: Fit, own: Growth) -> float:
-        return step.objective - fit.objective - math.log(width / own.width(problem.seconds))
-
-    best = max(found, key=lambda t: nats(*t[1:]))
-    return best[0], best[1], replace(best[2], nats=nats(*best[1:]))
+    wider, fit, _ = max(tried, key=lambda t: t[2].nats)
+    return judged(wider, fitted(wider, noise_fitted(wider, fit), steps=3))
 
 
-def _starts(
-    problem: Problem, wider: Problem, step: Fit, effect: str, moment: Moment
-) -> list[tuple[Problem, Fit]]:
-    """Where fits of growth begin: the likeliest length, and the longest within a tie of it.
+def _starts(problem: Problem, step: Fit, effect: str, moment: Moment) -> list[tuple[Problem, Fit]]:
+    """Where fits of growth begin: the lengths about a moment that are not hopeless as they are.
 
     Args:
-        problem, step: with the change at once, fitted. wider: in which it may grow.
-        effect, moment: that changes, and when.
+        problem, step: with the change at once, fitted. effect, moment: that changes, and when.
     """
     model = changing(problem)
     last = max(float(model.times(record)[-1]) for record in problem.engine.records)
     middle = model.time(moment)
-
-    def about(length: float) -> tuple[float, Problem, Fit]:
+    least = problem.engine.log_likelihood(step.values, step.noise) - WORSE
+    found = []
+    for length in LENGTHS:
         begins, grown = max(middle - 0.5 * length, 0.0), min(middle + 0.5 * length, last)
         free = times_of_growth(effect, begins, grown, last)
+        wider = with_moment(problem, effect, replace(moment, grows=length)).with_free(free)
         there = step.at({f.name: f.value for f in free})
-        return wider.engine.log_likelihood(there.values, there.noise), wider.with_free(free), there
-
-    tried = [about(length) for length in LENGTHS]
-    likeliest = max(tried, key=lambda t: t[0])
-    least = max(likeliest[0], problem.engine.log_likelihood(step.values, step.noise))
-    near = [t for t in tried if t[0] > least - problem.settings.tie]
-    starts = [likeliest, near[-1]] if near and near[-1] is not likeliest else near[-1:]
-    return [t[1:] for t in starts]
-
-
-def _fitted(wider: Problem, begun: Fit, effect: str) -> tuple[Problem, Fit, Growth]:
-    """A change that grows, fitted from there."""
-    fit = fitted(wider, noise_fitted(wider, fitted(wider, begun, steps=6)), steps=3)
-    fit, _, quadratic = linearise(wider, fit)
-    return wider, fit, growth_at(wider, fit, quadratic, effect)
+        if wider.engine.log_likelihood(there.values, there.noise) > least:
+            found.append((wider, there))
+    return found
 
 
 def growth_at(
