@@ -134,7 +134,11 @@ def growth_at(
 
 
 def with_moment(problem: Problem, effect: str, moment: Moment) -> Problem:
-    """With another moment of an effect that changes."""
+    """A problem whose model has another moment of an effect that changes.
+
+    Args:
+        problem: in which it changes. effect, moment: that changes, and when.
+    """
     model = changing(problem)
     moments = {**model.moments, effect: moment}
     return problem.with_model(ChangingModel(model.base, moments, model.clock))
