@@ -87,7 +87,8 @@ def growing(
     tried = [t for t in tried if t[2].grown - t[2].begins > 1.01 * SHORTEST]
     if not tried:
         return None
-    wider, fit, _ = max(tried, key=lambda t: t[2].nats)
+    wider, fit, own = max(tried, key=lambda t: t[2].nats)
+    wider = _about(wider, effect, own)
     return judged(wider, fitted(wider, noise_fitted(wider, fit), steps=3))
 
 
@@ -97,9 +98,7 @@ def _starts(problem: Problem, step: Fit, effect: str, moment: Moment) -> list[tu
     Args:
         problem, step: with the change at once, fitted. effect, moment: that changes, and when.
     """
-    model = changing(problem)
-    last = max(float(model.times(record)[-1]) for record in problem.engine.records)
-    middle = model.time(moment)
+    last, middle = _last(problem), changing(problem).time(moment)
     least = problem.engine.log_likelihood(step.values, step.noise) - WORSE
     found = []
     for length in LENGTHS:
@@ -110,6 +109,18 @@ def _starts(problem: Problem, step: Fit, effect: str, moment: Moment) -> list[tu
         if wider.engine.log_likelihood(there.values, there.noise) > least:
             found.append((wider, there))
     return found
+
+
+def _about(wider: Problem, effect: str, own: Growth) -> Problem:
+    """With the priors of the times at which an effect grows about those that were found."""
+    free = times_of_growth(effect, own.begins, own.grown, _last(wider))
+    return wider.with_fixed([f.name for f in free]).with_free(free)
+
+
+def _last(problem: Problem) -> float:
+    """Time of the last row that is fitted [s of the clock]."""
+    model = changing(problem)
+    return max(float(model.times(record)[-1]) for record in problem.engine.records)
 
 
 def growth_at(
