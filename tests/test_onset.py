@@ -717,14 +717,44 @@ def test_where_a_step_may_be_growth_its_interval_has_both(short, inflation):
 
 
 def test_what_grows_says_from_when_to_when(short):
-    problem, found = ambiguous(short, 30.0)
-    grows = onset._as_growth(problem, found, 4.0)
+    problem, found = ambiguous(short, 7.5)
+    grows = onset._as_growth(problem, found)
     run = found.moment.run
     assert grows.moment == Moment(run, pytest.approx(1.0), pytest.approx(1.5))
     entry = grows.entry()
-    assert entry["t"] == pytest.approx(1.0) and entry["std"] == pytest.approx(0.6)
+    assert entry["t"] == pytest.approx(1.0) and entry["std"] == pytest.approx(0.3)
     assert entry["at_once"] == pytest.approx(math.exp(-7.5), abs=1e-4)
-    assert entry["grown"] == {"run": run, "t": pytest.approx(2.5), "std": pytest.approx(0.8)}
+    assert entry["grown"] == {"run": run, "t": pytest.approx(2.5), "std": pytest.approx(0.4)}
+
+
+@pytest.mark.parametrize("inflation", [1.0, 2.0])
+def test_the_interval_of_growth_is_that_of_its_likelihoods_profile(short, monkeypatch, inflation):
+    """One that falls evenly to both sides, where a parabola would know better: Laplace's law.
+
+    What is grown follows at half the pace; its own spread, at a given first time, is known.
+    """
+    problem, found = ambiguous(short, 30.0)
+    names = [f"gyro_bias.{name}" for name in ("moment@begins", "moment@grown")]
+    peak, scale = 3.0, 0.25
+    free = times_of_growth("gyro_bias", 3.2, 5.0, 8.0)
+
+    def fitted(of: Any, fit: Fit, tolerance: float, held: list[str]) -> Fit:
+        begins = fit.values[names[0]]
+        there = fit.at({names[1]: 5.0 + 0.5 * (begins - peak)})
+        prior = sum(0.5 * ((there.values[f.name] - f.value) / f.std) ** 2 for f in free)
+        return replace(there, objective=abs(begins - peak) / scale + prior)
+
+    problem.free = lambda active: free
+    own = replace(found.growth, covariance=np.array([[0.01, 0.005], [0.005, 0.0425]]))
+    monkeypatch.setattr(growth, "growth_at", lambda *given: own)
+    monkeypatch.setattr(growth, "fitted", fitted)
+    fit = Fit(("gyro_bias",), {names[0]: 3.2, names[1]: 5.0}, NOISE_OF_ALL)
+    said = growth.profiled(problem, fit, None, "gyro_bias", 30.0, inflation)  # type: ignore[arg-type]
+    variance = 2.0 * (inflation * scale) ** 2
+    assert said.begins == pytest.approx(peak, abs=0.1 * scale)
+    assert said.covariance[0, 0] == pytest.approx(variance, rel=0.25)
+    assert said.covariance[1, 1] == pytest.approx(0.25 * variance + inflation * 0.04, rel=0.25)
+    assert said.nats == 30.0 / inflation
 
 
 def test_two_times_pay_as_one_that_is_as_rare():

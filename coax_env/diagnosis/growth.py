@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coax_env.diagnosis.fits import fitted, linearise, noise_fitted
+from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.changing_model import (
     BEGINS,
@@ -21,13 +21,16 @@ from coax_env.estimation.changing_model import (
     times_of_growth,
 )
 from coax_env.estimation.helicopter import Moment
-from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.quadratic import Quadratic, penalty
 
 LENGTHS = (0.5, 2.0, 8.0, 32.0, 128.0)
 """s over which something may grow, where fits of it begin; ours."""
 WORSE = 100.0
 """nats by which growth with a step's numbers may be worse than the step, to be fitted; ours. One that
 was fitted was 128 worse before and 30 better then."""
+
+GONE, MOST_POINTS = 4.5, 10
+"""nats from the best at which a time has no share in its interval, and points to each side; ours."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,9 @@ def growing(
         return None
     wider, fit, own = max(tried, key=lambda t: t[2].nats)
     wider = _about(wider, effect, own)
-    return judged(wider, fitted(wider, noise_fitted(wider, fit), steps=3))
+    if own.nats > -problem.settings.tie:
+        return judged(wider, converged(wider, fit))
+    return wider, fit, own
 
 
 def _starts(problem: Problem, step: Fit, effect: str, moment: Moment) -> list[tuple[Problem, Fit]]:
@@ -142,6 +147,56 @@ def growth_at(
     places = [free.index(name) for name in own]
     times = changing(problem).spans(fit.values)[effect]
     return Growth(*times, covariance[np.ix_(places, places)], nats)
+
+
+def profiled(
+    problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, nats: float, inflation: float
+) -> Growth:
+    """`growth_at`, its times and their covariance by the likelihood's profile over the first of them.
+
+    What a time does to the likelihood depends on what is flown then: no parabola in it. Outwards from
+    the fit to both sides, all else refitted, until it is `GONE` nats worse.
+
+    Args:
+        problem, fit: in which it grows, and its last fit.
+        quadratic: linearised at the fit.
+        effect: that grows.
+        nats: what that is worth beside a step.
+        inflation: of variances, by coloured innovations.
+    """
+    own = growth_at(problem, fit, quadratic, effect, nats)
+    begins, grown = (f"{effect}.{name}" for name in (BEGINS, GROWN))
+    free = [f for f in problem.free(fit.active) if f.name in (begins, grown)]
+    first = math.sqrt(inflation * own.covariance[0, 0])
+
+    def at(time: float, near: Fit) -> Fit:
+        return fitted(problem, near.at({begins: time}), tolerance=0.1, held=[begins])
+
+    def likelihood(there: Fit) -> float:
+        return (penalty(free, there.values) - there.objective) / inflation
+
+    points = [at(fit.values[begins], fit)]
+    best = likelihood(points[0])
+    for way in (-1.0, 1.0):
+        there, step = points[0], first
+        for _ in range(MOST_POINTS):
+            time = there.values[begins] + way * step
+            if not 0.0 <= time <= there.values[grown] - SHORTEST:
+                break
+            there, step = at(time, there), 1.3 * step
+            points.append(there)
+            best = max(best, likelihood(there))
+            if likelihood(there) < best - GONE:
+                break
+    points.sort(key=lambda there: there.values[begins])
+    times = np.array([[there.values[begins], there.values[grown]] for there in points])
+    weight = np.exp([likelihood(there) - best for there in points])
+    weight *= np.gradient(times[:, 0]) if len(points) > 1 else 1.0
+    mean = weight @ times / weight.sum()
+    covariance = np.cov(times.T, aweights=weight, ddof=0) if len(points) > 1 else np.zeros((2, 2))
+    alone = own.covariance[1, 1] - own.covariance[0, 1] ** 2 / own.covariance[0, 0]
+    covariance[1, 1] += inflation * alone  # the second beside the first
+    return Growth(float(mean[0]), float(mean[1]), covariance, nats / inflation)
 
 
 def with_moment(problem: Problem, effect: str, moment: Moment) -> Problem:

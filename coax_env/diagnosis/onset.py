@@ -29,7 +29,7 @@ from scipy.special import logsumexp
 from coax_env.diagnosis.confounding import alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, without_drifts
-from coax_env.diagnosis.growth import Growth, changing, growing, growth_at, with_moment
+from coax_env.diagnosis.growth import Growth, changing, growing, profiled, with_moment
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.search import search
@@ -681,8 +681,8 @@ def moments_of(
             inflation = evidence[effect].inflation
             if onset.grown is not None:
                 assert onset.growth is not None
-                own = growth_at(problem, fit, quadratic, effect, onset.growth.nats)
-                found[effect] = _as_growth(problem, replace(onset, growth=own), inflation)
+                own = profiled(problem, fit, quadratic, effect, onset.growth.nats, inflation)
+                found[effect] = _as_growth(problem, replace(onset, growth=own))
             else:
                 step = moment_of(problem, fit, effect, inflation)
                 step = replace(step, nats=onset.nats, growth=onset.growth)
@@ -710,14 +710,14 @@ def _grown(problem: Problem, step: Fit, found: Onset) -> tuple[Problem, Fit, Ons
     return with_moment(wider, effect, found.moment), fit, found
 
 
-def _as_growth(problem: Problem, onset: Onset, inflation: float = 1.0) -> Onset:
+def _as_growth(problem: Problem, onset: Onset) -> Onset:
     """The onset of what grows: its moment is when it begins to."""
     model, own = changing(problem), onset.growth
     assert own is not None
     moment = replace(model.moment(own.begins), grows=own.grown - own.begins)
-    std = np.sqrt(inflation * np.diag(own.covariance))
+    std = np.sqrt(np.diag(own.covariance))
     return replace(
-        onset, moment=moment, t=moment.t, std=float(std[0]), at_once=own.at_once(inflation),
+        onset, moment=moment, t=moment.t, std=float(std[0]), at_once=own.at_once(),
         grown=(model.moment(own.grown), float(std[1])),
     )  # fmt: skip
 
