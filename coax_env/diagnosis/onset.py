@@ -9,7 +9,7 @@ evidence of a name, a cause that was always there to one that pays less than a t
 that is over within a second is no change.
 
 What comes may come at once or grow evenly to its size. It is said to grow where that is worth more than
-a tie beside a step; where it is not, and a step not either, the interval of the moment has both in it.
+a tie beside a step; where it is not worth that, the interval of the moment has both in it (growth.py).
 
 Changes last to the end of the last run: the machine is what it is then. Where one is found, causes are
 searched for again beside it: without it, others may have stood in its place.
@@ -83,8 +83,7 @@ class Onset:
         effect: the cause.
         moment: the best by likelihood; it is the model's.
         t, std: mean and std of its posterior in that run [s].
-        width: s that this posterior is wide; of what grows, times what that of its length is narrower
-            than the flight.
+        width: s that this posterior is wide; of what grows, `Growth.width`.
         nats: what it is worth to have the change, its price paid.
         growth: as what grows, where that was fitted.
         at_once: probability that it came at once, and did not grow.
