@@ -284,6 +284,9 @@ def cause_line(cause: Mapping[str, Any]) -> str:
     if cause.get("since"):
         moment = cause["since"]
         line += f"; since {moment['t']:.2f} +- {moment['std']:.2g} s of {moment['run']}"
+        if moment["grown"]:
+            grown = moment["grown"]
+            line += f", grown at {grown['t']:.2f} +- {grown['std']:.2g} s of {grown['run']}"
     if cause["confusable_with"]:
         line += f"; confounded alternatives: {', '.join(cause['confusable_with'])}"
     if cause["doubts"]:

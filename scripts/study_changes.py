@@ -25,7 +25,7 @@ def main() -> None:
     ]
     wanted.sort(key=lambda pair: pair.number)
     in_flight = [
-        onsets.planned(kind, n, options.seed)
+        onsets.planned(kind, n, options.seed, options.whole)
         for n in range(options.onsets)
         for kind in options.kinds
     ]
@@ -70,7 +70,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--changed", type=int, default=100, help="pairs with one change")
     parser.add_argument(
         "--whole", action="store_true",
-        help="fly pairs of twelve whole runs each, instead of four of 8 s",
+        help="fly twelve whole runs, instead of four of 8 s (pairs) or 12 s (onsets)",
     )  # fmt: skip
     parser.add_argument(
         "--onsets", type=int, default=0, metavar="N",

@@ -7,7 +7,8 @@ from study import onset_worth, onsets
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter
 
-SINCE = {"run": "lat_3211", "t": 5.3, "std": 0.2}
+SINCE = {"run": "lat_3211", "t": 5.3, "std": 0.2, "grown": None}
+GROWN = SINCE | {"grown": {"run": "heave_3211", "t": 5.0, "std": 0.3}}
 
 
 def row(kind, causes, worth=None, others=()):
@@ -32,12 +33,33 @@ def test_kinds_differ_in_when_the_fault_is_there_alone():
     assert begins.fault["torque_balance"]["scale"] == pytest.approx(-0.042747877270685714)
 
 
+def test_whole_flights_begin_in_the_middle_of_a_middle_run():
+    """And the others where they did before there were whole ones."""
+    runs = onsets.lengths(True)
+    assert len(runs) == 12 and sum(runs.values()) == 210.0
+    names = list(runs)
+    for number in range(40):
+        plan = onsets.planned("begins", number, 8, whole=True)
+        run, t = plan.since
+        assert 3 <= names.index(run) < 9 and 3.0 <= t <= runs[run] - 3.0
+        assert plan.name == f"onset-begins-{number:04d}-whole"
+    assert onsets.planned("begins", 13, 8).since == ("lat_3211", 5.83)
+
+
+def test_a_moment_of_a_whole_flight_is_judged_in_its_own_flown_time():
+    """The end of a heave of 14 s and the start of the yaw behind it."""
+    whole = row("begins", [("gyro_bias", SINCE | {"run": "yaw_3211", "t": 0.1})])
+    whole["plan"] |= {"whole": True, "since": ["heave_3211", 13.8]}
+    j = onsets.judged(whole)
+    assert j["error"] == pytest.approx(0.3) and j["held"]
+
+
 @pytest.mark.parametrize(
     ("t", "std", "run", "held"),
     [(5.3, 0.2, "lat_3211", True), (5.3, 0.15, "lat_3211", False), (0.1, 4.0, "heave_3211", True)],
 )
 def test_a_moment_is_judged_in_flown_time(t, std, run, held):
-    since = {"run": run, "t": t, "std": std}
+    since = {"run": run, "t": t, "std": std, "grown": None}
     j = onsets.judged(row("begins", [("gyro_bias", since), ("wind", None)], 29.0))
     assert j["named"] and j["since"] and j["should_show"] and j["held"] == held
     assert j["error"] == pytest.approx(0.3 if run == "lat_3211" else 7.1)
@@ -58,6 +80,7 @@ def test_those_that_should_show_are_counted_beside_all():
         row("begins", [], 10.0),
         row("begins", [("gyro_bias", None)], 40.0),
         row("grows", [("gyro_bias", SINCE)]),
+        row("grows", [("gyro_bias", GROWN)]),
         row("constant", [("gyro_bias", None)]),
         row("clean", []),
         {"plan": {}, "error": "lost"},
@@ -68,11 +91,18 @@ def test_those_that_should_show_are_counted_beside_all():
         "| begins, should show: named | 2 | 2 | 100 % |",
         "| begins, should show: with its moment | 1 | 2 | 50 % |",
         "| begins: the moment within its 95 % interval | 1 | 1 | 100 % |",
-        "| grows: with its moment | 1 | 1 | 100 % |", "| constant: a moment | 0 | 1 | 0 % |",
+        "| grows: with its moment | 2 | 2 | 100 % |",
+        "| grows: said to grow | 1 | 2 | 50 % |", "| begins: said to grow | 0 | 1 | 0 % |",
+        "| constant: a moment | 0 | 1 | 0 % |",
         "begins: median error of the moment 0.300 s, largest 0.30 s.", "1 failed.",
     ):  # fmt: skip
         assert line in text, line
-    assert "ends" not in text and text.count("- begins 3") == 2 and "worth 40 nats" in text
+    assert (
+        "ends" not in text
+        and text.count("- begins 3") == 2
+        and text.count("- grows 3") == 1
+        and "worth 40 nats" in text
+    )
 
 
 def test_what_a_change_is_worth_beside_a_constant_one():

@@ -21,7 +21,7 @@ from coax_env.identification.maximum_likelihood import RunEstimate
 from coax_env.model import effects
 from coax_env.model.layout import STATES
 from coax_env.model.vehicle import Parameter
-from coax_env.report import consequences, figures, fit_figures, plot_style, trust_banner
+from coax_env.report import causes, consequences, figures, fit_figures, plot_style, trust_banner
 from coax_env.report.flight_view import flight_view
 from coax_env.report.page import card, figure, inline, table
 from coax_env.simulation import simulate as sim
@@ -672,6 +672,23 @@ def test_intervals_hold_what_the_covariance_says():
     assert (found.value - found.half_width, found.value + found.half_width) == pytest.approx(
         (low, high), rel=0.03
     )
+
+
+@pytest.mark.parametrize(
+    ("at_once", "grown", "words"),
+    [(1.0, None, "since 6.2 s (5.8 to 6.6) of run hover"),
+     (0.0, {"run": "circles", "t": 1.3, "std": 0.3},
+      "growing since 6.2 s (5.8 to 6.6) of run hover, grown at 1.3 s (0.7 to 1.9) of run circles"),
+     (0.6, None, "since 6.2 s (5.8 to 6.6) of run hover (whether it came at once or grew, these"
+      " flights do not tell)")],
+)  # fmt: skip
+def test_when_a_cause_came_is_said_in_words(at_once, grown, words):
+    moment = {"run": "hover", "t": 6.2, "std": 0.2, "at_once": at_once, "grown": grown}
+    cause = finding("gyro_bias", x=0.02) | {"since": moment, "before": {}}
+    assert causes.since(cause) == words
+    line = diagnose_script.cause_line(cause)
+    assert "; since 6.20 +- 0.2 s of hover" in line
+    assert ("grown at 1.30 +- 0.3 s of circles" in line) == (grown is not None)
 
 
 def test_a_cause_s_interval_knows_its_correlation():

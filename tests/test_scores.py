@@ -29,8 +29,10 @@ from coax_env.diagnosis.scores import (
     scores,
     swap,
 )
+from coax_env.estimation.changing_model import BEFORE, before
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import WHITE_LEVELS
+from coax_env.estimation.parted_engine import of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 from coax_env.model.effects import CATALOGUE
@@ -218,6 +220,19 @@ def test_what_replaces_a_number_must_move_it_by_two_of_its_std():
     assert 2.0 * std > 0.01, "or the smallest size decides"
     for factor, large in ((2.05, True), (1.95, False)):
         assert is_large(PROBLEM, "added_mass", {"added_mass.mass": factor * std}) == large
+
+
+def test_what_changes_matters_by_what_it_was_and_by_how_much():
+    """A number that is half its smallest size on either side of zero changes by all of it."""
+    for effect, name in (("torque_balance", "scale"), ("added_mass", "mass")):
+        full = f"{effect}.{name}"
+        (f,) = MODEL.effect_parameters(effect)
+        made = replace(PROBLEM, own={**PROBLEM.own, effect: (f, before(f))})
+        (p,) = (p for p in made.model.sized(effect) if p.name == name)
+        for last, was, large in ((0.55, -0.55, True), (0.45, -0.45, False), (0.0, 1.01, True),
+                                 (1.01, 1.01, True), (0.9, 0.9, False)):  # fmt: skip
+            values = {**OFF, full: last * p.smallest, of_part(full, BEFORE): was * p.smallest}
+            assert is_large(made, effect, values) == large, (effect, last, was)
 
 
 class Parabola:

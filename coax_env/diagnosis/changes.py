@@ -37,7 +37,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.errors import InputError
-from coax_env.estimation.changing_model import BEFORE, ChangingModel
+from coax_env.estimation.changing_model import BEFORE, ChangingModel, clock_of
 from coax_env.estimation.engine import BLOCK, Engine
 from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.flown import flown_parts
@@ -267,9 +267,9 @@ class Before:
         Args:
             moment: its run may be one that was cut into parts.
         """
-        runs = list(dict.fromkeys(record.whole for record in self.problem.engine.records))
+        clock = clock_of(self.problem.engine.records)
         known = [e for e in self.known if e != ROTOR_SPEED]
-        model = ChangingModel(self.problem.model, dict.fromkeys(known, moment), runs)
+        model = ChangingModel(self.problem.model, dict.fromkeys(known, moment), clock)
         was = {
             of_part(name, BEFORE): self.fit.values.get(name, p.off)
             for e in known

@@ -41,6 +41,7 @@ from coax_env.diagnosis.searched import searched
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
+from coax_env.estimation.changing_model import clock_of
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.fitted_vehicle import double_counting
 from coax_env.estimation.flown import flown_parts
@@ -160,7 +161,7 @@ def diagnose(
     first = searched(problem, noise)
     problem, bare, refitted = first.problem, first.bare, first.refitted
     passes_before = problem.engine.filter(bare.values, bare.noise)
-    state = with_onsets(problem, first.fit, first.quadratic, refitted, flight.run_names)
+    state = with_onsets(problem, first.fit, first.quadratic, refitted, clock_of(flight.runs))
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
     report("weighing the causes against their confounded alternatives")
     problem, fit, quadratic, evidence = weighed(beside_large_axes(problem, fit), fit)
@@ -169,7 +170,7 @@ def diagnose(
         "before": whiteness(passes_before, CHANNELS),
         "after": whiteness(passes_after, CHANNELS),
     }
-    onsets = moments_of(problem, fit, evidence, state.onsets)
+    onsets = moments_of(problem, fit, quadratic, evidence, state.onsets)
     found = confounding.alternatives(problem, fit, quadratic, evidence, white["after"])
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)
     report("asking left-out runs, halves and other noise whether the names hold")

@@ -8,6 +8,9 @@ of the flown time that the data leave for it. No change is preferred to one that
 evidence of a name, a cause that was always there to one that pays less than a tie beside it. A gust
 that is over within a second is no change.
 
+What comes may come at once or grow evenly to its size. It is said to grow where that is worth more than
+a tie beside a step; where it is not worth that, the interval of the moment has both in it (growth.py).
+
 Changes last to the end of the last run: the machine is what it is then. Where one is found, causes are
 searched for again beside it: without it, others may have stood in its place.
 """
@@ -17,6 +20,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -25,12 +29,13 @@ from scipy.special import logsumexp
 from coax_env.diagnosis.confounding import alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, without_drifts
+from coax_env.diagnosis.growth import Growth, changing, growing, profiled, with_moment
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import Settings
 from coax_env.estimation.beginnings import Asked, Beginning
-from coax_env.estimation.changing_model import BEFORE, ChangingModel, before
+from coax_env.estimation.changing_model import BEFORE, ChangingModel, Lap, before
 from coax_env.estimation.engine import Engine, RunPass, objective
 from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.parted_engine import AT, of_part
@@ -78,8 +83,12 @@ class Onset:
         effect: the cause.
         moment: the best by likelihood; it is the model's.
         t, std: mean and std of its posterior in that run [s].
-        width: s that this posterior is wide.
+        width: s that this posterior is wide; of what grows, `Growth.width`.
         nats: what it is worth to have the change, its price paid.
+        growth: as what grows, where that was fitted.
+        at_once: probability that it came at once, and did not grow.
+        grown: when it had its size, and the std of that [s]; None where the model has a step.
+        run: in which t is, where that is not the moment's.
     """
 
     effect: str
@@ -88,10 +97,19 @@ class Onset:
     std: float
     width: float
     nats: float
+    growth: Growth | None = None
+    at_once: float = 1.0
+    grown: tuple[Moment, float] | None = None
+    run: str = ""
 
-    def entry(self) -> dict[str, str | float]:
+    def entry(self) -> dict[str, Any]:
         """findings.json's `since`."""
-        return {"run": self.moment.run, "t": self.t, "std": self.std}
+        until = None
+        if self.grown is not None:
+            moment, std = self.grown
+            until = {"run": moment.run, "t": moment.t, "std": std}
+        return {"run": self.run or self.moment.run, "t": self.t, "std": self.std,
+                "at_once": round(self.at_once, 4), "grown": until}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -105,7 +123,7 @@ class Changing:
 
 
 def with_onsets(
-    problem: Problem, fit: Fit, quadratic: Quadratic, bare: Fit, runs: Sequence[str]
+    problem: Problem, fit: Fit, quadratic: Quadratic, bare: Fit, clock: Mapping[str, Lap]
 ) -> Changing:
     """The model with what begins or changes in flight, where that pays; as it is where nothing does.
 
@@ -113,12 +131,12 @@ def with_onsets(
         problem, fit: after the search.
         quadratic: linearised at the fit.
         bare: the fit without any cause, from which a search begins again.
-        runs: names of all runs in the order in which they were flown.
+        clock: of all runs in the order in which they were flown.
     """
     state = Changing(problem, fit, quadratic, {})
     for _ in range(MOST_ONSETS):
         problem.report("asking whether something began in flight")
-        found = _next(state, runs)
+        found = _next(state, clock)
         if found is None:
             break
         trial, onset = found
@@ -374,7 +392,7 @@ def _behind(parts: np.ndarray) -> list[np.ndarray]:
 # --- one change, fitted -----------------------------------------------------------------------------
 
 
-def _next(state: Changing, runs: Sequence[str]) -> tuple[Changing, Onset] | None:
+def _next(state: Changing, clock: Mapping[str, Lap]) -> tuple[Changing, Onset] | None:
     """The change that is worth most once fitted, where it pays."""
     chosen = state.problem.settings
     best = None
@@ -383,7 +401,7 @@ def _next(state: Changing, runs: Sequence[str]) -> tuple[Changing, Onset] | None
     if near and near[0].nats < chosen.clear_evidence * chosen.evidence:
         near = _beside_commands(steady, near)
     for candidate in near[: chosen.most_trials]:
-        trial = _fitted(state, steady, candidate, runs)
+        trial = _fitted(state, steady, candidate, clock)
         if trial is None:
             continue
         onset = trial[1]
@@ -419,15 +437,15 @@ def _least(state: Changing, effect: str) -> float:
 
 
 def beginning(
-    problem: Problem, fit: Fit, moments: Mapping[str, Moment], runs: Sequence[str]
+    problem: Problem, fit: Fit, moments: Mapping[str, Moment], clock: Mapping[str, Lap]
 ) -> Problem:
     """The problem in which effects begin at moments of theirs, or change where they are active.
 
     Args:
         problem, fit: with what was found so far. moments: of the effects.
-        runs: names of all runs, in the order in which they were flown.
+        clock: of all runs, in the order in which they were flown.
     """
-    model = ChangingModel(problem.model.base, {**problem.model.moments, **moments}, runs)
+    model = ChangingModel(problem.model.base, {**problem.model.moments, **moments}, clock)
     own = dict(problem.own)
     for effect in moments:
         if effect in fit.active and not problem.changes(effect):
@@ -437,7 +455,7 @@ def beginning(
 
 
 def _fitted(
-    state: Changing, steady: Changing, candidate: Scored, runs: Sequence[str]
+    state: Changing, steady: Changing, candidate: Scored, clock: Mapping[str, Lap]
 ) -> tuple[Changing, Onset] | None:
     """A change fitted at its best moment, and what it is worth beside the state without it.
 
@@ -446,7 +464,7 @@ def _fitted(
     effect, fit = candidate.effect, steady.fit
     active = fit.active if effect in fit.active else (*fit.active, effect)
     there = replace(fit, active=active) if candidate.ends else fit
-    problem = beginning(state.problem, there, {effect: candidate.moment}, runs)
+    problem = beginning(state.problem, there, {effect: candidate.moment}, clock)
     before_it = {of_part(n, BEFORE): fit.values[n] for n in candidate.move}
     moved = [of_part(n, BEFORE) if candidate.ends else n for n in candidate.move]
     values = {**fit.values, **before_it}
@@ -454,9 +472,10 @@ def _fitted(
     trial = fitted(problem, replace(fit.at(values), active=active))
     if not math.isfinite(trial.objective):
         return None
-    problem, found = _moved(problem, trial, effect, runs)
+    problem, found = _moved(problem, trial, effect)
     trial = fitted(problem, noise_fitted(problem, trial), steps=2)
-    problem, found = _moved(problem, trial, effect, runs)
+    problem, found = _moved(problem, trial, effect)
+    problem, trial, found = _grown(problem, trial, found)
     trial = _with_noise_of(problem, trial, state.fit)
     trial, rivals = _compared(state, problem, trial, effect)
     trial, _, quadratic = linearise(problem, trial)
@@ -539,7 +558,7 @@ def _worth(
     extra = problem.acting_names(effect) if rivals.always else was
     others = [n for n in problem.free_names(trial.active) if n not in extra]
     inflation = quadratic.variance_inflation(extra, [*others, *extra])
-    of_moment = math.log(_seconds(problem) / found.width)
+    of_moment = math.log(problem.seconds / found.width)
     nats = (
         (same.objective - trial.objective) / inflation - quadratic.occam(extra, others) - of_moment
     )
@@ -567,11 +586,6 @@ def _before(problem: Problem, effect: str) -> list[str]:
     return [n for n in problem.acting_names(effect) if n.endswith(BEFORE)]
 
 
-def _seconds(problem: Problem) -> float:
-    """Flown time that is fitted [s]."""
-    return float(sum(r.t[-1] - r.t[0] for r in problem.engine.records))
-
-
 def _matters(problem: Problem, fit: Fit, effect: str) -> bool:
     """Whether what changes is large enough to matter in prediction."""
     for p in problem.model.sized(effect):
@@ -597,11 +611,10 @@ def _lasting(without: Sequence[RunPass], with_it: Sequence[RunPass], moment: Mom
 # --- the moment -------------------------------------------------------------------------------------
 
 
-def _moved(problem: Problem, fit: Fit, effect: str, runs: Sequence[str]) -> tuple[Problem, Onset]:
+def _moved(problem: Problem, fit: Fit, effect: str) -> tuple[Problem, Onset]:
     """The problem with an effect's moment where the likelihood is largest, and the interval of it."""
     found = moment_of(problem, fit, effect)
-    model = ChangingModel(problem.model.base, {**problem.model.moments, effect: found.moment}, runs)
-    return problem.with_model(model), found
+    return with_moment(problem, effect, found.moment), found
 
 
 def moment_of(problem: Problem, fit: Fit, effect: str, inflation: float = 1.0) -> Onset:
@@ -635,12 +648,11 @@ def _profile(
     At every tenth near where it stands and at some others first, then between any two of which one has
     a share in the interval and that differ, and by a line between the others.
     """
-    model = problem.model
-    assert isinstance(model, ChangingModel)
+    model = changing(problem)
 
     def nats_at(k: int) -> float:
         moments = {**model.moments, effect: Moment(model.moments[effect].run, float(times[k]))}
-        other = ChangingModel(model.base, moments, model.runs)
+        other = ChangingModel(model.base, moments, model.clock)
         return Engine(other, records, problem.engine.threads).log_likelihood(fit.values, fit.noise)
 
     known: dict[int, float] = {}
@@ -662,22 +674,79 @@ def _profile(
 
 
 def moments_of(
-    problem: Problem, fit: Fit, evidence: Mapping[str, Evidence], onsets: Mapping[str, Onset]
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    evidence: Mapping[str, Evidence],
+    onsets: Mapping[str, Onset],
 ) -> dict[str, Onset]:
     """The onsets of causes that are still there, each with its interval at the final fit.
 
     Args:
         problem, fit: with the causes.
+        quadratic: linearised at the fit.
         evidence: of each cause.
         onsets: as they were found.
     """
-    return {
-        effect: replace(
-            moment_of(problem, fit, effect, evidence[effect].inflation), nats=onset.nats
-        )
-        for effect, onset in onsets.items()
-        if effect in fit.active
-    }
+    found = {}
+    for effect, onset in onsets.items():
+        if effect in fit.active:
+            inflation = evidence[effect].inflation
+            if onset.grown is not None:
+                assert onset.growth is not None
+                own = profiled(problem, fit, quadratic, effect, onset.growth.nats, inflation)
+                found[effect] = _as_growth(problem, replace(onset, growth=own))
+            else:
+                step = moment_of(problem, fit, effect, inflation)
+                step = replace(step, nats=onset.nats, growth=onset.growth)
+                found[effect] = _as_step(problem, step, inflation)
+    return found
+
+
+def _grown(problem: Problem, step: Fit, found: Onset) -> tuple[Problem, Fit, Onset]:
+    """A change as one that grows, where that is worth more than a tie beside the step; else the step.
+
+    Args:
+        problem, step: with the change at its moment, fitted. found: its moment.
+    """
+    effect = found.effect
+    tried = growing(problem, step, effect, found.moment, found.width)
+    if tried is None:
+        return problem, step, found
+    wider, fit, own = tried
+    problem.report(f"{effect} grows for {own.grown - own.begins:.2f} s:"
+                   f" {own.nats:.1f} nats beside a step")  # fmt: skip
+    found = replace(found, growth=own)
+    if own.nats < problem.settings.tie:
+        return problem, step, _as_step(problem, found)
+    found = replace(_as_growth(wider, found), width=own.width(problem.seconds))
+    return with_moment(wider, effect, found.moment), fit, found
+
+
+def _as_growth(problem: Problem, onset: Onset) -> Onset:
+    """The onset of what grows: its moment is when it begins to."""
+    model, own = changing(problem), onset.growth
+    assert own is not None
+    moment = replace(model.moment(own.begins), grows=own.grown - own.begins)
+    std = np.sqrt(np.diag(own.covariance))
+    return replace(
+        onset, moment=moment, t=moment.t, std=float(std[0]), at_once=own.at_once(),
+        grown=(model.moment(own.grown), float(std[1])),
+    )  # fmt: skip
+
+
+def _as_step(problem: Problem, onset: Onset, inflation: float = 1.0) -> Onset:
+    """The onset of a step; where it may as well have grown, from when on is in its interval."""
+    model, own = changing(problem), onset.growth
+    if own is None:
+        return onset
+    p = own.at_once(inflation)
+    step = model.time(replace(onset.moment, t=onset.t))
+    mean = p * step + (1.0 - p) * own.begins
+    spread = p * (onset.std**2 + (step - mean) ** 2)
+    spread += (1.0 - p) * (inflation * float(own.covariance[0, 0]) + (own.begins - mean) ** 2)
+    there = model.moment(mean)
+    return replace(onset, t=there.t, run=there.run, std=math.sqrt(spread), at_once=p)
 
 
 # --- beside a change --------------------------------------------------------------------------------
@@ -725,12 +794,10 @@ def beside_onsets(
     """
     found: dict[str, dict[str, Fit]] = {}
     for effect, onset in onsets.items():
-        model = problem.model
-        assert isinstance(model, ChangingModel)
         others = [e for e in may_begin(problem, fit, onsets) if e not in fit.active]
         others += [e for e in exclusive_with(effect) if e in problem.candidates]
         moments = {e: onset.moment for e in others if e not in fit.active}
-        then = beginning(problem, fit, moments, model.runs)
+        then = beginning(problem, fit, moments, changing(problem).clock)
         there, _, quadratic = linearise(then, fit)
         found |= alternatives(then, there, quadratic, evidence, white, [effect])
     return found

@@ -168,10 +168,14 @@ class Problem:
         return {f.name: f.value for f in self.own[effect]}
 
     @property
+    def seconds(self) -> float:
+        """Flown time that is fitted [s]."""
+        return float(sum(r.t[-1] - r.t[0] for r in self.engine.records))
+
+    @property
     def noise_fit_seconds(self) -> float:
         """s of flight on which noise levels are fitted while the search goes on."""
-        flown = sum(float(r.t[-1] - r.t[0]) for r in self.engine.records)
-        return max(self.settings.noise_fit_seconds, self.settings.noise_fit_share * flown)
+        return max(self.settings.noise_fit_seconds, self.settings.noise_fit_share * self.seconds)
 
     # --- work -----------------------------------------------------------------------------------------
 

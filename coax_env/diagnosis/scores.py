@@ -87,9 +87,10 @@ def scores(
 
 
 def is_large(problem: Problem, effect: str, values: Mapping[str, float]) -> bool:
-    """Whether an effect at these values matters in prediction.
+    """Whether an effect at these values matters in prediction: what it is, was, or changed by.
 
-    One that replaces a base parameter must move it by more than twice its prior std.
+    One that replaces a base parameter must move it by more than twice its prior std; one that changes
+    in flight need not, since what the base parameter is does not change then.
 
     Args:
         problem: whose vehicle file the base parameter stands in.
@@ -97,13 +98,12 @@ def is_large(problem: Problem, effect: str, values: Mapping[str, float]) -> bool
         values: of all parameters.
     """
     entry = effects.CATALOGUE[effect]
-    sizes = [
-        abs(values[name] - p.off) / p.smallest
-        for full, p in zip(entry.names(), problem.model.sized(effect), strict=True)
-        for name in (full, of_part(full, BEFORE))
-        if p.smallest > 0.0 and name in values
-    ]
-    for base in problem.file_values(effect):
+    sizes = []
+    for full, p in zip(entry.names(), problem.model.sized(effect), strict=True):
+        if p.smallest > 0.0 and full in values:
+            last, was = values[full], values.get(of_part(full, BEFORE), p.off)
+            sizes += [abs(x) / p.smallest for x in (last - p.off, was - p.off, last - was)]
+    for base in () if problem.changes(effect) else problem.file_values(effect):
         old = problem.model.vehicle.parameters[base]
         relative = abs(values[entry.names()[0]])
         relative /= 1.0 if entry.parameters[0].unit == "1" else old.value

@@ -125,10 +125,14 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True)
 class Moment:
-    """When something begins: at `t` [s] of a run, and it lasts through all later ones."""
+    """When something begins: at `t` [s] of a run, and it lasts through all later ones.
+
+    grows: s of flight over which it comes evenly; 0: at once.
+    """
 
     run: str
     t: float
+    grows: float = 0.0
 
 
 _step_of_registers: Any = None  # what stands for them is compiled when it is first needed

@@ -82,6 +82,8 @@ TRUST = {
     ),
 }
 """How far a cause's name may be believed -> the heading of such causes, and what that means."""
+AT_ONCE = 0.95
+"""Probability from which on a cause is said to have come at once; ours."""
 _ROBUST_HEADER = ["cause", "name is", "under other noise", "left-out runs", "halves"]
 
 
@@ -121,9 +123,18 @@ def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicl
 
 
 def since(cause: Mapping[str, Any]) -> str:
-    """When a cause began or changed, in words, with its 95 % interval."""
+    """When a cause began, changed or grew, in words, with 95 % intervals."""
     moment = cause["since"]
-    return f"since {bounds(moment['t'], NORMAL_95 * moment['std'], 's')} of run {moment['run']}"
+    words = f"since {_moment(moment)}"
+    if moment["grown"]:
+        return f"growing {words}, grown at {_moment(moment['grown'])}"
+    if moment["at_once"] < AT_ONCE:
+        words += " (whether it came at once or grew, these flights do not tell)"
+    return words
+
+
+def _moment(moment: Mapping[str, Any]) -> str:
+    return f"{bounds(moment['t'], NORMAL_95 * moment['std'], 's')} of run {moment['run']}"
 
 
 def _was(cause: Mapping[str, Any]) -> str:

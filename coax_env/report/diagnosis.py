@@ -101,7 +101,7 @@ def headline(findings: Findings) -> str:
 def lead(findings: Findings) -> list[str]:
     """The result in a few sentences."""
     sentences = [
-        f"{capital(plain(c['effect']))} {'changed' if c['before'] else 'is there'} {since(c)}."
+        f"{capital(plain(c['effect']))} {'changed' if c['before'] else 'is there'}, {since(c)}."
         for c in findings["causes"]
         if c.get("since")
     ]

@@ -11,7 +11,7 @@ from coax_env.diagnosis.diagnose import stated
 from coax_env.diagnosis.fits import linearise, noise_fitted, start, without_drifts
 from coax_env.diagnosis.onset import beginning
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation.changing_model import BEFORE
+from coax_env.estimation.changing_model import BEFORE, Lap, clock_of
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, Moment, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
@@ -26,7 +26,7 @@ UNKNOWN = 1e-9
 
 
 def worth_of_change(
-    folder: Path, before: Sizes, after: Sizes, others: Sizes, since: tuple[str, float]
+    folder: Path, before: Sizes, after: Sizes, others: Sizes, since: Moment
 ) -> float:
     """Half the square of a true change over its variance [nats], beside a cause that was always there.
 
@@ -36,12 +36,12 @@ def worth_of_change(
 
     Args:
         folder: of the flight. before, after: the effect, with its sizes then. others: that are there
-            all the time. since: run and time [s] in it.
+            all the time. since: when it came, or began to grow.
     """
     (effect,) = after
-    problem, fit, runs = _steady(folder, [effect, *others])
+    problem, fit, clock = _steady(folder, [effect, *others])
     fit = replace(fit.at(_values(others)), active=(effect, *others))
-    problem = beginning(problem, fit, {effect: Moment(*since)}, runs)
+    problem = beginning(problem, fit, {effect: since}, clock)
     was = {of_part(name, BEFORE): value for name, value in _values(before).items()}
     fit = noise_fitted(problem, fit.at({**_values(after), **was}))
     change = {n: value - was[of_part(n, BEFORE)] for n, value in _values(after).items()}
@@ -50,8 +50,8 @@ def worth_of_change(
     return expected_nats(quadratic, problem.free_names(fit.active), effect, change)
 
 
-def _steady(folder: Path, names: list[str]) -> tuple[Problem, Fit, list[str]]:
-    """The problem of these effects alone, noise fitted to the bare model, and the runs' names."""
+def _steady(folder: Path, names: list[str]) -> tuple[Problem, Fit, dict[str, Lap]]:
+    """The problem of these effects alone, noise fitted to the bare model, and the clock."""
     flight = read_flight(folder)
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     flight = flown_parts(flight, vehicle)
@@ -59,7 +59,7 @@ def _steady(folder: Path, names: list[str]) -> tuple[Problem, Fit, list[str]]:
     model = HeliModel(vehicle, stated(flight))
     problem = Problem.of(model, [record_of(run) for run in calm.runs], names)
     fit = without_drifts(start(problem, starting_noise(calm, calm_vehicle)))
-    return problem, fit, list(flight.run_names)
+    return problem, fit, clock_of(flight.runs)
 
 
 def _values(sizes: Sizes) -> dict[str, float]:

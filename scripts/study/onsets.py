@@ -5,6 +5,7 @@ nothing is hidden. Other faults are there all the time in three of four, gusts i
 """
 
 import json
+import math
 import tempfile
 import time
 import traceback
@@ -19,6 +20,7 @@ from injector_air import Air
 
 from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.helicopter import Moment
 from study.judge import tied, wilson
 from study.onset_worth import worth_of_change
 from study.pairs import FAULTS
@@ -26,7 +28,9 @@ from study.plan import sizes_of
 
 RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
 LONGEST = 12.0
-"""s of each run: 48 s a flight, for time."""
+"""s of each run: 48 s a flight, for time; `whole` flights have all twelve runs, to their ends."""
+MIDDLE = (3, 9)
+"""Places among those between which something begins there: in one of the six runs in the middle."""
 KINDS = ("begins", "constant", "clean", "ends", "grows")
 CHANGES = ("begins", "ends", "grows")
 """Kinds in which something changes in flight."""
@@ -37,13 +41,16 @@ BEGINS = (
     "added_mass", "motor_lag", "accel_bias", "servo_play", "swash_gain", "servo_lag",
 )  # fmt: skip
 """What may begin: rigging, blades, sensors, payload, motors, servos, play."""
-EARLIEST, LATEST = 3.0, 9.0
-"""s of the run in which it begins."""
+EARLIEST = 3.0
+"""s from the start, and from the end, of the run in which it begins."""
 
 
 @dataclass(frozen=True)
 class Planned:
-    """One flight of the study. fault: what changes at `since`, or is there all the time."""
+    """One flight of the study. fault: what changes at `since`, or is there all the time.
+
+    whole: whether it is as long as a labelled one.
+    """
 
     kind: str
     number: int
@@ -52,21 +59,31 @@ class Planned:
     since: tuple[str, float]
     air: dict[str, Any]
     seed: int
+    whole: bool = False
 
     @property
     def name(self) -> str:
         """Of the file that it is stored in."""
-        return f"onset-{self.kind}-{self.number:04d}"
+        return f"onset-{self.kind}-{self.number:04d}{'-whole' * self.whole}"
 
 
-def planned(kind: str, number: int, seed: int) -> Planned:
+def lengths(whole: bool) -> dict[str, float]:
+    """Runs of a flight in the order in which they are flown, with the length of each [s]."""
+    if whole:
+        return dict(injector.MANEUVERS)
+    return dict.fromkeys(RUNS, LONGEST)
+
+
+def planned(kind: str, number: int, seed: int, whole: bool = False) -> Planned:
     """A flight, drawn from the study's seed, its kind and its number alone."""
     rng = np.random.default_rng([seed, 1000 + KINDS.index(kind), number])
     fault = BEGINS[number % len(BEGINS)]
     sizes = sizes_of(fault, rng)
     others = FAULTS[int(rng.integers(len(FAULTS)))]
     others = {e: dict(p) for e, p in others.items() if not tied(e, fault)}
-    since = (RUNS[int(rng.integers(1, 3))], round(float(rng.uniform(EARLIEST, LATEST)), 2))
+    runs = lengths(whole)
+    run = list(runs)[int(rng.integers(*(MIDDLE if whole else (1, 3))))]
+    since = (run, round(float(rng.uniform(EARLIEST, runs[run] - EARLIEST)), 2))
     air: dict[str, Any] = {"gusts": "none"}
     if number % 2:
         scale = float(rng.uniform(0.5, 1.5))
@@ -76,7 +93,7 @@ def planned(kind: str, number: int, seed: int) -> Planned:
         }  # fmt: skip
     hidden = {} if kind == "clean" else {fault: sizes}
     return Planned(
-        kind, number, hidden, others if hidden else {}, since, air, int(rng.integers(2**31))
+        kind, number, hidden, others if hidden else {}, since, air, int(rng.integers(2**31)), whole
     )
 
 
@@ -85,8 +102,9 @@ def fly(plan: Planned, folder: Path) -> Path:
     air = {**plan.air, "memory": tuple(plan.air["memory"])} if "memory" in plan.air else plan.air
     before, after = stages(plan)
     return injector.fly(
-        folder, {**plan.others, **before}, gusts=Air(**air), seed=plan.seed, runs=RUNS,
-        longest=LONGEST, later=after if plan.kind in CHANGES else None,
+        folder, {**plan.others, **before}, gusts=Air(**air), seed=plan.seed,
+        runs=lengths(plan.whole), longest=math.inf if plan.whole else LONGEST,
+        later=after if plan.kind in CHANGES else None,
         since=plan.since if plan.kind in CHANGES else ("", 0.0),
         growing=GROWING if plan.kind == "grows" else 0.0,
     )  # fmt: skip
@@ -109,12 +127,11 @@ def fly_and_diagnose(plan: Planned) -> dict[str, Any]:
             began = time.process_time()
             findings = diagnose(folder, hold_out=[]).findings
             row |= {"causes": findings["causes"], "seconds": time.process_time() - began}
-            if plan.kind in ("begins", "ends"):
+            if plan.kind in CHANGES:
                 before, after = stages(plan)
                 off = {effect: dict.fromkeys(sizes, 0.0) for effect, sizes in after.items()}
-                row["worth"] = worth_of_change(
-                    folder, before or off, after, plan.others, plan.since
-                )
+                moment = Moment(*plan.since, GROWING if plan.kind == "grows" else 0.0)
+                row["worth"] = worth_of_change(folder, before or off, after, plan.others, moment)
     except Exception:
         return row | {"error": traceback.format_exc()}
     return row
@@ -133,14 +150,17 @@ def judged(row: Mapping[str, Any]) -> dict[str, Any]:
     mine = [c for c in causes if any(tied(c["effect"], e) for e in plan["fault"])]
     changed = [c for c in mine if c["since"]] if plan["kind"] in CHANGES else []
     error = None
-    held = False
+    held = grows = False
     if changed:
         since = changed[0]["since"]
-        error = abs(_flown(since["run"], since["t"]) - _flown(*plan["since"]))
+        before = flown_before(plan.get("whole", False))
+        error = abs(before[since["run"]] + since["t"] - before[plan["since"][0]] - plan["since"][1])
         held = error <= 1.96 * since["std"]
+        grows = since["grown"] is not None
     return {
         "named": bool(mine),
         "since": bool(changed),
+        "grows": grows,
         "should_show": row.get("worth", 0.0) > 2.0 * SETTINGS.evidence,
         "error": error,
         "held": held,
@@ -151,9 +171,10 @@ def judged(row: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _flown(run: str, t: float) -> float:
-    """s of flight before a moment."""
-    return RUNS.index(run) * LONGEST + t
+def flown_before(whole: bool) -> dict[str, float]:
+    """s of flight before each run."""
+    runs = lengths(whole)
+    return dict(zip(runs, np.cumsum([0.0, *runs.values()]).tolist(), strict=False))
 
 
 def text_of(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -183,14 +204,14 @@ def text_of(rows: Sequence[Mapping[str, Any]]) -> str:
 def _of_change(kind: str, of: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[bool]]]:
     """Figures of one kind in which something changes."""
     shown = [j for j in of if j["should_show"]]
-    figures = [(f"{kind}: named", [j["named"] for j in of]),
-               (f"{kind}: with its moment", [j["since"] for j in of])]  # fmt: skip
-    if kind != "grows":
-        figures += [(f"{kind}, should show: named", [j["named"] for j in shown]),
-                    (f"{kind}, should show: with its moment", [j["since"] for j in shown]),
-                    (f"{kind}: the moment within its 95 % interval",
-                     [j["held"] for j in of if j["since"]])]  # fmt: skip
-    return [*figures, (f"{kind}: a false name", [bool(j["false"]) for j in of]),
+    dated = [j for j in of if j["since"]]
+    return [(f"{kind}: named", [j["named"] for j in of]),
+            (f"{kind}: with its moment", [j["since"] for j in of]),
+            (f"{kind}, should show: named", [j["named"] for j in shown]),
+            (f"{kind}, should show: with its moment", [j["since"] for j in shown]),
+            (f"{kind}: the moment within its 95 % interval", [j["held"] for j in dated]),
+            (f"{kind}: said to grow", [j["grows"] for j in dated]),
+            (f"{kind}: a false name", [bool(j["false"]) for j in of]),
             (f"{kind}: a false moment", [bool(j["false_since"]) for j in of])]  # fmt: skip
 
 
@@ -204,7 +225,8 @@ def _line(words: str, right: Sequence[bool]) -> str:
 
 def _is_off(row: Mapping[str, Any], j: Mapping[str, Any]) -> bool:
     kind = row["plan"]["kind"]
-    missed = kind in CHANGES and not (j["since"] and (j["held"] or kind == "grows"))
+    right = j["since"] and j["held"] and j["grows"] == (kind == "grows")
+    missed = kind in CHANGES and not right
     return bool(missed or j["false"] or j["false_since"])
 
 

@@ -1,0 +1,216 @@
+"""Does a cause that begins in flight come at once, or does it grow?
+
+What grows has a share of its size that goes from 0 to 1 evenly between two times (changing_model.py).
+The two are fitted beside all other numbers, from several lengths about the step's moment, since a short
+growth is not far from a step and a likelihood of its own. Both models pay for their times alike: of all
+times of the flight each was as likely.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation.changing_model import (
+    BEGINS,
+    GROWN,
+    SHORTEST,
+    ChangingModel,
+    times_of_growth,
+)
+from coax_env.estimation.helicopter import Moment
+from coax_env.estimation.quadratic import Quadratic, penalty
+
+LENGTHS = (0.5, 2.0, 8.0, 32.0, 128.0)
+"""s over which something may grow, where fits of it begin; ours."""
+WORSE = 100.0
+"""nats by which growth with a step's numbers may be worse than the step, to be fitted; ours. One that
+was fitted was 128 worse before and 30 better then."""
+
+GONE, MOST_POINTS = 4.5, 10
+"""nats from the best at which a time has no share in its interval, and points to each side; ours."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What is known of a cause as one that grows.
+
+    Attributes:
+        begins, grown: times between which it grows [s of the clock].
+        covariance: of these two, (2, 2).
+        nats: what that is worth beside a step, both with their times paid for.
+    """
+
+    begins: float
+    grown: float
+    covariance: np.ndarray
+    nats: float
+
+    def at_once(self, inflation: float = 1.0) -> float:
+        """Probability that it came at once, before any look as likely as that it grew.
+
+        Args:
+            inflation: of variances, by coloured innovations.
+        """
+        return 1.0 / (1.0 + math.exp(min(self.nats / inflation, 700.0)))
+
+    def width(self, seconds: float) -> float:
+        """s that a step's moment would be narrowed down to at the same price as these two times.
+
+        Args:
+            seconds: of flight, in which each pair of times was as likely.
+        """
+        pairs = 0.5 * seconds**2
+        area = 2.0 * math.pi * math.sqrt(max(float(np.linalg.det(self.covariance)), 0.0))
+        return seconds * min(area / pairs, 1.0)
+
+
+def growing(
+    problem: Problem, step: Fit, effect: str, moment: Moment, width: float
+) -> tuple[Problem, Fit, Growth] | None:
+    """A change as one that grows; None where it would come as fast as a step, or all are far worse.
+
+    Args:
+        problem, step: with the change at its moment, fitted.
+        effect, moment: that changes, and when.
+        width: s that the posterior of this moment is wide.
+    """
+    step = fitted(problem, noise_fitted(problem, step), steps=2)
+
+    def judged(wider: Problem, fit: Fit) -> tuple[Problem, Fit, Growth]:
+        fit, _, quadratic = linearise(wider, fit)
+        own = growth_at(wider, fit, quadratic, effect)
+        price = math.log(width / own.width(problem.seconds))
+        return wider, fit, replace(own, nats=step.objective - fit.objective - price)
+
+    tried = [judged(wider, fitted(wider, begun, steps=6))
+             for wider, begun in _starts(problem, step, effect, moment)]  # fmt: skip
+    tried = [t for t in tried if t[2].grown - t[2].begins > 1.01 * SHORTEST]
+    if not tried:
+        return None
+    wider, fit, own = max(tried, key=lambda t: t[2].nats)
+    wider = _about(wider, effect, own)
+    if own.nats > -problem.settings.tie:
+        return judged(wider, converged(wider, fit))
+    return wider, fit, own
+
+
+def _starts(problem: Problem, step: Fit, effect: str, moment: Moment) -> list[tuple[Problem, Fit]]:
+    """Where fits of growth begin: the lengths about a moment that are not hopeless as they are.
+
+    Args:
+        problem, step: with the change at once, fitted. effect, moment: that changes, and when.
+    """
+    last, middle = _last(problem), changing(problem).time(moment)
+    least = problem.engine.log_likelihood(step.values, step.noise) - WORSE
+    found = []
+    for length in LENGTHS:
+        begins, grown = max(middle - 0.5 * length, 0.0), min(middle + 0.5 * length, last)
+        free = times_of_growth(effect, begins, grown, last)
+        wider = with_moment(problem, effect, replace(moment, grows=length)).with_free(free)
+        there = step.at({f.name: f.value for f in free})
+        if wider.engine.log_likelihood(there.values, there.noise) > least:
+            found.append((wider, there))
+    return found
+
+
+def _about(wider: Problem, effect: str, own: Growth) -> Problem:
+    """With the priors of the times at which an effect grows about those that were found."""
+    free = times_of_growth(effect, own.begins, own.grown, _last(wider))
+    return wider.with_fixed([f.name for f in free]).with_free(free)
+
+
+def _last(problem: Problem) -> float:
+    """Time of the last row that is fitted [s of the clock]."""
+    model = changing(problem)
+    return max(float(model.times(record)[-1]) for record in problem.engine.records)
+
+
+def growth_at(
+    problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, nats: float = 0.0
+) -> Growth:
+    """When an effect grows at a fit, with covariance, any time of the flight as likely before.
+
+    Args:
+        problem, fit: in which it grows.
+        quadratic: linearised at the fit.
+        effect: that grows.
+        nats: what that is worth beside a step.
+    """
+    own = [f"{effect}.{name}" for name in (BEGINS, GROWN)]
+    precision = quadratic.precision.copy()
+    precision[quadratic.index(own)] = 12.0 / problem.seconds**2  # of an even spread over the flight
+    free = problem.free_names(fit.active)
+    covariance = replace(quadratic, precision=precision).covariance(free)
+    places = [free.index(name) for name in own]
+    times = changing(problem).spans(fit.values)[effect]
+    return Growth(*times, covariance[np.ix_(places, places)], nats)
+
+
+def profiled(
+    problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, nats: float, inflation: float
+) -> Growth:
+    """`growth_at`, its times and their covariance by the likelihood's profile over the first of them.
+
+    What a time does to the likelihood depends on what is flown then: no parabola in it. Outwards from
+    the fit to both sides, all else refitted, until it is `GONE` nats worse.
+
+    Args:
+        problem, fit: in which it grows, and its last fit.
+        quadratic: linearised at the fit.
+        effect: that grows.
+        nats: what that is worth beside a step.
+        inflation: of variances, by coloured innovations.
+    """
+    own = growth_at(problem, fit, quadratic, effect, nats)
+    begins, grown = (f"{effect}.{name}" for name in (BEGINS, GROWN))
+    free = [f for f in problem.free(fit.active) if f.name in (begins, grown)]
+    first = math.sqrt(inflation * own.covariance[0, 0])
+
+    def at(time: float, near: Fit) -> Fit:
+        return fitted(problem, near.at({begins: time}), tolerance=0.1, held=[begins])
+
+    def likelihood(there: Fit) -> float:
+        return (penalty(free, there.values) - there.objective) / inflation
+
+    points = [at(fit.values[begins], fit)]
+    best = likelihood(points[0])
+    for way in (-1.0, 1.0):
+        there, step = points[0], first
+        for _ in range(MOST_POINTS):
+            time = there.values[begins] + way * step
+            if not 0.0 <= time <= there.values[grown] - SHORTEST:
+                break
+            there, step = at(time, there), 1.3 * step
+            points.append(there)
+            best = max(best, likelihood(there))
+            if likelihood(there) < best - GONE:
+                break
+    points.sort(key=lambda there: there.values[begins])
+    times = np.array([[there.values[begins], there.values[grown]] for there in points])
+    weight = np.exp([likelihood(there) - best for there in points])
+    weight *= np.gradient(times[:, 0]) if len(points) > 1 else 1.0
+    mean = weight @ times / weight.sum()
+    covariance = np.cov(times.T, aweights=weight, ddof=0) if len(points) > 1 else np.zeros((2, 2))
+    alone = own.covariance[1, 1] - own.covariance[0, 1] ** 2 / own.covariance[0, 0]
+    covariance[1, 1] += inflation * alone  # the second beside the first
+    return Growth(float(mean[0]), float(mean[1]), covariance, nats / inflation)
+
+
+def with_moment(problem: Problem, effect: str, moment: Moment) -> Problem:
+    """A problem whose model has another moment of an effect that changes.
+
+    Args:
+        problem: in which it changes. effect, moment: that changes, and when.
+    """
+    model = changing(problem)
+    moments = {**model.moments, effect: moment}
+    return problem.with_model(ChangingModel(model.base, moments, model.clock))
+
+
+def changing(problem: Problem) -> ChangingModel:
+    """The model of a problem in which something changes."""
+    assert isinstance(problem.model, ChangingModel)
+    return problem.model
