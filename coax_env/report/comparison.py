@@ -262,9 +262,10 @@ def _shared(changes: Changes) -> list[str]:
         return [prose("The vehicle file's own numbers, refitted to both; no effect beside them.")]
     return [
         prose(
-            f"The vehicle file's own numbers, refitted to both, and {count_word(len(names))} effects "
-            f"that the file lacks: {and_list(names)}. What is wrong with the model is in both "
-            "flights and cancels in the difference."
+            f"The vehicle file's own numbers, refitted to both, and what makes both flights likelier "
+            f"beside them: {and_list(names)}. These are not weighed as changes are: what the file lacks, "
+            "a diagnosis says. What is wrong with the model is in both flights and cancels in the "
+            "difference."
         )
     ]
 
