@@ -263,7 +263,7 @@ def _shared(changes: Changes) -> list[str]:
     return [
         prose(
             f"The vehicle file's own numbers, refitted to both, and what makes both flights likelier "
-            f"beside them: {and_list(names)}. These are not weighed as changes are: what the file lacks, "
+            f"beside them: {and_list(names)}. These are not weighed as changes are: what it lacks, "
             "a diagnosis says. What is wrong with the model is in both flights and cancels in the "
             "difference."
         )
