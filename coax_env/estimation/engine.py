@@ -237,6 +237,16 @@ class Engine:
 
         return self._each(one, which)
 
+    def remember(
+        self, values: Mapping[str, float], noise: Noise, passes: Sequence[RunPass]
+    ) -> None:
+        """Passes of all records, to be returned where `filter` is asked for them again.
+
+        Args:
+            values, noise: at which the passes were flown. passes: of every record.
+        """
+        self._remember(self.model.vector(values, noise), noise, passes)
+
     def _remember(self, p: np.ndarray, noise: Noise, passes: Sequence[RunPass]) -> None:
         """Passes of all records, whose end others will ask for again; without their gains."""
         bare = [
@@ -677,7 +687,7 @@ class Engine:
                 progress(f"fit: step {count}, gained {gained:.1f} nats")
             if gained < tolerance or count == iterations:
                 passes = self.filter(values, noise)
-                self._remember(self.model.vector(values, noise), noise, passes)
+                self.remember(values, noise, passes)
                 break
             passes, lin = self.linearise(values, noise, free)
         return Estimate(

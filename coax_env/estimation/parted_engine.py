@@ -110,6 +110,14 @@ class PartedEngine(Engine):
             passes += part.engine.filter(part.values(values), part.noise(noise), keep, chosen, rows)
         return passes
 
+    def remember(
+        self, values: Mapping[str, float], noise: Noise, passes: Sequence[RunPass]
+    ) -> None:
+        """As `Engine.remember`, by each part's engine."""
+        for part, indices in self._indices():
+            own = [passes[i] for i in indices]
+            part.engine.remember(part.values(values), part.noise(noise), own)
+
     def linearise(
         self, values: Mapping[str, float], noise: Noise, free: Sequence[FreeParameter]
     ) -> tuple[list[RunPass], Linearised]:
