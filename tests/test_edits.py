@@ -237,5 +237,5 @@ def test_edits_of_real_logs(name, runs, run):
             assert row["found"] and row["named"] == row["effect"], row
             assert not row["else"], row
             assert since is None or row["in_time"], row
-            largest = max(abs(p["planted"]) for p in row["parameters"].values())
-            assert all(p["std"] < 0.5 * largest for p in row["parameters"].values()), row
+            size = math.hypot(*(p["planted"] for p in row["parameters"].values()))
+            assert all(p["std"] < 0.5 * size for p in row["parameters"].values()), row
