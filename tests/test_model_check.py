@@ -27,7 +27,7 @@ from coax_env.diagnosis.model_check import (
     model_check,
 )
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.remarks import one_step_against_a_second
+from coax_env.diagnosis.remarks import held_out_before, one_step_against_a_second
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import RunPass
 from coax_env.estimation.helicopter import HeliModel, record_of
@@ -139,6 +139,17 @@ def test_a_better_likelihood_with_a_worse_second_is_said(better, low, said):
     assert bool(texts) == said
     assert not said or ("50 nats" in texts[0] and "heading" in texts[0])
     assert one_step_against_a_second(None, [], [], SETTINGS) == []
+
+
+@pytest.mark.parametrize(
+    ("held_out", "since", "said"),
+    [(["a"], "b", True), (["a"], "a", False), (["a", "c"], "b", False), (["a"], None, False)],
+)
+def test_a_gain_on_runs_before_a_cause_began_says_nothing_of_it(held_out, since, said):
+    cause = {"effect": "swash_offset", "since": since and {"run": since, "t": 2.0}}
+    texts = held_out_before({"held_out": held_out}, [cause], ["a", "b", "c"])
+    assert ["swash offset" in text for text in texts] == [True] * said
+    assert held_out_before(None, [cause], []) == []
     assert np.isnan(RunReplay("run", {}, False, {}).log_likelihood)
 
 

@@ -36,7 +36,12 @@ from coax_env.diagnosis.input_innovations import (
 from coax_env.diagnosis.model_check import model_check
 from coax_env.diagnosis.onset import beside_onsets, moments_of, with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.remarks import one_step_against_a_second, remarks, vibration_removed
+from coax_env.diagnosis.remarks import (
+    held_out_before,
+    one_step_against_a_second,
+    remarks,
+    vibration_removed,
+)
 from coax_env.diagnosis.searched import searched
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.trust import beside_large_axes, trusts
@@ -222,6 +227,7 @@ def diagnose(
             *([vibration_removed(lines)] if lines else []),
             *remarks(problem, fit, quadratic, found),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
+            *held_out_before(gain, causes, flight.run_names),
             *check.remarks,
         ),
         noise=sensors,

@@ -14,7 +14,7 @@ from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.model.effects import CATALOGUE
-from coax_env.plain_words import and_list, channel_name
+from coax_env.plain_words import and_list, channel_name, plain
 
 
 def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternatives) -> list[str]:
@@ -73,6 +73,27 @@ def one_step_against_a_second(
         f"on the held-out runs the likelihood of one step prefers the corrected model by"
         f" {nats[1] - nats[0]:.0f} nats, but a second ahead it predicts {and_list(worse)} worse:"
         " the noise model is wrong"
+    ]
+
+
+def held_out_before(
+    gain: Mapping[str, Any] | None, causes: Sequence[Mapping[str, Any]], runs: Sequence[str]
+) -> list[str]:
+    """That the gain says nothing of a cause, since all held-out runs were flown before it began.
+
+    Args:
+        gain: of the corrected model on the held-out runs.
+        causes: of the findings.
+        runs: names of all, in the order in which they were flown.
+    """
+    if not gain:
+        return []
+    last = max(runs.index(name) for name in gain["held_out"])
+    began = {c["effect"]: runs.index(c["since"]["run"]) for c in causes if c.get("since")}
+    return [
+        f"the held-out runs were flown before {plain(effect)} began: the gain says nothing of it"
+        for effect, run in began.items()
+        if run > last
     ]
 
 
