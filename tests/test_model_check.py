@@ -143,7 +143,13 @@ def test_a_better_likelihood_with_a_worse_second_is_said(better, low, said):
 
 @pytest.mark.parametrize(
     ("held_out", "since", "said"),
-    [(["a"], "b", True), (["a"], "a", False), (["a", "c"], "b", False), (["a"], None, False)],
+    [
+        (["a"], "b", True),
+        (["a"], "a", False),
+        (["a", "c"], "b", False),
+        (["a"], None, False),
+        (["a (its last third)"], "b", False),
+    ],
 )
 def test_a_gain_on_runs_before_a_cause_began_says_nothing_of_it(held_out, since, said):
     cause = {"effect": "swash_offset", "since": since and {"run": since, "t": 2.0}}

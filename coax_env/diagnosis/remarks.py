@@ -86,14 +86,14 @@ def held_out_before(
         causes: of the findings.
         runs: names of all, in the order in which they were flown.
     """
-    if not gain:
-        return []
-    last = max(runs.index(name) for name in gain["held_out"])
-    began = {c["effect"]: runs.index(c["since"]["run"]) for c in causes if c.get("since")}
+    began_in = {c["effect"]: c["since"]["run"] for c in causes if c.get("since")}
+    if not gain or not {*gain["held_out"], *began_in.values()} <= set(runs):
+        return []  # of one run a part was held out
+    last = max((runs.index(name) for name in gain["held_out"]), default=len(runs))
     return [
         f"the held-out runs were flown before {plain(effect)} began: the gain says nothing of it"
-        for effect, run in began.items()
-        if run > last
+        for effect, run in began_in.items()
+        if runs.index(run) > last
     ]
 
 
