@@ -39,8 +39,8 @@ def main() -> None:
     options = arguments()
     log = read_flight(options.flight)
     with command_line.progress("edits") as report_progress:
-        before = before_edits(log, options.vehicle, report_progress)
-        rows = check(log, before, dict(options.edit), report_progress, options.since)
+        flight, before = before_edits(log, options.vehicle, report_progress)
+        rows = check(flight, before, dict(options.edit), report_progress, options.since)
     write_json(options.out / "edits.json", rows)
     show(rows)
     if options.since is not None:
@@ -80,8 +80,8 @@ def _edit(text: str) -> tuple[str, float]:
 
 def before_edits(
     log: "Flight", vehicle: str | None, report_progress: Callable[[str], None]
-) -> "Before":
-    """The model of a flight as it was logged.
+) -> tuple["Flight", "Before"]:
+    """What a fit needs of a flight (`changes.calm`), and its model as it was logged.
 
     Args:
         log: the flight as read.
@@ -92,11 +92,12 @@ def before_edits(
     from coax_env.diagnosis.changes import Before, calm, fitted_model
 
     machine = load_vehicle(vehicle or log.vehicle).in_air(log.air)
-    return Before.of(*fitted_model(calm(log, machine), machine, progress=report_progress))
+    flight = calm(log, machine)
+    return flight, Before.of(*fitted_model(flight, machine, progress=report_progress))
 
 
 def check(
-    log: "Flight",
+    flight: "Flight",
     before: "Before",
     edits: Mapping[str, float],
     report_progress: Callable[[str], None],
@@ -105,16 +106,15 @@ def check(
     """Every edit of a flight, one at a time, and what the difference says.
 
     Args:
-        log: the flight as read. before: `before_edits` of it.
+        flight, before: of `before_edits`.
         edits: name -> size.
         report_progress: called with a line of text.
         since: run and time [s] from which on each edit holds; None: in the whole flight.
     """
-    from coax_env.diagnosis.changes import calm, changes
+    from coax_env.diagnosis.changes import changes
     from coax_env.estimation.helicopter import record_of
     from coax_env.logs.edits import edited
 
-    flight = calm(log, before.problem.model.vehicle)
     rows = []
     for name, size in edits.items():
         report_progress(f"{name} {size:g}")

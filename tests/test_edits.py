@@ -229,9 +229,9 @@ def test_edits_of_real_logs(name, runs, run):
     script = importlib.import_module("check_edits")
     log = read_flight(shared_flight(name))
     log = log.select(runs or log.run_names)
-    model = script.before_edits(log, None, lambda text: None)
+    flight, model = script.before_edits(log, None, lambda text: None)
     for since in (None, (run, 20.0)):
-        rows = script.check(log, model, script.STANDARD, lambda text: None, since)
+        rows = script.check(flight, model, script.STANDARD, lambda text: None, since)
         assert [row["edit"] for row in rows] == list(script.STANDARD)
         for row in rows:
             assert row["found"] and row["named"] == row["effect"], row

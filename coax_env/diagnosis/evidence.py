@@ -108,9 +108,8 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
     """
     while True:
         wider, trial = with_command_gains(problem, fit, coloured=True)
-        stated = has_command_gains(wider) and _is_white(
-            problem, fit
-        )  # colour spoils them for a model
+        # colour spoils the gains for a model, not for the question
+        stated = has_command_gains(wider) and _is_white(problem, fit)
         joint, alone = (wider, trial), (problem, fit)
         (first, start), (second, again) = (joint, alone) if stated else (alone, joint)
         pruned, quadratic, evidence = prune(first, start)

@@ -19,19 +19,18 @@ from numba import float64, int64, types
 
 from coax_env.estimation.frozen_gains import KEPT, Kept
 from coax_env.estimation.kalman import _M, _N, TRACE
-from coax_env.estimation.noise_score import reading_back
+from coax_env.estimation.noise_score import reading_back, row_back, turned_jacobian
 from coax_env.estimation.sparse import (
     REORDER,
     aligned,
     combine,
-    find_non_zeros,
     multiply,
     padded,
     unpack,
     with_places,
 )
 from coax_env.kernel.compilation import compiled, compiled_when_called
-from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks, transpose
+from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
 
 
 @dataclass(frozen=True)
@@ -113,20 +112,11 @@ class _Answers(NamedTuple):
 @compiled(**REORDER)
 def _step_back(w):
     """The step to the next row: X <- F' X, and F' X F of `to_C`."""
-    nx = w.to_e.size
-    for i in range(nx):
-        w.K[i] = w.to_e[i]
-    for i in range(nx):
-        w.to_e[i] = 0.0
-        for c in range(w.F.counts[i]):
-            w.to_e[i] += w.F.values[i, w.F.places[i, c]] * w.K[w.F.places[i, c]]
+    row_back(w.F, w.to_e, w.to_C, w.K, w.half, w.turned)
     multiply(w.F, w.to_J, w.scratch)
     rows, results = simd_blocks(w.scratch), simd_blocks(w.to_J)
-    for b in range(np.uint64(nx * w.to_J.shape[1] // SIMD_WIDTH)):
+    for b in range(np.uint64(w.to_e.size * w.to_J.shape[1] // SIMD_WIDTH)):
         results[b] = rows[b]
-    multiply(w.F, w.to_C, w.half)
-    transpose(w.half, nx, w.turned)
-    multiply(w.F, w.turned, w.to_C)
 
 
 @compiled(**REORDER)
@@ -203,10 +193,7 @@ def beginnings_pass(trace, refresh, moved, asked, out):
         if row < n - 1:
             if trace.path.F_of[row] != F_slot:
                 F_slot = trace.path.F_of[row]
-                for i in range(nx):
-                    for j in range(nx):
-                        w.F.values[j, i] = trace.path.F[F_slot, i, j]
-                find_non_zeros(w.F)
+                turned_jacobian(trace.path, F_slot, w.F)
             _step_back(w)
         if row // refresh != H_slot:
             H_slot = row // refresh

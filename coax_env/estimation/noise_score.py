@@ -110,18 +110,37 @@ class _Backward(NamedTuple):
 
 
 @compiled(**REORDER)
-def _row_back(w):
-    """Across a row: r = F' r, N = F' (F' N)'; what r was is in r_next, F' N in B."""
-    nx = w.r.size
+def turned_jacobian(path, slot, F):
+    """A row's Jacobian of the step, transposed, into F (Sparse).
+
+    Args:
+        path: kalman.Path. slot: which of its Jacobians.
+    """
+    nx = path.F.shape[1]
     for i in range(nx):
-        w.r_next[i] = w.r[i]
+        for j in range(nx):
+            F.values[j, i] = path.F[slot, i, j]
+    find_non_zeros(F)
+
+
+@compiled(**REORDER)
+def row_back(F, r, N, r_next, FN, NF):
+    """Across a row: r = F' r, N = F' (F' N)'; what r was is in r_next, F' N in FN.
+
+    Args:
+        F: the row's Jacobian, Sparse, transposed. r, N: slope and its variance, in place.
+        r_next, FN: out. NF: scratch.
+    """
+    nx = r.size
     for i in range(nx):
-        w.r[i] = 0.0
-        for c in range(w.F.counts[i]):
-            w.r[i] += w.F.values[i, w.F.places[i, c]] * w.r_next[w.F.places[i, c]]
-    multiply(w.F, w.N, w.B)
-    transpose(w.B, nx, w.NF)
-    multiply(w.F, w.NF, w.N)
+        r_next[i] = r[i]
+    for i in range(nx):
+        r[i] = 0.0
+        for c in range(F.counts[i]):
+            r[i] += F.values[i, F.places[i, c]] * r_next[F.places[i, c]]
+    multiply(F, N, FN)
+    transpose(FN, nx, NF)
+    multiply(F, NF, N)
 
 
 @compiled(**REORDER)
@@ -214,11 +233,8 @@ def score_pass(dt, trace, places, q, decay, gate, refresh, block, out):
             )  # fmt: skip
             if path.F_of[k] != F_slot:
                 F_slot = path.F_of[k]
-                for i in range(nx):
-                    for j in range(nx):
-                        w.F.values[j, i] = path.F[F_slot, i, j]
-                find_non_zeros(w.F)
-            _row_back(w)
+                turned_jacobian(path, F_slot, w.F)
+            row_back(w.F, w.r, w.N, w.r_next, w.B, w.NF)
             for d in range(path.decaying.size):
                 g = path.decaying[d]
                 slope = _decay_slope(g, trace.states[k, g], path.P[k, d], dt[k], w)
