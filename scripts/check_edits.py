@@ -14,7 +14,8 @@ import command_line
 from coax_env.files import write_json
 
 if TYPE_CHECKING:
-    from coax_env.diagnosis.changes import Before, Changes
+    from coax_env.comparison.two_logs.before import Before
+    from coax_env.comparison.two_logs.stated import Changes
     from coax_env.logs.flight import Flight
 
 STANDARD = {
@@ -89,7 +90,7 @@ def before_edits(
         report_progress: called with a line of text.
     """
     from coax_env import load_vehicle
-    from coax_env.diagnosis.changes import Before, calm, fitted_model
+    from coax_env.comparison.two_logs.before import Before, calm, fitted_model
 
     machine = load_vehicle(vehicle or log.vehicle).in_air(log.air)
     flight = calm(log, machine)
@@ -111,7 +112,7 @@ def check(
         report_progress: called with a line of text.
         since: run and time [s] from which on each edit holds; None: in the whole flight.
     """
-    from coax_env.diagnosis.changes import changes
+    from coax_env.comparison.two_logs.changes import changes
     from coax_env.estimation.helicopter import record_of
     from coax_env.logs.edits import edited
 
@@ -217,7 +218,7 @@ def _phase(before: "Before") -> float:
 
 def _scale(effect: str) -> Callable[[float, "Before"], Planted]:
     def planted(size: float, before: "Before") -> Planted:
-        from coax_env.diagnosis.changes import effective
+        from coax_env.comparison.two_logs.coordinates import effective
 
         name = f"{effect}.scale"
         was = effective(before.problem, before.fit.values, effect)[name]

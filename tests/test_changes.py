@@ -14,13 +14,25 @@ import numpy as np
 import pytest
 
 from coax_env import load_vehicle
-from coax_env.diagnosis import changes
-from coax_env.diagnosis.changes import ROTOR_SCALE, Coordinate, _Logs, _Trial
+from coax_env.comparison.two_logs import changes, stated, trials
+from coax_env.comparison.two_logs.before import Before
+from coax_env.comparison.two_logs.coordinates import (
+    ROTOR_SCALE,
+    Coordinate,
+    coordinates,
+    effective,
+    moved,
+    scale_of,
+)
+from coax_env.comparison.two_logs.logs import Logs
+from coax_env.comparison.two_logs.stated import Changes
+from coax_env.comparison.two_logs.trials import Trial
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.state_space import Noise, Record
 
+ROOM = "coax_env.comparison.two_logs"
 MODEL = HeliModel(load_vehicle("lama400d"))
 FILE = MODEL.bare_values
 NAMES = ("gyro_bias.x", "gyro_bias.y", "wind.north")
@@ -55,7 +67,7 @@ class Made:
         return self.of(np.array([values[n] - self.fit.values[n] for n in NAMES]))
 
     def slopes(self, at: Mapping[str, float], of: Sequence[Coordinate]) -> np.ndarray:
-        return _Logs.slopes(self, at, of)  # type: ignore[arg-type]
+        return Logs.slopes(self, at, of)  # type: ignore[arg-type]
 
 
 FIT = Fit((), {"gyro_bias.x": 0.002, "gyro_bias.y": 0.0, "wind.north": 1.0}, Noise({}))
@@ -74,15 +86,15 @@ def test_a_set_of_changes_is_worth_how_many_times_smaller_it_makes_the_differenc
     """A tenth of the square left: n/2 log(1.03 / 0.13), less half log n for each number (Schwarz)."""
     nothing = np.full(100, 2.0)
     residual = nothing * math.sqrt(0.1)
-    found = changes._worth(nothing, residual, 3, 40)
+    found = trials.worth(nothing, residual, 3, 40)
     expected = 20.0 * math.log(1.03 / 0.13) - 1.5 * math.log(40.0)
     assert found == pytest.approx(expected)
-    assert changes._worth(nothing, nothing, 0, 40) == pytest.approx(0.0)
+    assert trials.worth(nothing, nothing, 0, 40) == pytest.approx(0.0)
 
 
-def trial(nats: float, left: float) -> _Trial:
+def trial(nats: float, left: float) -> Trial:
     """So many nats by the logs, with a residual worth so many in a flight's own noise."""
-    return _Trial(("a",), {}, nats, np.array([math.sqrt(2.0 * left)]), np.zeros((1, 0)))
+    return Trial(("a",), {}, nats, np.array([math.sqrt(2.0 * left)]), np.zeros((1, 0)))
 
 
 @pytest.mark.parametrize(
@@ -96,23 +108,23 @@ def trial(nats: float, left: float) -> _Trial:
 def test_a_change_holds_by_the_logs_or_by_the_flights_own_noise(nats, left, holds):
     """Nothing changed is worth 1000 nats: nine of a hundred must go, and more than a threshold."""
     nothing = trial(0.0, 1000.0)
-    found = changes._holds(trial(nats, left), nothing, nothing.residual, SETTINGS)
+    found = trials.holds(trial(nats, left), nothing, nothing.residual, SETTINGS)
     assert found == holds
 
 
 def test_where_little_differs_a_flights_noise_would_not_show_it():
     """Half of 20 nats is a large share, and less than a threshold."""
     nothing = trial(0.0, 20.0)
-    assert not changes._holds(trial(0.0, 10.0), nothing, nothing.residual, SETTINGS)
-    assert changes._holds(trial(0.0, 5.0), nothing, nothing.residual, SETTINGS)
+    assert not trials.holds(trial(0.0, 10.0), nothing, nothing.residual, SETTINGS)
+    assert trials.holds(trial(0.0, 5.0), nothing, nothing.residual, SETTINGS)
 
 
 # --- fits ---------------------------------------------------------------------------------------------
 
 
-def fitted(logs: Made, *effects: str, begin: Mapping[str, float] | None = None) -> _Trial:
+def fitted(logs: Made, *effects: str, begin: Mapping[str, float] | None = None) -> Trial:
     nothing = logs.difference(FIT.values)
-    return changes._fitted(logs, KNOWN, effects, begin or {}, nothing)  # type: ignore[arg-type]
+    return trials.fitted(logs, KNOWN, effects, begin or {}, nothing)  # type: ignore[arg-type]
 
 
 def test_moves_are_those_of_least_squares():
@@ -125,7 +137,7 @@ def test_moves_are_those_of_least_squares():
     assert set(found.moves) == set(NAMES[:2])
     np.testing.assert_allclose(found.residual, logs.of(np.array([*moves, 0.0])), atol=1e-9)
     nothing = logs.difference(FIT.values)
-    assert found.nats == changes._worth(nothing, found.residual, 2, BLOCKS)
+    assert found.nats == trials.worth(nothing, found.residual, 2, BLOCKS)
     np.testing.assert_allclose(found.slopes, SLOPES[:, :2], rtol=1e-6)
 
 
@@ -153,11 +165,11 @@ def test_effects_are_tried_from_the_best_on_and_the_hopeless_not_at_all():
     """By half b' A^-1 b, what the derivatives promise; less than half of the best is not fitted."""
     logs = linear((0.02, 0.0, 0.0))
     nothing = logs.difference(FIT.values)
-    none = _Trial((), {}, 0.0, nothing, np.zeros((COUNT, 0)))
+    none = Trial((), {}, 0.0, nothing, np.zeros((COUNT, 0)))
     slopes = {"gyro_bias": SLOPES[:, :2], "wind": SLOPES[:, 2:]}
 
-    def tried(made: Made, begin: _Trial) -> list[tuple[str, ...]]:
-        found = changes._trials(made, KNOWN, slopes, begin, nothing)  # type: ignore[arg-type]
+    def tried(made: Made, begin: Trial) -> list[tuple[str, ...]]:
+        found = trials.best_trials(made, KNOWN, slopes, begin, nothing)  # type: ignore[arg-type]
         nats = [t.nats for t in found]
         assert nats == sorted(nats, reverse=True)
         return [t.effects for t in found]
@@ -176,7 +188,7 @@ def test_what_stood_for_a_later_change_is_dropped():
     for logs, left in ((alone, ("wind",)), (both, ("gyro_bias", "wind"))):
         nothing = logs.difference(FIT.values)
         best = fitted(logs, "gyro_bias", "wind")
-        found = changes._without_worthless(logs, KNOWN, best, nothing, SETTINGS)  # type: ignore
+        found = trials.without_worthless(logs, KNOWN, best, nothing, SETTINGS)  # type: ignore
         assert found.effects == left
 
 
@@ -189,19 +201,19 @@ def test_changes_are_found_one_by_one_until_none_holds(monkeypatch, true, found)
     quiet = Made(lambda x: SLOPES @ (x - np.array(true)) + 1e-3 * LEFT, FIT)
     known = KNOWN | {"twin": [replace(c, effect="twin") for c in KNOWN["wind"]]}
     slopes = {"gyro_bias": SLOPES[:, :2], "wind": SLOPES[:, 2:], "twin": 0.999 * SLOPES[:, 2:]}
-    monkeypatch.setattr(changes, "_Logs", lambda *given: quiet)
+    monkeypatch.setattr(changes, "Logs", lambda *given: quiet)
     monkeypatch.setattr(changes, "_of_readings", lambda before, there: slopes)
     monkeypatch.setattr(
         changes,
-        "_stated",
-        lambda problem, logs, known, best, alike, nothing: changes.Changes((best, alike), 0.0, 0.0),
+        "stated",
+        lambda problem, logs, known, best, alike, nothing: Changes((best, alike), 0.0, 0.0),
     )
     one = record("a", 2.0, 0.0)
     made = SimpleNamespace(
         settings=SETTINGS, model=None, engine=SimpleNamespace(records=[one], threads=1)
     )
     monkeypatch.setattr(changes, "Engine", Echo)
-    before = changes.Before(made, FIT, [], [np.ones((4, 18), bool)], known, slopes)  # type: ignore
+    before = Before(made, FIT, [], [np.ones((4, 18), bool)], known, slopes)  # type: ignore
     best, alike = changes.changes(before, [one]).changes  # type: ignore[misc]
     names = {"wind" if e == "twin" else e for e in best.effects}
     assert names == found
@@ -222,11 +234,11 @@ def test_a_std_is_that_of_the_residuals_scores_block_by_block():
     rng = np.random.default_rng(5)
     logs = SimpleNamespace(block=np.repeat(np.arange(BLOCKS), PER_BLOCK))
     sign = np.repeat(rng.choice([-1.0, 1.0], BLOCKS), PER_BLOCK)
-    best = _Trial(("wind",), {"wind.north": 0.0}, 0.0, 0.3 * sign, J)
-    found = changes._std(logs, own, best, 0.01, 0.01)["wind.north"]  # type: ignore[arg-type]
+    best = Trial(("wind",), {"wind.north": 0.0}, 0.0, 0.3 * sign, J)
+    found = stated.std_of(logs, own, best, 0.01, 0.01)["wind.north"]  # type: ignore[arg-type]
     expected = 0.3 / (40.0 * math.sqrt(COUNT)) * math.sqrt(PER_BLOCK * BLOCKS / (BLOCKS - 1))
     assert found == pytest.approx(expected, rel=1e-5)
-    assert changes._std(logs, [], best, 0.01, 0.01) == {}  # type: ignore[arg-type]
+    assert stated.std_of(logs, [], best, 0.01, 0.01) == {}  # type: ignore[arg-type]
 
 
 def test_a_std_is_at_least_a_share_of_the_effects_change_and_lags_know_half_a_row():
@@ -235,8 +247,8 @@ def test_a_std_is_at_least_a_share_of_the_effects_change_and_lags_know_half_a_ro
     lag = Coordinate("servo_lag", "servo_lag.time", "s", 0.04, 0.0, 0.2, 0.02, timing=True)
     own = [*KNOWN["gyro_bias"], lag]
     moves = {"gyro_bias.x": -0.04, "gyro_bias.y": 0.01, "servo_lag.time": 0.008}
-    best = _Trial(("gyro_bias", "servo_lag"), moves, 0.0, np.zeros(COUNT), SLOPES)
-    found = changes._std(logs, own, best, 0.012, 0.05)  # type: ignore[arg-type]
+    best = Trial(("gyro_bias", "servo_lag"), moves, 0.0, np.zeros(COUNT), SLOPES)
+    found = stated.std_of(logs, own, best, 0.012, 0.05)  # type: ignore[arg-type]
     assert found["gyro_bias.x"] == found["gyro_bias.y"] == pytest.approx(0.05 * 0.04)
     assert found["servo_lag.time"] == pytest.approx(math.hypot(0.05 * 0.008, 0.012 / math.sqrt(12)))
 
@@ -265,9 +277,9 @@ class Echo:
         ]
 
 
-def logs_of(records: Sequence[Record], there: list[np.ndarray]) -> _Logs:
+def logs_of(records: Sequence[Record], there: list[np.ndarray]) -> Logs:
     before = [0.5 * r.command for r in records]
-    return _Logs(Echo(None, records), FIT, before, there)  # type: ignore[arg-type]
+    return Logs(Echo(None, records), FIT, before, there)  # type: ignore[arg-type]
 
 
 def test_blocks_are_two_seconds_of_a_run_and_of_one_run_alone():
@@ -283,7 +295,7 @@ def test_blocks_are_two_seconds_of_a_run_and_of_one_run_alone():
 
 def test_faster_rotors_are_flown_as_larger_commands(monkeypatch):
     """Of both rotors and of nothing else; what is missing in one of the logs counts for nothing."""
-    monkeypatch.setattr(changes, "Engine", Echo)
+    monkeypatch.setattr(f"{ROOM}.logs.Engine", Echo)
     records = [record("a", 2.0, 0.0)]
     there = [np.ones((4, 4), bool)]
     there[0][2, 1] = False
@@ -303,25 +315,25 @@ def test_faster_rotors_are_flown_as_larger_commands(monkeypatch):
 @pytest.mark.parametrize("scale", [1.0, -0.5])
 def test_rotors_of_any_speed_are_flown(monkeypatch, scale):
     """Twice and half as fast; and where they are as fast as before no engine is made anew."""
-    monkeypatch.setattr(changes, "Engine", Echo)
+    monkeypatch.setattr(f"{ROOM}.logs.Engine", Echo)
     records = [record("a", 1.0, 0.0)]
     logs = logs_of(records, [np.ones((2, 4), bool)])
     found = logs.difference({"wind.north": 0.0, ROTOR_SCALE: scale})[:4]
     faster = 1.0 + scale
     np.testing.assert_allclose(found, [200 * (faster - 0.5), 210 * (faster - 0.5), 0.015, -0.01])
-    monkeypatch.setattr(changes, "Engine", None)
+    monkeypatch.setattr(f"{ROOM}.logs.Engine", None)
     assert logs.difference({"wind.north": 0.0})[0] == 100.0
 
 
 def test_readings_of_a_filters_first_second_do_not_count(monkeypatch):
     """By each run's own clock, from one second on; nor do those that are missing."""
-    monkeypatch.setattr(changes, "coordinates", lambda problem, fit: KNOWN["wind"])
+    monkeypatch.setattr(f"{ROOM}.before.coordinates", lambda problem, fit: KNOWN["wind"])
     records = [record("a", 3.0, 30.0), record("b", 2.0, 4.0)]
     engine = Echo(None, records)
     records[1].command[3, 2] = np.nan
     said: list[str] = []
     made = SimpleNamespace(engine=engine, report=said.append)
-    found = changes.Before.of(made, FIT)  # type: ignore[arg-type]
+    found = Before.of(made, FIT)  # type: ignore[arg-type]
     expected = [np.repeat([[False] * 4, [True] * 4], [2, n - 2], axis=0) for n in (6, 4)]
     expected[1][3, 2] = False
     for there, wanted in zip(found.there, expected, strict=True):
@@ -349,7 +361,7 @@ def problem(*effects: str) -> Problem:
 
 def of(values: Mapping[str, float], *effects: str) -> dict[str, Coordinate]:
     made = problem(*effects)
-    return {c.name: c for c in changes.coordinates(made, Fit((), values, Noise({})))}
+    return {c.name: c for c in coordinates(made, Fit((), values, Noise({})))}
 
 
 def test_a_number_moves_five_usual_sizes_and_no_farther_than_physics():
@@ -376,27 +388,23 @@ def test_a_derivative_is_taken_by_the_probe_at_nothing_and_inwards_at_a_bound():
 def test_a_swash_offset_keeps_the_tilt_that_it_makes():
     """A linkage of 1.25 times: the offset is 0.8 times, beside its own move; a scale multiplies."""
     values = {**FILE, "swash_offset.lon": 0.02, "swash_offset.lat": -0.01, "swash_gain.scale": 0.2}
-    found = changes.moved(values, {"swash_gain.scale": 0.25, "swash_offset.lat": 0.003})
+    found = moved(values, {"swash_gain.scale": 0.25, "swash_offset.lat": 0.003})
     assert found["swash_gain.scale"] == pytest.approx(1.2 * 1.25 - 1.0)
     assert found["swash_offset.lon"] == pytest.approx(0.016)
     assert found["swash_offset.lat"] == pytest.approx(-0.008 + 0.003)
-    plain = changes.moved(values, {"swash_offset.lon": 0.004, "wind.north": -1.0})
+    plain = moved(values, {"swash_offset.lon": 0.004, "wind.north": -1.0})
     assert plain["swash_offset.lon"] == pytest.approx(0.024) and plain["wind.north"] == -1.0
     assert plain["swash_offset.lat"] == -0.01
-    assert changes.moved({ROTOR_SCALE: 0.1}, {ROTOR_SCALE: -0.1})[ROTOR_SCALE] == pytest.approx(
-        -0.01
-    )
+    assert moved({ROTOR_SCALE: 0.1}, {ROTOR_SCALE: -0.1})[ROTOR_SCALE] == pytest.approx(-0.01)
 
 
 def test_a_mass_is_one_number_wherever_a_fit_put_it():
     """In kilograms: what the fit moved the file's by, and what the effect adds."""
     made = problem("added_mass")
     values = {**FILE, "mass": FILE["mass"] + 0.03, "added_mass.mass": 0.02}
-    found = changes.effective(made, values, "added_mass")
+    found = effective(made, values, "added_mass")
     assert found == {"added_mass.mass": pytest.approx(0.05)}
-    assert changes.effective(made, {**values, ROTOR_SCALE: 0.04}, "rotor_speed") == {
-        ROTOR_SCALE: 0.04
-    }
+    assert effective(made, {**values, ROTOR_SCALE: 0.04}, "rotor_speed") == {ROTOR_SCALE: 0.04}
 
 
 def test_a_move_of_a_scale_is_a_share_of_what_it_scales():
@@ -406,7 +414,7 @@ def test_a_move_of_a_scale_is_a_share_of_what_it_scales():
         ("added_mass", "added_mass.mass", 0.05, 1.0), ("wind", "wind.north", 3.0, 1.0),
     ):  # fmt: skip
         c = Coordinate(effect, name, "1", 1.0, -1.0, 1.0, 0.1)
-        assert changes.scale_of({name: before}, c) == pytest.approx(expected)
+        assert scale_of({name: before}, c) == pytest.approx(expected)
 
 
 # --- what is stated -----------------------------------------------------------------------------------
@@ -422,7 +430,7 @@ def test_each_changes_evidence_is_what_a_flight_with_noise_would_lose_without_it
         engine=SimpleNamespace(records=[record("a", 5.0, 0.0)]),  # type: ignore[arg-type]
     )
     alike = {"gyro_bias": ("wind",), "wind": ()}
-    found = changes._stated(made, logs, KNOWN, best, alike, nothing)  # type: ignore[arg-type]
+    found = stated.stated(made, logs, KNOWN, best, alike, nothing)  # type: ignore[arg-type]
     assert [c.effect for c in found.changes] == ["wind", "gyro_bias"]
     for c, other in zip(found.changes, ("gyro_bias", "wind"), strict=True):
         without = fitted(logs, other).residual

@@ -19,7 +19,7 @@ from coax_env.comparison.information import Information
 from coax_env.comparison.logbook import logbook, over_time
 from coax_env.comparison.search import Changed
 from coax_env.comparison.two_flights import ROTOR_SPEED, MachineModel, read_two
-from coax_env.comparison.two_logs import of_one_flight
+from coax_env.comparison.two_logs.difference import of_one_flight
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.errors import InputError

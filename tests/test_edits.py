@@ -10,15 +10,10 @@ import pytest
 from shared_flights import shared_flight
 
 import coax_env
-from coax_env.diagnosis.changes import (
-    Before,
-    _with_rotors,
-    changes,
-    coordinates,
-    effective,
-    first_difference,
-    moved,
-)
+from coax_env.comparison.two_logs.before import Before
+from coax_env.comparison.two_logs.changes import changes, first_difference
+from coax_env.comparison.two_logs.coordinates import coordinates, effective, moved
+from coax_env.comparison.two_logs.logs import with_rotors
 from coax_env.diagnosis.fits import start
 from coax_env.diagnosis.problem import Problem
 from coax_env.errors import InputError
@@ -176,7 +171,7 @@ def test_what_differs_from_a_run_on_does_so_from_its_first_row_on():
 def test_rotors_turn_faster_from_the_moment_on():
     """Of the commands, rows before the moment and the swash plate's stay."""
     late = before().since(Moment(RUNS[1], 6.0))
-    faster = _with_rotors(late.problem.engine, 1.04)
+    faster = with_rotors(late.problem.engine, 1.04)
     for was, now in zip(late.problem.engine.records, faster.records, strict=True):
         after = (was.whole == RUNS[1]) & (was.t >= 6.0)
         expected = np.where(after[:, None], [1.04, 1.04, 1.0, 1.0], 1.0)

@@ -28,8 +28,8 @@ from coax_env.comparison.shared import (
     with_pilots,
 )
 from coax_env.comparison.two_flights import ROTOR_SPEED, A, B, OneFlight, read, read_two
-from coax_env.comparison.two_logs import difference, of_one_flight
-from coax_env.diagnosis.changes import effective
+from coax_env.comparison.two_logs.coordinates import effective
+from coax_env.comparison.two_logs.difference import difference, of_one_flight
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.estimation.fitted_vehicle import median_step, with_timing

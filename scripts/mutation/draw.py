@@ -16,7 +16,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "env": ("coax_env/env/*.py", "coax_env/simulation/*.py"),
     "estimation": ("coax_env/estimation/*.py", "controllers/estimator.py"),
     "identification": ("coax_env/identification/*.py",),
-    "diagnosis": ("coax_env/diagnosis/*.py",),
+    "diagnosis": ("coax_env/diagnosis/*.py", "coax_env/comparison/two_logs/*.py"),
 }
 """Part -> its files as patterns, whose * goes into folders too, so that a new file is in at once."""
 

@@ -76,12 +76,12 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/identification/*": (
         "tests/test_run_estimates.py", "tests/test_identification.py", "tests/test_two_step.py",
     ),
+    "coax_env/comparison/two_logs/*": ("tests/test_changes.py", "tests/test_edits.py"),
     "coax_env/diagnosis/gain.py": ("tests/test_gain.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/trust.py": ("tests/test_trust.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/replication.py": (
         "tests/test_trust.py", "tests/test_noise_variation.py", "tests/test_diagnosis.py",
     ),
-    "coax_env/diagnosis/changes.py": ("tests/test_edits.py",),
     "coax_env/diagnosis/evidence.py": ("tests/test_fits.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/refinement.py": (
         "tests/test_refinement.py", "tests/test_diagnosis.py", "tests/test_unlisted.py",

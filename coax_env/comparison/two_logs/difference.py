@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.changes import Before, calm, changes, fitted_model
+from coax_env.comparison.two_logs.before import Before, calm, fitted_model
+from coax_env.comparison.two_logs.changes import changes
 from coax_env.diagnosis.settings import Settings
 from coax_env.estimation.helicopter import record_of
 from coax_env.logs.flight import Flight, Run
