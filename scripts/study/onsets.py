@@ -36,6 +36,8 @@ CHANGES = ("begins", "ends", "grows")
 """Kinds in which something changes in flight."""
 GROWING = 12.0
 """s of flight over which what grows comes to its size."""
+GROWING_WHOLE = (4.0, 80.0)
+"""The same in whole flights, log-uniform: from a screw that works loose to a battery that goes flat."""
 BEGINS = (
     "swash_offset", "torque_balance", "gyro_bias", "thrust_scale", "cg_offset", "attitude_bias",
     "added_mass", "motor_lag", "accel_bias", "servo_play", "swash_gain", "servo_lag",
@@ -49,7 +51,7 @@ EARLIEST = 3.0
 class Planned:
     """One flight of the study. fault: what changes at `since`, or is there all the time.
 
-    whole: whether it is as long as a labelled one.
+    whole: whether it is as long as a labelled one. growing: s over which what grows comes.
     """
 
     kind: str
@@ -60,6 +62,7 @@ class Planned:
     air: dict[str, Any]
     seed: int
     whole: bool = False
+    growing: float = 0.0
 
     @property
     def name(self) -> str:
@@ -92,8 +95,13 @@ def planned(kind: str, number: int, seed: int, whole: bool = False) -> Planned:
             "moment_z": 0.003 * scale, "memory": rng.uniform(0.2, 1.0, 2).tolist(),
         }  # fmt: skip
     hidden = {} if kind == "clean" else {fault: sizes}
+    of_flight = int(rng.integers(2**31))
+    growing = 0.0
+    if kind == "grows":
+        low, high = np.log(GROWING_WHOLE if whole else (GROWING, GROWING))
+        growing = round(float(np.exp(rng.uniform(low, high))), 2)
     return Planned(
-        kind, number, hidden, others if hidden else {}, since, air, int(rng.integers(2**31)), whole
+        kind, number, hidden, others if hidden else {}, since, air, of_flight, whole, growing
     )
 
 
@@ -106,7 +114,7 @@ def fly(plan: Planned, folder: Path) -> Path:
         runs=lengths(plan.whole), longest=math.inf if plan.whole else LONGEST,
         later=after if plan.kind in CHANGES else None,
         since=plan.since if plan.kind in CHANGES else ("", 0.0),
-        growing=GROWING if plan.kind == "grows" else 0.0,
+        growing=plan.growing,
     )  # fmt: skip
 
 
@@ -130,7 +138,7 @@ def fly_and_diagnose(plan: Planned) -> dict[str, Any]:
             if plan.kind in CHANGES:
                 before, after = stages(plan)
                 off = {effect: dict.fromkeys(sizes, 0.0) for effect, sizes in after.items()}
-                moment = Moment(*plan.since, GROWING if plan.kind == "grows" else 0.0)
+                moment = Moment(*plan.since, plan.growing)
                 row["worth"] = worth_of_change(folder, before or off, after, plan.others, moment)
     except Exception:
         return row | {"error": traceback.format_exc()}
@@ -234,7 +242,8 @@ def _remark(row: Mapping[str, Any]) -> str:
     plan = row["plan"]
     worth = f", worth {row['worth']:.0f} nats" if "worth" in row else ""
     said = [(c["effect"], round(c["evidence"], 1), c["since"]) for c in row["causes"]]
+    over = f" over {plan['growing']:g} s" if plan.get("growing") else ""
     return (
-        f"- {plan['kind']} {plan['number']} {plan['fault']} {plan['since']} beside"
+        f"- {plan['kind']} {plan['number']} {plan['fault']} {plan['since']}{over} beside"
         f" {list(plan['others'])} ({plan['air']['gusts']}){worth}: {said}"
     )
