@@ -26,8 +26,8 @@ from coax_env.errors import InputError, require
 from coax_env.kernel.angles import wrap_angles
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from controllers.estimator import (
-    WINDUP,
+from controllers.estimator import WINDUP
+from controllers.estimator_design import (
     EstimatorDesign,
     NoiseLevels,
     design_estimator,

@@ -19,9 +19,9 @@ from coax_env.env.period import DELAYS, DT
 from coax_env.errors import InputError
 from coax_env.model.vehicle import Parameter, Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from controllers.estimator import (
+from controllers.estimator import Estimating
+from controllers.estimator_design import (
     INTEGRAL_TIME,
-    Estimating,
     EstimatorDesign,
     design_estimator,
     integrated_readings,

@@ -13,7 +13,7 @@ from coax_env.env.period import DT
 from coax_env.errors import InputError
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from controllers.estimator import EstimatorDesign, integrated_readings, plant
+from controllers.estimator_design import EstimatorDesign, integrated_readings, plant
 from controllers.hinf import HInfinity
 from controllers.lqr import LQG
 

@@ -21,7 +21,7 @@ from coax_env.env.spaces import ACTIONS
 from coax_env.errors import InputError
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from controllers.estimator import design_estimator
+from controllers.estimator_design import design_estimator
 from controllers.feedback import Feedback
 
 DEFAULT_SENSORS = "onboard"

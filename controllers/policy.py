@@ -28,7 +28,8 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.files import write_bytes
-from controllers.estimator import Estimating, EstimatorDesign, Tracker, integrated_readings
+from controllers.estimator import Estimating, Tracker
+from controllers.estimator_design import EstimatorDesign, integrated_readings
 from controllers.target import TargetView
 
 FORMAT = "coax-policy"

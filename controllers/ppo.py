@@ -22,7 +22,7 @@ from coax_env.model.vehicle import Parameter, Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 from coax_env.workers import each
 from controllers import lqr
-from controllers.estimator import design_estimator
+from controllers.estimator_design import design_estimator
 from controllers.policy import (
     Network,
     Sight,

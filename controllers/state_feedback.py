@@ -21,7 +21,7 @@ from coax_env.env.period import DT
 from coax_env.model.layout import ACTUATOR_STATES, STATES
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from controllers.estimator import design_estimator, integrated_readings
+from controllers.estimator_design import design_estimator, integrated_readings
 from controllers.feedback import Designed, Feedback
 from controllers.lqr import regulator_problem
 from controllers.target import TargetView, turned

@@ -16,7 +16,8 @@ from coax_env.env import hover
 from coax_env.env.period import DT
 from coax_env.errors import require
 from coax_env.model.vehicle import Vehicle
-from controllers.estimator import EstimatorDesign, Tracker
+from controllers.estimator import Tracker
+from controllers.estimator_design import EstimatorDesign
 from controllers.policy import feature_sizes, features, linear_actions, seen
 from controllers.target import TargetView
 from controllers.vec_env import FleetVecEnv

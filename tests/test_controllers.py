@@ -29,7 +29,8 @@ from controllers import (
     policy,
     state_feedback,
 )
-from controllers.estimator import Tracker, design_estimator, integrated_readings
+from controllers.estimator import Tracker
+from controllers.estimator_design import design_estimator, integrated_readings
 from controllers.evaluation import evaluate, evaluate_spread
 from controllers.loading import make_controller
 from controllers.policy import Network

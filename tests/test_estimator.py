@@ -19,8 +19,9 @@ from coax_env.model.layout import CHANNELS, FULL_STATES, N_FULL
 from coax_env.model.linear import N_SAMPLED
 from coax_env.model.sampling import is_new
 from coax_env.model.sensors import suite
-from controllers import estimator
-from controllers.estimator import BIAS_STD, Tracker, delay_as_lag, design_estimator
+from controllers import estimator_design
+from controllers.estimator import Tracker
+from controllers.estimator_design import BIAS_STD, delay_as_lag, design_estimator
 
 LAMA = load_vehicle("lama400d")
 X = {name: i for i, (name, _) in enumerate(FULL_STATES[:N_SAMPLED])}
@@ -34,7 +35,7 @@ def onboard():
 
 @pytest.fixture(scope="module")
 def spreads():
-    return estimator._spreads(LAMA, TRIM[1])
+    return estimator_design._spreads(LAMA, TRIM[1])
 
 
 def noise_of(design) -> np.ndarray:
@@ -240,7 +241,7 @@ def test_a_heading_that_is_missing_is_the_one_expected():
 
 def test_integrals_add_up_what_is_read_and_stop(onboard):
     tracker = Tracker(onboard)
-    integrated = list(estimator.integrated_readings(onboard))
+    integrated = list(estimator_design.integrated_readings(onboard))
     for _ in range(100):
         known = tracker.see(observation_of(onboard, h=0.02, psi=0.01))
         tracker.acted(np.zeros((1, 4)))
@@ -354,10 +355,12 @@ def test_a_machine_that_yaws_is_predicted_as_the_model_flies_it():
 @pytest.mark.parametrize(("share", "named"), [(0.03, False), (0.07, True), (0.6, True)])
 def test_a_blind_direction_is_told_by_the_states_it_runs_along(share, named):
     """One direction across two states that nothing reads, and that stays: both are unobserved."""
-    n = len(estimator._NAMES)
+    n = len(estimator_design._NAMES)
     blind = np.zeros(n)
     blind[3], blind[7] = math.sqrt(1.0 - share**2), share
     C = np.linalg.svd(blind[None])[2][1:]  # reads all that is across it
-    found = estimator._unobserved(np.eye(n), C, np.ones(n), np.ones(n - 1))
-    assert found == tuple(estimator._NAMES[i] for i in ((3, 7) if named else (3,)))
-    assert not estimator._unobserved(0.9 * np.eye(n), C, np.ones(n), np.ones(n - 1))  # it heals
+    found = estimator_design._unobserved(np.eye(n), C, np.ones(n), np.ones(n - 1))
+    assert found == tuple(estimator_design._NAMES[i] for i in ((3, 7) if named else (3,)))
+    assert not estimator_design._unobserved(
+        0.9 * np.eye(n), C, np.ones(n), np.ones(n - 1)
+    )  # it heals

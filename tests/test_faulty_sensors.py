@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from controllers import lqr
-from controllers.estimator import Tracker, design_estimator
+from controllers.estimator import Tracker
+from controllers.estimator_design import design_estimator
 
 SECONDS, RATE = 8, 100
 FAULT = slice(200, 300)

@@ -9,8 +9,8 @@ import numpy as np
 from coax_env.env import hover
 from coax_env.env.period import DT
 from coax_env.model.sensors import slow_instruments, suite
-from controllers.estimator import (
-    WINDUP,
+from controllers.estimator import WINDUP
+from controllers.estimator_design import (
     EstimatorDesign,
     axis_of,
     horizontal_pairs,

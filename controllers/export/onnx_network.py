@@ -6,7 +6,7 @@ The filter has a memory and is not in it: it stays C or Python. Needs the packag
 
 import numpy as np
 
-from controllers.estimator import integrated_readings
+from controllers.estimator_design import integrated_readings
 from controllers.policy import BEYOND, FEATURE_LIMIT, Policy
 from controllers.target import TargetView
 

@@ -14,7 +14,7 @@ EQUIVALENT = Path(__file__).with_name("equivalent.toml")
 PARTS: dict[str, tuple[str, ...]] = {
     "model": ("coax_env/model/*.py",),
     "env": ("coax_env/env/*.py", "coax_env/simulation/*.py"),
-    "estimation": ("coax_env/estimation/*.py", "controllers/estimator.py"),
+    "estimation": ("coax_env/estimation/*.py", "controllers/estimator*.py"),
     "identification": ("coax_env/identification/*.py",),
     "diagnosis": ("coax_env/diagnosis/*.py", "coax_env/comparison/two_logs/*.py"),
 }

@@ -49,7 +49,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/simulation/multisine.py": ("tests/test_flight_plan.py",),
     "coax_env/simulation/pilot.py": ("tests/test_pilot.py", "tests/test_simulation.py"),
     "coax_env/simulation/*": ("tests/test_simulation.py", "tests/test_sensors.py"),
-    "controllers/estimator.py": (
+    "controllers/estimator*.py": (
         "tests/test_estimator.py", "tests/test_faulty_sensors.py", "tests/test_controllers.py",
     ),
     "coax_env/estimation/beginnings.py": ("tests/test_onset.py",),
