@@ -315,6 +315,8 @@ def test_what_changed_is_named_and_nothing_else(change, tmp_path):
         for name, p in c["parameters"].items():
             planted = change[c["effect"]].get(name.partition(".")[2], 0.0)
             assert abs(p["change"] - planted) < 3.0 * p["std"], name
+            # known better than if all that neither flight shows were free
+            assert p["std"] < 0.9 * found["bounds"][name]["std"], name
 
 
 @pytest.mark.slow

@@ -156,8 +156,7 @@ def _changes(
     found: Mapping[str, Mapping[str, Changed]],
 ) -> list[dict[str, Any]]:
     """The changes, strongest first."""
-    names = [f.name for f in state.problem.parameters]
-    std = dict(zip(names, np.sqrt(np.diag(quadratic.covariance(names))), strict=True))
+    std = _std(state, quadratic)
     before, after = (part.values(state.fit.values) for part in parts_of(state.problem))
     dt = median_step(state.problem.engine.records)
     entries = []
@@ -189,6 +188,12 @@ def _changes(
             }
         )
     return sorted(entries, key=lambda c: -c["evidence"])
+
+
+def _std(state: Changed, quadratic: Quadratic) -> dict[str, float]:
+    """Posterior std of every number that is free: an effect that neither flight shows is not there."""
+    free = state.problem.free_names(state.fit.active)
+    return dict(zip(free, np.sqrt(np.diag(quadratic.covariance(free))).tolist(), strict=True))
 
 
 def _effective(state: Changed, values: Mapping[str, float], effect: str) -> dict[str, float]:
@@ -246,8 +251,7 @@ def _unexplained(white: Mapping[str, Mapping[str, Whiteness]]) -> list[dict[str,
 
 def _circumstances(state: Changed, quadratic: Quadratic) -> dict[str, Any]:
     """Air, battery and gusts of each flight: what differs and is no change of the machine."""
-    free = state.problem.free_names(state.fit.active)
-    std = dict(zip(free, np.sqrt(np.diag(quadratic.covariance(free))), strict=True))
+    std = _std(state, quadratic)
     found: dict[str, Any] = {}
     for part in parts_of(state.problem):
         noise = part.noise(state.fit.noise)
