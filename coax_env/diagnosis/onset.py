@@ -28,7 +28,14 @@ from scipy.special import logsumexp
 
 from coax_env.diagnosis.confounding import alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
-from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, without_drifts
+from coax_env.diagnosis.fits import (
+    converged,
+    fitted,
+    linearise,
+    noise_fitted,
+    quadratic_at,
+    without_drifts,
+)
 from coax_env.diagnosis.growth import Growth, changing, growing, profiled, with_moment
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
@@ -459,7 +466,8 @@ def _fitted(
 ) -> tuple[Changing, Onset] | None:
     """A change fitted at its best moment, and what it is worth beside the state without it.
 
-    It is fitted from the steady noise in which it was seen. What ends has numbers after it too.
+    It is fitted from the steady noise in which it was seen. What ends has numbers after it too. The
+    quadratic is that of what is free.
     """
     effect, fit = candidate.effect, steady.fit
     active = fit.active if effect in fit.active else (*fit.active, effect)
@@ -478,7 +486,7 @@ def _fitted(
     problem, trial, found = _grown(problem, trial, found)
     trial = _with_noise_of(problem, trial, state.fit)
     trial, rivals = _compared(state, problem, trial, effect)
-    trial, _, quadratic = linearise(problem, trial)
+    trial, quadratic = quadratic_at(problem, trial, problem.free(trial.active))
     onset = _worth(state, problem, trial, rivals, quadratic, found)
     return Changing(problem, trial, quadratic, {**state.onsets, effect: onset}), onset
 
