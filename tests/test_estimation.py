@@ -664,6 +664,65 @@ def test_one_step_is_one_step():
     assert once.values["bias"] == pytest.approx(0.1, abs=0.03)
 
 
+# --- what is not flown twice -----------------------------------------------------------------------
+
+
+@pytest.fixture
+def flown(monkeypatch) -> list[int]:
+    """Grows by one with every filter pass over a record."""
+    passes: list[int] = []
+    filter_run = Engine._filter_run
+
+    def counted(self, i, *args, **more):
+        passes.append(i)
+        return filter_run(self, i, *args, **more)
+
+    monkeypatch.setattr(Engine, "_filter_run", counted)
+    return passes
+
+
+def test_what_was_linearised_is_remembered_at_its_point_for_its_parameters(flown):
+    record = swing(1, n=200)
+    engine, free = Engine(Pendulum(), [record]), [prior("stiffness", 3.0), prior("bias", 0.3)]
+    wider, louder = [replace(f, std=2.0 * f.std) for f in free], NOISE.with_levels({"torque": 0.4})
+    _, first = engine.linearise(TRUTH, NOISE, free)
+    for at, noise, of, passes in (
+        (TRUTH, NOISE, free, 1), (TRUTH, NOISE, free[:1], 2), (TRUTH, NOISE, wider, 3),
+        (TRUTH, louder, free, 4), (PLANTED, NOISE, free, 5), (PLANTED, NOISE, free, 5),
+    ):  # fmt: skip
+        _, again = engine.linearise(at, noise, of, gains=False)
+        _, fresh = Engine(Pendulum(), [record]).linearise(at, noise, of)
+        flown.pop()
+        assert len(flown) == passes
+        np.testing.assert_array_equal(again.information, fresh.information)
+    (run,), last = engine.linearise(PLANTED, NOISE, free)  # its gains are wanted
+    assert len(flown) == 6 and run.gains.size and not np.array_equal(last.slope, first.slope)
+
+
+def test_a_fit_goes_on_from_what_was_linearised(flown):
+    """As one from the start: with the gains that are not remembered."""
+    record = swing(1, n=600, values={**TRUTH, "bias": 0.1})
+    free, known = [prior("bias", 1.0)], Engine(Pendulum(), [record])
+    known.linearise(TRUTH, NOISE, free)
+    again, fresh = (
+        engine.fit(free, TRUTH, NOISE, 3, 1e-9) for engine in (known, Engine(Pendulum(), [record]))
+    )
+    assert again.values == fresh.values and again.objective == fresh.objective
+    settled = known.fit(free, again.values, NOISE, 3, 1e-2)
+    flown.clear()
+    known.linearise(settled.values, NOISE, free, gains=False)
+    assert settled.converged and not flown
+
+
+def test_the_noise_is_scored_once_at_a_point(flown):
+    engine = Engine(Pendulum(), [swing(1, n=200)])
+    louder = NOISE.with_levels({"torque": 0.4})
+    first = engine.noise_score(TRUTH, NOISE)
+    assert engine.noise_score(TRUTH, NOISE) is first and len(flown) == 1
+    other = engine.noise_score(TRUTH, louder)
+    assert len(flown) == 2 and other.log_likelihood != first.log_likelihood
+
+
 # --- fits ----------------------------------------------------------------------------------------
 
 FREE = [prior("stiffness", 3.0, 10.5, lower=1.0), prior("damping", 0.5, 0.3, lower=0.0),

@@ -59,7 +59,7 @@ class Flights:
             "refined": lambda problem, fit: fit,
             "fitted": lambda problem, fit, steps, held: self.converged(problem, fit),
             "noise_fitted": lambda problem, fit: fit,
-            "linearise": lambda problem, fit: (fit, [], None),
+            "quadratic_at": lambda problem, fit: (fit, None),
             "inflation": lambda problem, quadratic, active, effect: 1.0,
         }  # fmt: skip
         for name, stand_in in stand_ins.items():
@@ -156,7 +156,7 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "_is_white", lambda problem, fit: problem.white)
     monkeypatch.setattr(evidence, "converged", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "refined", lambda problem, fit: fit)
-    monkeypatch.setattr(evidence, "linearise", lambda problem, fit: (fit, [], nothing))
+    monkeypatch.setattr(evidence, "quadratic_at", lambda problem, fit: (fit, nothing))
     monkeypatch.setattr(evidence, "_is_doubtful", lambda problem, fit, quadratic, effect: True)
     monkeypatch.setattr(evidence, "weigh", removals)
     problem, fit, _, found = weighed(tables, Fit(active, {}, Noise({})))

@@ -963,6 +963,66 @@ def test_what_commands_explain_is_not_worth_a_fit(monkeypatch, gains):
     assert kept == (found[1:] if gains else found)
 
 
+def trial_worth(nats: float, gained: float) -> onset.Trial:
+    """A change that was fitted, and what it gained after its step."""
+    best = onset.Onset("servo_lag", Moment("a", 9.0), 9.0, 0.1, 0.1, nats)
+    return onset.Trial(None, best, gained)  # type: ignore[arg-type]
+
+
+def test_a_step_is_out_of_reach_where_it_lacks_more_than_can_be_made_up():
+    """600 nats; the best gained 50 after its step, and the other may so too."""
+    state = SimpleNamespace(fit=Fit((), {}, NOISE_OF_ALL, objective=1000.0))
+    for gained, step, out in (
+        (50.0, 1000.0, True), (50.0, 751.0, True), (50.0, 749.0, False), (250.0, 951.0, True),
+        (250.0, 949.0, False), (-80.0, 701.0, True), (-80.0, 699.0, False), (0.0, 100.0, False),
+    ):  # fmt: skip
+        best, fit = trial_worth(600.0, gained), Fit((), {}, NOISE_OF_ALL, objective=step)
+        assert best.is_out_of_reach(state, fit) == out, (gained, step)  # type: ignore[arg-type]
+
+
+def test_what_is_out_of_reach_could_not_have_become_the_best():
+    """But for more than MADE_UP beyond what the best gained: nats are what the likelihood gains, less a
+    price, over an inflation.
+    """
+    rng = np.random.default_rng(4)
+    for _ in range(2000):
+        nats, gained, step, more, price = rng.exponential([400.0, 60.0, 900.0, 200.0, 12.0])
+        state = SimpleNamespace(fit=Fit((), {}, NOISE_OF_ALL, objective=1000.0))
+        more = min(more, gained + onset.MADE_UP)
+        worth = (1000.0 - (step - more)) / rng.uniform(1.0, 3.0) - price
+        fit = Fit((), {}, NOISE_OF_ALL, objective=step)
+        if worth > nats:
+            assert not trial_worth(nats, gained).is_out_of_reach(state, fit)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("reach", [True, False])
+def test_a_step_out_of_reach_is_not_fitted_further(monkeypatch, reach):
+    """Neither is its moment looked for again, nor whether it grew."""
+    state, problem, trial, _ = weighed("begins", 1.0)
+    moment, looked = Moment("a", 9.0), []
+    candidate = onset.Scored("gyro_bias", 20.0, moment, {"gyro_bias.x": 0.01}, False, 20.0)
+    monkeypatch.setattr(onset, "beginning", lambda *given: problem)
+    monkeypatch.setattr(onset, "fitted", lambda of, fit, steps=3: replace(fit, objective=900.0))
+    monkeypatch.setattr(onset, "noise_fitted", lambda of, fit: fit)
+    monkeypatch.setattr(
+        onset, "_moved", lambda of, fit, effect: looked.append(effect) or (problem, None)
+    )
+
+    def grown(*given: Any) -> Any:
+        raise InterruptedError
+
+    monkeypatch.setattr(onset, "_grown", grown)
+    monkeypatch.setattr(onset.Trial, "is_out_of_reach", lambda self, of, step: not reach)
+    state.fit = trial
+    best = trial_worth(50.0, 0.0)
+    if reach:
+        with pytest.raises(InterruptedError):
+            onset._fitted(state, state, candidate, {}, best)
+    else:
+        assert onset._fitted(state, state, candidate, {}, best) is None
+    assert len(looked) == 1 + reach
+
+
 def test_a_cause_that_stands_may_change_for_less_than_a_name():
     state, *_ = weighed("changes", 1.0)
     assert onset._least(state, "gyro_bias") == SETTINGS.tie

@@ -45,7 +45,7 @@ class Made:
         return [SimpleNamespace(log_likelihood=-0.5 * away @ self.curvature @ away)]
 
     def linearise(
-        self, values: dict[str, float], noise: Noise, free: Any
+        self, values: dict[str, float], noise: Noise, free: Any, gains: bool = True
     ) -> tuple[Any, Linearised]:
         slope = self.curvature @ self.at(values) - self.beyond
         lin = Linearised(

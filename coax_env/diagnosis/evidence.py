@@ -11,7 +11,7 @@ where, alone, it was worth less than nothing.
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted, without
+from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_at, without
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.refinement import refined
@@ -82,7 +82,7 @@ def prune(
     while True:
         fit = refined(problem, converged(problem, fit))
         beside = problem if fit.active else problem.of_candidates(())  # for whom could they stand?
-        fit, _, quadratic = linearise(beside, fit)
+        fit, quadratic = quadratic_at(beside, fit)
         doubtful = [e for e in fit.active if _is_doubtful(problem, fit, quadratic, e)]
         rest = [e for e in fit.active if e not in doubtful and e not in clear]
         removals: dict[str, Removal] = {}

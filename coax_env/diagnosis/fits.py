@@ -19,7 +19,7 @@ from coax_env.estimation.helicopter_noise import (
 from coax_env.estimation.noise_levels import fit_noise, level_slopes
 from coax_env.estimation.parted_engine import AT, PartedEngine, joint_noise, of_part
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.state_space import Noise
+from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.model.effect_registry import GUST_MEMORY
 
 
@@ -48,6 +48,21 @@ def linearise(problem: Problem, fit: Fit) -> tuple[Fit, list[RunPass], Quadratic
     passes, lin = problem.engine.linearise(fit.values, fit.noise, everything)
     nats = objective(passes, problem.free(fit.active), fit.values)
     return replace(fit, objective=nats), passes, Quadratic.of(lin, everything, fit.values)
+
+
+def quadratic_at(
+    problem: Problem, fit: Fit, of: Sequence[FreeParameter] | None = None
+) -> tuple[Fit, Quadratic]:
+    """As `linearise`, of some parameters, for who needs no passes: a last fit may have left it.
+
+    Args:
+        problem, fit: what may be free, and where.
+        of: the parameters; default all that may be free.
+    """
+    of = problem.parameters if of is None else of
+    passes, lin = problem.engine.linearise(fit.values, fit.noise, of, gains=False)
+    nats = objective(passes, problem.free(fit.active), fit.values)
+    return replace(fit, objective=nats), Quadratic.of(lin, of, fit.values)
 
 
 def stepped(problem: Problem, fit: Fit, passes: Sequence[RunPass], quadratic: Quadratic) -> Fit:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coax_env.diagnosis.fits import converged, fitted, linearise, noise_fitted
+from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_at
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.changing_model import (
     BEGINS,
@@ -80,7 +80,7 @@ def growing(
     step = fitted(problem, noise_fitted(problem, step), steps=2)
 
     def judged(wider: Problem, fit: Fit) -> tuple[Problem, Fit, Growth]:
-        fit, _, quadratic = linearise(wider, fit)
+        fit, quadratic = quadratic_at(wider, fit, wider.free(fit.active))
         own = growth_at(wider, fit, quadratic, effect)
         price = math.log(width / own.width(problem.seconds))
         return wider, fit, replace(own, nats=step.objective - fit.objective - price)

@@ -34,7 +34,7 @@ def refined(problem: Problem, fit: Fit) -> Fit:
     names = [f.name for f in free]
     missing = np.zeros(len(names))  # of the slope with the gains held; it hardly changes on the way
     for count in range(chosen.most_refinements):
-        passes, lin = engine.linearise(fit.values, fit.noise, free)
+        passes, lin = engine.linearise(fit.values, fit.noise, free, gains=False)
         quadratic = Quadratic.of(lin, free, fit.values)
         if count == 0:
             fit = replace(fit, objective=objective(passes, free, fit.values))

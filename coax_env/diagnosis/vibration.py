@@ -21,6 +21,7 @@ first, segment by segment, and the search sees what is left.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -94,8 +95,8 @@ def taken_out(flight: Flight, lines: Sequence[Line]) -> Flight:
         for line in lines:
             for channel in (c for c in KINDS[line.kind] if c in measured):
                 values = measured[channel].copy()
-                for segment in _segments(run, channel, line.rotor, line.slip):
-                    values[segment.rows] -= segment.line()
+                for second, readings in _Turning(run, line.rotor, line.slip).segments(channel):
+                    values[second.rows] -= second.line(readings)
                 measured[channel] = values
         runs.append(replace(run, measured=measured))
     return replace(flight, runs=tuple(runs))
@@ -122,15 +123,14 @@ def without(vehicle: Vehicle) -> Vehicle:
 
 
 @dataclass(frozen=True)
-class _Segment:
-    """Readings of one channel over a second, with the azimuth of the rotor at their times.
+class _Second:
+    """Rows of a run, within a second, that a channel or several have readings at.
 
-    ahead: how much faster the other rotor turns [Hz].
+    t: their times, azimuth: of the rotor then. ahead: how much faster the other rotor turns [Hz].
     """
 
     rows: np.ndarray
     t: np.ndarray
-    y: np.ndarray
     azimuth: np.ndarray
     ahead: float
 
@@ -148,38 +148,65 @@ class _Segment:
     def _trend(self) -> np.ndarray:
         return np.vander(self.t / SEGMENT, TREND + 1)
 
-    def powers(self, beside: np.ndarray) -> np.ndarray:
-        """Sums of squares that waves beside the rotor's frequency explain beyond the trend, (f,)."""
+    @cached_property
+    def _beyond_trend(self) -> tuple[np.ndarray, np.ndarray]:
+        """Waves at the rotor's frequency and its NEIGHBOURS without their trend, (f, 2, n), and the
+        inverse of their products, (f, 2, 2).
+        """
         trend, _ = np.linalg.qr(self._trend())
-        waves = self._waves(beside)
+        waves = self._waves(np.array([0.0, *NEIGHBOURS]))
         waves -= (waves @ trend) @ trend.T
-        answer = waves @ self.y
-        inverse = np.linalg.pinv(waves @ waves.transpose(0, 2, 1), hermitian=True, rcond=1e-9)
+        products = waves @ waves.transpose(0, 2, 1)
+        return waves, np.linalg.pinv(products, hermitian=True, rcond=1e-9)
+
+    def powers(self, y: np.ndarray) -> np.ndarray:
+        """Sums of squares of readings (n,) that waves explain beyond the trend, (f,): at the rotor's
+        frequency, then at its NEIGHBOURS.
+        """
+        waves, inverse = self._beyond_trend
+        answer = waves @ y
         return np.einsum("fi,fij,fj->f", answer, inverse, answer)
 
-    def line(self) -> np.ndarray:
-        """The wave at the rotor's frequency itself, (n,)."""
+    def line(self, y: np.ndarray) -> np.ndarray:
+        """The wave at the rotor's frequency itself in readings, (n,)."""
         waves = self._waves(np.zeros(1))[0].T
-        fit = np.linalg.lstsq(np.column_stack([self._trend(), waves]), self.y, rcond=None)[0]
+        fit = np.linalg.lstsq(np.column_stack([self._trend(), waves]), y, rcond=None)[0]
         return waves @ fit[-2:]
 
 
-def _segments(run: Run, channel: str, rotor: str, slip: float = 1.0) -> Iterator[_Segment]:
-    speed, other = (slip * _speed(run, r) for r in (rotor, *(r for r in ROTORS if r != rotor)))
-    azimuth = np.concatenate([[0.0], np.cumsum(speed[:-1] * np.diff(run.t))])
-    values = run.measured[channel]
-    there = np.isfinite(values)
-    if channel in ANGLES:
-        values = _unwrapped(values, there)
-    which = np.floor((run.t - run.t[0]) / SEGMENT)
-    for k in np.unique(which):
-        rows = np.flatnonzero((which == k) & there)
-        if rows.size >= LEAST_SAMPLES:
-            ahead = float(np.median(other[rows] - speed[rows])) / (2.0 * np.pi)
-            t = run.t[rows] - run.t[rows[0]] - 0.5 * SEGMENT
-            segment = _Segment(rows, t, values[rows], azimuth[rows], ahead)
-            if channel in KINDS["amplitude"] or segment.resolved:
-                yield segment
+class _Turning:
+    """A run with a rotor's azimuth; channels that are read at the same rows share their seconds."""
+
+    def __init__(self, run: Run, rotor: str, slip: float) -> None:
+        self.run = run
+        self.speed, self.other = (
+            slip * _speed(run, r) for r in (rotor, *(r for r in ROTORS if r != rotor))
+        )
+        self.azimuth = np.concatenate([[0.0], np.cumsum(self.speed[:-1] * np.diff(run.t))])
+        self._seconds: dict[bytes, list[_Second]] = {}
+
+    def segments(self, channel: str) -> Iterator[tuple[_Second, np.ndarray]]:
+        """The seconds in which a channel can show a line, with its readings (n,)."""
+        values = self.run.measured[channel]
+        there = np.isfinite(values)
+        if channel in ANGLES:
+            values = _unwrapped(values, there)
+        at = there.tobytes()
+        if at not in self._seconds:
+            self._seconds[at] = list(self._seconds_of(there))
+        for second in self._seconds[at]:
+            if channel in KINDS["amplitude"] or second.resolved:
+                yield second, values[second.rows]
+
+    def _seconds_of(self, there: np.ndarray) -> Iterator[_Second]:
+        t = self.run.t
+        which = np.floor((t - t[0]) / SEGMENT)
+        for k in np.unique(which):
+            rows = np.flatnonzero((which == k) & there)
+            if rows.size >= LEAST_SAMPLES:
+                ahead = float(np.median(self.other[rows] - self.speed[rows])) / (2.0 * np.pi)
+                middle = t[rows[0]] + 0.5 * SEGMENT
+                yield _Second(rows, t[rows] - middle, self.azimuth[rows], ahead)
 
 
 def _unwrapped(values: np.ndarray, there: np.ndarray) -> np.ndarray:
@@ -220,14 +247,15 @@ def _line_at(flight: Flight, rotor: str, kind: str, slip: float) -> Line | None:
     squares: list[float] = []  # amplitude squared, by segment and axis
     by_run: dict[str, list[float]] = {run.name: [] for run in flight.runs}
     for run in flight.runs:
+        turning = _Turning(run, rotor, slip)
         for channel in (c for c in ratio if c in run.measured):
-            segments = list(_segments(run, channel, rotor, slip))
+            segments = list(turning.segments(channel))
             powers, level = _powers(segments)
             if level > 0.0:
                 ratio[channel] += [p / level for p in powers]
                 by_run[run.name] += [p / level for p in powers]
                 squares += [
-                    2.0 * (p - level) / s.t.size for p, s in zip(powers, segments, strict=True)
+                    2.0 * (p - level) / y.size for p, (_, y) in zip(powers, segments, strict=True)
                 ]
     if len(squares) < 2:
         return None
@@ -248,16 +276,16 @@ def _line_at(flight: Flight, rotor: str, kind: str, slip: float) -> Line | None:
     )
 
 
-def _powers(segments: Sequence[_Segment]) -> tuple[list[float], float]:
+def _powers(segments: Sequence[tuple[_Second, np.ndarray]]) -> tuple[list[float], float]:
     """Each segment's power at the rotor's own frequency, and the mean power beside it.
 
     Not where the other rotor's line is.
     """
     powers, beside = [], []
-    for segment in segments:
-        own, *rest = segment.powers(np.array([0.0, *NEIGHBOURS])).tolist()
+    for second, readings in segments:
+        own, *rest = second.powers(readings).tolist()
         powers.append(own)
-        beside += [p for f, p in zip(NEIGHBOURS, rest, strict=True) if abs(f - segment.ahead) > 1.0]
+        beside += [p for f, p in zip(NEIGHBOURS, rest, strict=True) if abs(f - second.ahead) > 1.0]
     return powers, float(np.mean(beside)) if beside else 0.0
 
 

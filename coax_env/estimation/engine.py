@@ -34,7 +34,9 @@ NONE_KEPT = frozen_gains.Kept(np.zeros((0, 0, 0), np.float32), np.zeros(0, np.in
 OF_GAINS = ("gains", "per_sigma", "H")  # what takes most of a pass' memory
 MANY_ROWS = 50_000
 """Rows, 500 s at 100 Hz, from which on what was freed goes back before a linearisation; ours."""
-REMEMBERED = 4  # passes at which something was linearised or a fit ended; ours
+REMEMBERED = (
+    4  # points at which something was linearised, a fit ended, or the noise was scored; ours
+)
 DIVERGED = 1e6  # whitened innovations [std] that only a diverging mean has
 
 
@@ -154,6 +156,23 @@ class NoiseScore:
     reading_expected: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Flown:
+    """What was flown at a point: the passes, without the rows' gains, and what was linearised there, in
+    `free`, if anything.
+    """
+
+    p: np.ndarray
+    noise: Noise
+    passes: list[RunPass]
+    free: tuple[FreeParameter, ...] = ()
+    lin: Linearised | None = None
+
+    def is_at(self, p: np.ndarray, noise: Noise) -> bool:
+        """Whether this is the point."""
+        return np.array_equal(self.p, p) and self.noise == noise
+
+
 class _Buffers:
     """Large arrays, filled anew by every pass: fresh memory would cost as much time as a pass."""
 
@@ -184,7 +203,8 @@ class Engine:
         self._refresh = [_rows_between_jacobians(dt) for dt in self.intervals]
         self._readings = [int((~np.isnan(r.z)).sum()) for r in self.records]
         self._buffers: list[_Buffers] = []  # that no thread works with
-        self._flown: deque[tuple[np.ndarray, Noise, list[RunPass]]] = deque(maxlen=REMEMBERED)
+        self._flown: deque[_Flown] = deque(maxlen=REMEMBERED)
+        self._scored: deque[tuple[np.ndarray, Noise, NoiseScore]] = deque(maxlen=REMEMBERED)
 
     def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
         """Work done on every run (or those in `which`), the longest first so that no thread waits."""
@@ -226,9 +246,9 @@ class Engine:
         """
         p = self.model.vector(values, noise)
         if not keep and which is None and start_rows is None:
-            for vector, of_noise, passes in tuple(self._flown):
-                if np.array_equal(vector, p) and of_noise == noise:
-                    return passes
+            for known in tuple(self._flown):
+                if known.is_at(p, noise):
+                    return known.passes
 
         def one(i: int) -> RunPass:
             starts = None if start_rows is None else start_rows[i]
@@ -245,15 +265,7 @@ class Engine:
         Args:
             values, noise: at which the passes were flown. passes: of every record.
         """
-        self._remember(self.model.vector(values, noise), noise, passes)
-
-    def _remember(self, p: np.ndarray, noise: Noise, passes: Sequence[RunPass]) -> None:
-        """Passes of all records, whose end others will ask for again; without their gains."""
-        bare = [
-            replace(run, **{name: np.empty_like(getattr(run, name)[:0]) for name in OF_GAINS})
-            for run in passes
-        ]
-        self._flown.append((p, noise, bare))
+        self._flown.append(_Flown(self.model.vector(values, noise), noise, _without_gains(passes)))
 
     def _reading_variances(self, noise: Noise) -> np.ndarray:
         return np.array([noise.reading.get(c, 1.0) for c in self.model.channels]) ** 2
@@ -325,7 +337,11 @@ class Engine:
         return float(sum(p.log_likelihood for p in self.filter(values, noise, which=which)))
 
     def linearise(
-        self, values: Mapping[str, float], noise: Noise, free: Sequence[FreeParameter]
+        self,
+        values: Mapping[str, float],
+        noise: Noise,
+        free: Sequence[FreeParameter],
+        gains: bool = True,
     ) -> tuple[list[RunPass], Linearised]:
         """Filter, then the derivatives of the innovations in every free parameter, gains frozen.
 
@@ -336,8 +352,12 @@ class Engine:
             values: of all parameters, by name.
             noise: levels of process and reading noise.
             free: the parameters to differentiate in.
+            gains: whether the passes must have theirs; what is remembered has none.
         """
         p = self.model.vector(values, noise)
+        for known in () if gains else tuple(self._flown):
+            if known.lin is not None and known.free == tuple(free) and known.is_at(p, noise):
+                return known.passes, known.lin
         moves = self._moves(values, noise, free)
         if sum(record.t.size for record in self.records) > MANY_ROWS:
             return_freed_memory()
@@ -357,14 +377,15 @@ class Engine:
     ) -> tuple[list[RunPass], Linearised]:
         """The passes, and the linearisations of all runs."""
         passes = [one.run for one in found]
-        self._remember(p, noise, passes)
-        return passes, Linearised(
+        lin = Linearised(
             tuple(f.name for f in free),
             np.array([one.information for one in found]),
             np.array([one.blocks.sum(0) for one in found]),
             np.array([one.by_channel for one in found]),
             np.concatenate([one.blocks for one in found]),
         )
+        self._flown.append(_Flown(p, noise, _without_gains(passes), tuple(free), lin))
+        return passes, lin
 
     def _linearise_run(
         self,
@@ -672,7 +693,7 @@ class Engine:
         """
         values = dict(values)
         names = [f.name for f in free]
-        passes, lin = self.linearise(values, noise, free)
+        passes, lin = self.linearise(values, noise, free, gains=False)
         converged = False
         count = 0
         for count in range(1, iterations + 1):
@@ -681,6 +702,8 @@ class Engine:
                 converged = True
                 break
             moves = dict(zip(names, step.tolist(), strict=True))
+            if not passes[0].gains.size:
+                passes = self.filter(values, noise, keep=True)
             values, gained = self.descend(passes, free, values, noise, moves)
             del passes  # gains of every row: gone before others are made
             if progress:
@@ -708,6 +731,9 @@ class Engine:
             noise: levels of process and reading noise.
         """
         p = self.model.vector(values, noise)
+        for vector, of_noise, score in tuple(self._scored):
+            if np.array_equal(vector, p) and of_noise == noise:
+                return score
         q, decay = self.model.process_noise(noise, p)
         places = self.compiled.noise_places
         nx, m = self.starts[0][0].size, len(self.model.channels)
@@ -731,7 +757,7 @@ class Engine:
             return run.log_likelihood, slopes
 
         log_likelihood, slopes = zip(*self._each(one), strict=True)
-        return NoiseScore(
+        score = NoiseScore(
             float(sum(log_likelihood)),
             np.concatenate([s.in_noise for s in slopes]),
             np.concatenate([s.in_decay for s in slopes]),
@@ -741,6 +767,16 @@ class Engine:
             np.array([s.start_expected for s in slopes]),
             np.sum([s.reading_expected for s in slopes], axis=0),
         )
+        self._scored.append((p, noise, score))
+        return score
+
+
+def _without_gains(passes: Sequence[RunPass]) -> list[RunPass]:
+    """Passes without what takes most of their memory."""
+    return [
+        replace(run, **{name: np.empty_like(getattr(run, name)[:0]) for name in OF_GAINS})
+        for run in passes
+    ]
 
 
 def objective(

@@ -43,7 +43,9 @@ def fit_noise(
         seconds: of flight that are enough: whole runs, evenly picked.
         progress: called with a line of text.
     """
-    picked = Engine(engine.model, _some(engine.records, seconds), engine.threads)
+    some = _some(engine.records, seconds)
+    whole = len(some) == len(engine.records)
+    picked = engine if whole else Engine(engine.model, some, engine.threads)
     first = _Point.at(picked, values, noise, levels)
     gains = first.predicted_gains()
     if gains.sum() < tolerance:

@@ -119,14 +119,18 @@ class PartedEngine(Engine):
             part.engine.remember(part.values(values), part.noise(noise), own)
 
     def linearise(
-        self, values: Mapping[str, float], noise: Noise, free: Sequence[FreeParameter]
+        self,
+        values: Mapping[str, float],
+        noise: Noise,
+        free: Sequence[FreeParameter],
+        gains: bool = True,
     ) -> tuple[list[RunPass], Linearised]:
         """As `Engine.linearise`, with joint values and noise."""
         passes: list[RunPass] = []
         found = []
         for part in self.parts:
             plain, columns = _plain_of(free, part.name)
-            own, lin = part.engine.linearise(part.values(values), part.noise(noise), plain)
+            own, lin = part.engine.linearise(part.values(values), part.noise(noise), plain, gains)
             passes += own
             found.append(_spread(lin, columns))
         names = tuple(f.name for f in free)
