@@ -429,6 +429,7 @@ def test_what_begins_in_flight_is_named_with_its_moment(tmp_path, later):
         if cause["effect"] in later:
             assert cause["since"]["run"] == "heave_3211"
             assert abs(cause["since"]["t"] - 6.0) <= max(3.0 * cause["since"]["std"], 0.05)
+            assert cause["since"]["grown"] is None
         else:
             assert cause["since"] is None
 
@@ -448,6 +449,7 @@ def test_what_stands_in_its_place_is_not_named(tmp_path, later):
     assert cause["effect"] in later
     assert cause["since"]["run"] == "lat_3211"
     assert abs(cause["since"]["t"] - 4.0) <= max(3.0 * cause["since"]["std"], 0.05)
+    assert cause["since"]["grown"] is None
 
 
 @pytest.mark.slow
@@ -774,6 +776,31 @@ def test_two_times_pay_as_one_that_is_as_rare():
     assert own.width(100.0) == pytest.approx(100.0 * share)
     assert replace(own, covariance=1e9 * np.eye(2)).width(100.0) == 100.0
     assert own.at_once() == 0.5 and replace(own, nats=2.0).at_once(2.0) == 1.0 / (1.0 + math.e)
+
+
+def test_growth_is_not_credited_with_what_a_step_would_gain_as_well(short, monkeypatch):
+    """Both are taken until nothing is gained: 15 nats beside a step that had ten to gain are five."""
+    problem, found = ambiguous(short, 0.0)
+    problem.settings, problem.seconds = SETTINGS, 8.0
+    gained = {"step": 10.0, "grows": 0.0}
+
+    def converged(of: Any, fit: Fit) -> Fit:
+        return replace(fit, objective=fit.objective - gained[fit.active[0]])
+
+    step, grows = (
+        Fit((e,), {}, NOISE_OF_ALL, nats) for e, nats in (("step", 100.0), ("grows", 85.0))
+    )
+    wider = SimpleNamespace(free=lambda active: [])
+    monkeypatch.setattr(growth, "_starts", lambda *given: [(wider, grows)])
+    monkeypatch.setattr(growth, "_about", lambda of, effect, own: of)
+    monkeypatch.setattr(growth, "noise_fitted", lambda of, fit: fit)
+    monkeypatch.setattr(growth, "fitted", lambda of, fit, steps: fit)
+    monkeypatch.setattr(growth, "converged", converged)
+    monkeypatch.setattr(growth, "quadratic_at", lambda of, fit, free: (fit, None))
+    monkeypatch.setattr(growth, "growth_at", lambda *given: found.growth)
+    width = found.growth.width(8.0)  # of a step that is known as well, and pays the same price
+    tried = growth.growing(problem, step, "gyro_bias", found.moment, width)
+    assert tried is not None and tried[2].nats == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize(("nats", "grows"), [(5.9, False), (6.1, True), (None, False)])

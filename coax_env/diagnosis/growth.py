@@ -93,6 +93,7 @@ def growing(
     wider, fit, own = max(tried, key=lambda t: t[2].nats)
     wider = _about(wider, effect, own)
     if own.nats > -problem.settings.tie:
+        step = converged(problem, step)  # or growth is credited with what a step would gain as well
         return judged(wider, converged(wider, fit))
     return wider, fit, own
 
