@@ -13,9 +13,13 @@ import pytest
 from causes import check_causes, truth_of
 from test_estimation import NOISE, TRUTH, Pendulum, prior, swing
 
-from coax_env.diagnosis import growth, onset
 from coax_env.diagnosis.diagnose import diagnose
-from coax_env.diagnosis.onset import Changing, _Table, rows_of
+from coax_env.diagnosis.onsets import changing as changes
+from coax_env.diagnosis.onsets import every_moment, growth, search
+from coax_env.diagnosis.onsets import moment as moments
+from coax_env.diagnosis.onsets import trial as trials
+from coax_env.diagnosis.onsets.changing import Changing
+from coax_env.diagnosis.onsets.every_moment import Table, rows_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.beginnings import Asked, Beginning
@@ -48,7 +52,7 @@ def all_of(k: int) -> Asked:
     return Asked(np.arange(k), np.repeat(np.arange(k), k), np.tile(np.arange(k), k))
 
 
-def known(found: _Table, record: int, slope, across, own=None) -> Beginning:
+def known(found: Table, record: int, slope, across, own=None) -> Beginning:
     """What a table takes of a beginning, of full matrices; own: as across where it is left out."""
     own = across if own is None else own
     return Beginning(record, 5, slope, across[:, found.rest], across[found.pairs], own[found.pairs])
@@ -159,7 +163,7 @@ def test_a_changes_worth_is_what_the_joint_quadratic_gains(least):
     both = np.vstack([always[rest], begins[own]])
     H, h = both @ both.T + 0.7 * np.eye(5), both @ e
     alone, pull = H[:3, :3], h[:3]
-    table = _Table(
+    table = Table(
         quadratic, [np.zeros((5, 5))], [np.zeros(5)], np.array(rest), np.linalg.inv(alone), pull,
         [np.array(own)], [np.zeros(2)], (np.array([3, 3, 4, 4]), np.array([3, 4, 3, 4])),
         np.array([0, 2, 1, 3]),
@@ -246,8 +250,8 @@ def test_what_changes_has_numbers_before_and_what_begins_has_none(short):
     runs = clock_of(records)
     made = Problem.of(model, records, ("swash_offset", "gyro_bias", "wind"))
     fit = Fit(("swash_offset",), model.bare_values, noise)
-    made = onset.beginning(made, fit, {"wind": first}, runs)
-    begun = onset.beginning(made, fit, {"swash_offset": second, "gyro_bias": second}, runs)
+    made = changes.beginning(made, fit, {"wind": first}, runs)
+    begun = changes.beginning(made, fit, {"swash_offset": second, "gyro_bias": second}, runs)
     names = [f.name for f in begun.own["swash_offset"]]
     plain = ["swash_offset.lon", "swash_offset.lat"]
     assert names == [*plain, *(of_part(n, BEFORE) for n in plain)]
@@ -256,7 +260,7 @@ def test_what_changes_has_numbers_before_and_what_begins_has_none(short):
     assert [(f.value, f.std) for f in own[2:]] == [(f.value, f.std) for f in own[:2]]
     assert begun.model.moments == {"wind": first, "swash_offset": second, "gyro_bias": second}
     assert begun.engine.records == made.engine.records and begun.engine.model is begun.model
-    again = onset.beginning(begun, fit, {"swash_offset": first}, runs)
+    again = changes.beginning(begun, fit, {"swash_offset": first}, runs)
     assert again.own["swash_offset"] == own, "its numbers before are there already"
 
 
@@ -536,11 +540,11 @@ def table(at: dict[str, float], slope: np.ndarray):
     values = {f.name: f.value + at.get(f.name, 0.0) * f.std for f in free}
     quadratic = Quadratic.of(lin, free, values)
     state = Changing(problem, Fit((), values, NOISE_OF_ALL), quadratic, {})
-    found = _Table.of(state, {e: [f.name for f in own[e]] for e in own})
+    found = Table.of(state, {e: [f.name for f in own[e]] for e in own})
     return found, quadratic, std
 
 
-def worths(found: _Table, there: Beginning, ends: bool = False) -> list[tuple[float, np.ndarray]]:
+def worths(found: Table, there: Beginning, ends: bool = False) -> list[tuple[float, np.ndarray]]:
     """What a change of each effect there is worth, or its end, and how its numbers move."""
     rows = [np.array([part]) for part in found.row_of(there)]
     of_form = found.ended(*rows) if ends else rows[:2]
@@ -617,7 +621,7 @@ def test_a_change_stays_within_what_physics_gives():
 
 def test_what_lies_behind_a_run_is_the_sum_of_the_later_ones():
     parts = np.array([[1.0, 2.0], [3.0, 5.0], [7.0, 11.0]])
-    np.testing.assert_allclose(onset._behind(parts), [[10.0, 16.0], [7.0, 11.0], [0.0, 0.0]])
+    np.testing.assert_allclose(every_moment._behind(parts), [[10.0, 16.0], [7.0, 11.0], [0.0, 0.0]])
 
 
 def flown(t: np.ndarray, e: float, whole: str):
@@ -631,11 +635,11 @@ def test_what_a_gust_may_have_made_counts_for_nothing():
     t = 20.0 + 0.1 * np.arange(100)
     without = [flown(t, 3.0, "a"), flown(t, 2.0, "b")]
     with_it = [flown(t, 1.0, "a"), flown(t, 1.0, "b")]
-    found = onset._lasting(without, with_it, Moment("b", 25.04))
+    found = trials._lasting(without, with_it, Moment("b", 25.04))
     rows = 100 - 20  # 24.6 to 26.5 s are left out
     assert found == pytest.approx(0.5 * 2 * (100 * (9.0 - 1.0) + rows * (4.0 - 1.0)))
     with_it[0].innovations[7, 1] = np.nan
-    assert onset._lasting(without, with_it, Moment("b", 25.04)) == pytest.approx(found - 4.0)
+    assert trials._lasting(without, with_it, Moment("b", 25.04)) == pytest.approx(found - 4.0)
 
 
 def test_a_change_matters_from_its_smallest_size_on():
@@ -647,10 +651,10 @@ def test_a_change_matters_from_its_smallest_size_on():
     off = {"gyro_bias.x": 0.0, "gyro_bias.z": 0.0}
     for change, matters in ((1.01, True), (-1.01, True), (0.99, False), (-0.99, False)):
         fit = Fit((), {**off, name: change * p.smallest}, NOISE_OF_ALL)
-        assert onset._matters(problem, fit, "gyro_bias") == matters
+        assert trials._matters(problem, fit, "gyro_bias") == matters
         was = {of_part(n, BEFORE): 0.0 for n in off} | {of_part(name, BEFORE): 5.0 * p.smallest}
         moved = fit.at({name: (5.0 + change) * p.smallest, **was})
-        assert onset._matters(problem, moved, "gyro_bias") == matters
+        assert trials._matters(problem, moved, "gyro_bias") == matters
 
 
 @pytest.fixture
@@ -672,9 +676,9 @@ def profile(monkeypatch):
                 asked.append(self.t)
                 return float(nats(self.t))
 
-        monkeypatch.setattr(onset, "ChangingModel", Model)
+        monkeypatch.setattr(moments, "ChangingModel", Model)
         monkeypatch.setattr(growth, "ChangingModel", Model)
-        monkeypatch.setattr(onset, "Engine", Likelihood)
+        monkeypatch.setattr(moments, "Engine", Likelihood)
         half = t.size // 2
         records = [SimpleNamespace(whole=w, t=own)
                    for w, own in (("a", t), ("b", t[:half]), ("b", t[half:]))]  # fmt: skip
@@ -690,13 +694,13 @@ def test_the_interval_of_a_moment_is_its_posteriors(profile, inflation):
     of, asked = profile
     t, best, std = 30.0 + 0.01 * np.arange(900), 33.613, 0.08
     problem = of(lambda s: -0.5 * ((s - best) / std) ** 2 - 700.0, t, 33.3)
-    found = onset.moment_of(problem, Fit((), {}, NOISE_OF_ALL), "wind", inflation)
+    found = moments.moment_of(problem, Fit((), {}, NOISE_OF_ALL), "wind", inflation)
     wide = math.sqrt(inflation) * std
     assert found.moment == Moment("b", pytest.approx(33.61)) and found.effect == "wind"
     assert found.t == pytest.approx(best, abs=0.003)
     assert found.std == pytest.approx(math.hypot(wide, 0.01), rel=0.01)
     assert found.width == pytest.approx(math.sqrt(2.0 * math.pi) * wide, rel=0.01)
-    assert len([s for s in asked if abs(s - 33.3) > 1.0 + 1e-9]) <= onset.AFAR
+    assert len([s for s in asked if abs(s - 33.3) > 1.0 + 1e-9]) <= moments.AFAR
     assert found.entry() == {"run": "b", "t": found.t, "std": found.std, "at_once": 1.0,
                              "grown": None}  # fmt: skip
 
@@ -710,7 +714,7 @@ def ambiguous(short, nats: float):
     covariance = np.array([[0.09, 0.03], [0.03, 0.16]])
     times = there.time(moment) - 1.0, there.time(moment) + 0.5
     own = growth.Growth(*times, covariance, nats)
-    found = onset.Onset("gyro_bias", moment, 2.0, 0.1, 0.25, 20.0, own)
+    found = changes.Onset("gyro_bias", moment, 2.0, 0.1, 0.25, 20.0, own)
     return problem, found
 
 
@@ -718,19 +722,19 @@ def ambiguous(short, nats: float):
 def test_where_a_step_may_be_growth_its_interval_has_both(short, inflation):
     """The mixture of both, as likely as the evidence has them; all of the step where it is clear."""
     problem, found = ambiguous(short, 0.0)
-    mixed = onset._as_step(problem, found, inflation)
+    mixed = moments._as_step(problem, found, inflation)
     both = [2.0, 1.0], [0.1**2, inflation * 0.09]
     assert mixed.at_once == 0.5 and mixed.t == pytest.approx(np.mean(both[0]))
     expected = np.mean(both[1]) + np.var(both[0])
     assert mixed.std == pytest.approx(math.sqrt(expected)) and mixed.grown is None
-    clear = onset._as_step(problem, replace(found, growth=replace(found.growth, nats=-60.0)))
+    clear = moments._as_step(problem, replace(found, growth=replace(found.growth, nats=-60.0)))
     assert (clear.t, clear.std) == (pytest.approx(2.0), pytest.approx(0.1))
     assert clear.entry()["at_once"] == 1.0 and clear.entry()["grown"] is None
 
 
 def test_what_grows_says_from_when_to_when(short):
     problem, found = ambiguous(short, 7.5)
-    grows = onset._as_growth(problem, found)
+    grows = moments._as_growth(problem, found)
     run = found.moment.run
     assert grows.moment == Moment(run, pytest.approx(1.0), pytest.approx(1.5))
     entry = grows.entry()
@@ -811,8 +815,8 @@ def test_it_is_said_to_grow_where_that_is_worth_more_than_a_tie(short, monkeypat
     step, other = Fit((), {}, NOISE_OF_ALL), Fit(("gyro_bias",), {}, NOISE_OF_ALL)
     wider = SimpleNamespace(model=problem.model, with_model=lambda model: model)
     tried = None if nats is None else (wider, other, own)
-    monkeypatch.setattr(onset, "growing", lambda *given: tried)
-    then, fit, said = onset._grown(problem, step, found)
+    monkeypatch.setattr(moments, "growing", lambda *given: tried)
+    then, fit, said = moments.grown_or_step(problem, step, found)
     assert (said.grown is not None) == grows and fit is (other if grows else step)
     if grows:
         assert then.moments["gyro_bias"] == said.moment and said.width == own.width(8.0)
@@ -828,13 +832,13 @@ def test_a_moments_likelihood_is_asked_where_it_has_a_share(profile):
     problem = of(lambda s: -50.0 * abs(s - 5.037) / 0.1, t, 5.0)
     records = problem.engine.records[1:]
     near = t[400:601]
-    found = onset._profile(problem, Fit((), {}, NOISE_OF_ALL), "wind", records, near)
+    found = moments._profile(problem, Fit((), {}, NOISE_OF_ALL), "wind", records, near)
     exact = -50.0 * np.abs(near - 5.037) / 0.1
     close = exact > -9.0
     np.testing.assert_allclose(found[close], exact[close], atol=1e-9)
     assert int(np.argmax(found)) == int(np.argmax(exact))
     far = [s for s in asked if abs(s - 5.037) > 0.15]
-    assert len(far) <= 20 + onset.AFAR and len(asked) < 45 + onset.AFAR
+    assert len(far) <= 20 + moments.AFAR and len(asked) < 45 + moments.AFAR
 
 
 def test_where_runs_are_short_all_of_the_flown_time_is_asked_for():
@@ -854,8 +858,8 @@ def test_a_models_cost_is_its_objective_and_occams_factor():
     problem = Problem(model, None, (mass,), own)
     fit = Fit(("yaw_damping",), {}, NOISE_OF_ALL, objective=80.0)
     expected = 80.0 + q.occam(["yaw_damping.coefficient"], ["mass"])
-    assert onset._cost(problem, fit, q) == pytest.approx(expected)
-    assert onset._cost(problem, replace(fit, active=()), q) == 80.0
+    assert search._cost(problem, fit, q) == pytest.approx(expected)
+    assert search._cost(problem, replace(fit, active=()), q) == 80.0
 
 
 def weighed(form: str, inflation: float):
@@ -893,23 +897,23 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, form, inf
     paid for. None is worth anything that a gust made, that is small, or where channels stay coloured.
     """
     made = {"lasting": 12.1, "matters": True, "white": True}
-    monkeypatch.setattr(onset, "_lasting", lambda without, with_it, moment: made["lasting"])
-    monkeypatch.setattr(onset, "_matters", lambda problem, fit, effect: made["matters"])
-    monkeypatch.setattr(onset, "channels_of", lambda *given: ["p"])
+    monkeypatch.setattr(trials, "_lasting", lambda without, with_it, moment: made["lasting"])
+    monkeypatch.setattr(trials, "_matters", lambda problem, fit, effect: made["matters"])
+    monkeypatch.setattr(trials, "channels_of", lambda *given: ["p"])
     monkeypatch.setattr(
-        onset, "whiteness", lambda passes, channels: {
+        trials, "whiteness", lambda passes, channels: {
             "p": SimpleNamespace(white=made["white"]), "q": SimpleNamespace(white=False)}
     )  # fmt: skip
     state, problem, trial, quadratic = weighed(form, inflation)
-    found = onset.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
+    found = changes.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
     of_moment = math.log(100.0 / 2.0)
 
     def worth(always: float = 900.0, same: float = 160.0) -> float:
-        rivals = onset.Rivals(
+        rivals = trials.Rivals(
             replace(state.fit, objective=same),
             None if form == "changes" else replace(trial, objective=always),
         )
-        return onset._worth(state, problem, trial, rivals, quadratic, found).nats  # type: ignore[arg-type]
+        return trials._worth(state, problem, trial, rivals, quadratic, found).nats  # type: ignore[arg-type]
 
     expected = 60.0 / inflation - (10.0 if form == "ends" else 5.0) - of_moment
     assert worth() == pytest.approx(expected)
@@ -950,29 +954,32 @@ def test_what_may_decide_is_refitted_until_nothing_is_gained(monkeypatch, same, 
         assert not begun or fit.values["gyro_bias.x"] == 0.01
         return replace(fit, objective=131.0 if begun else same)
 
-    monkeypatch.setattr(onset, "fitted", fitted)
-    monkeypatch.setattr(onset, "noise_fitted", lambda of, fit: fit)
+    monkeypatch.setattr(trials, "fitted", fitted)
+    monkeypatch.setattr(trials, "noise_fitted", lambda of, fit: fit)
     monkeypatch.setattr(
-        onset, "converged", lambda of, fit: replace(fit, objective=fit.objective - 7.0)
+        trials, "converged", lambda of, fit: replace(fit, objective=fit.objective - 7.0)
     )
-    after, rivals = onset._compared(state, problem, trial, "gyro_bias")
+    after, rivals = trials._compared(state, problem, trial, "gyro_bias")
     less = 7.0 if closer else 0.0
     assert after.objective == 100.0 - less and rivals.same.objective == same - less
     assert (rivals.always is None) == was_there
     assert was_there or rivals.always.objective == 131.0 - less
     state.fit = replace(state.fit, objective=90.0)  # better without another noise
-    assert onset._compared(state, problem, trial, "gyro_bias")[1].same is state.fit
+    assert trials._compared(state, problem, trial, "gyro_bias")[1].same is state.fit
 
 
-def scores(**worth: tuple[float, float]) -> list[onset.Scored]:
+def scores(**worth: tuple[float, float]) -> list[every_moment.Scored]:
     """Changes with what each is worth, and worth beside a constant cause of its name."""
     moment = Moment("a", 9.0)
-    return [onset.Scored(e, nats, moment, {}, False, beside) for e, (nats, beside) in worth.items()]
+    return [
+        every_moment.Scored(e, nats, moment, {}, False, beside)
+        for e, (nats, beside) in worth.items()
+    ]
 
 
 def test_what_a_constant_cause_does_as_well_is_not_worth_a_fit():
     found = scores(wind=(7.1, 3.1), servo_lag=(6.9, 6.9), cg_offset=(60.0, 2.9))
-    assert [s.effect for s in onset._standing(found, SETTINGS)] == ["wind"]
+    assert [s.effect for s in search._standing(found, SETTINGS)] == ["wind"]
 
 
 @pytest.mark.parametrize("gains", [True, False])
@@ -980,20 +987,20 @@ def test_what_commands_explain_is_not_worth_a_fit(monkeypatch, gains):
     """Asked again with their gains where they carry something on the gusts."""
     found = scores(servo_delay=(27.9, 17.7), swash_gain=(20.0, 20.0))
     with_gains = scores(swash_gain=(8.0, 8.0), rate_damping=(9.0, 9.0), servo_delay=(0.1, 0.1))
-    monkeypatch.setattr(onset, "with_command_gains", lambda p, fit, coloured: (p, fit))
-    monkeypatch.setattr(onset, "has_command_gains", lambda p: gains)
-    monkeypatch.setattr(onset, "linearise", lambda p, fit: (fit, [], None))
-    monkeypatch.setattr(onset, "scored", lambda state: (state, with_gains))
+    monkeypatch.setattr(search, "with_command_gains", lambda p, fit, coloured: (p, fit))
+    monkeypatch.setattr(search, "has_command_gains", lambda p: gains)
+    monkeypatch.setattr(search, "linearise", lambda p, fit: (fit, [], None))
+    monkeypatch.setattr(search, "scored", lambda state: (state, with_gains))
     fit = Fit((), {}, NOISE_OF_ALL)
     steady = Changing(SimpleNamespace(settings=SETTINGS), fit, None, {})  # type: ignore[arg-type]
-    kept = onset._beside_commands(steady, found)
+    kept = search._beside_commands(steady, found)
     assert kept == (found[1:] if gains else found)
 
 
-def trial_worth(nats: float, gained: float) -> onset.Trial:
+def trial_worth(nats: float, gained: float) -> trials.Trial:
     """A change that was fitted, and what it gained after its step."""
-    best = onset.Onset("servo_lag", Moment("a", 9.0), 9.0, 0.1, 0.1, nats)
-    return onset.Trial(None, best, gained)  # type: ignore[arg-type]
+    best = changes.Onset("servo_lag", Moment("a", 9.0), 9.0, 0.1, 0.1, nats)
+    return trials.Trial(None, best, gained)  # type: ignore[arg-type]
 
 
 def test_a_step_is_out_of_reach_where_it_lacks_more_than_can_be_made_up():
@@ -1015,7 +1022,7 @@ def test_what_is_out_of_reach_could_not_have_become_the_best():
     for _ in range(2000):
         nats, gained, step, more, price = rng.exponential([400.0, 60.0, 900.0, 200.0, 12.0])
         state = SimpleNamespace(fit=Fit((), {}, NOISE_OF_ALL, objective=1000.0))
-        more = min(more, gained + onset.MADE_UP)
+        more = min(more, gained + trials.MADE_UP)
         worth = (1000.0 - (step - more)) / rng.uniform(1.0, 3.0) - price
         fit = Fit((), {}, NOISE_OF_ALL, objective=step)
         if worth > nats:
@@ -1027,30 +1034,30 @@ def test_a_step_out_of_reach_is_not_fitted_further(monkeypatch, reach):
     """Neither is its moment looked for again, nor whether it grew."""
     state, problem, trial, _ = weighed("begins", 1.0)
     moment, looked = Moment("a", 9.0), []
-    candidate = onset.Scored("gyro_bias", 20.0, moment, {"gyro_bias.x": 0.01}, False, 20.0)
-    monkeypatch.setattr(onset, "beginning", lambda *given: problem)
-    monkeypatch.setattr(onset, "fitted", lambda of, fit, steps=3: replace(fit, objective=900.0))
-    monkeypatch.setattr(onset, "noise_fitted", lambda of, fit: fit)
+    candidate = every_moment.Scored("gyro_bias", 20.0, moment, {"gyro_bias.x": 0.01}, False, 20.0)
+    monkeypatch.setattr(trials, "beginning", lambda *given: problem)
+    monkeypatch.setattr(trials, "fitted", lambda of, fit, steps=3: replace(fit, objective=900.0))
+    monkeypatch.setattr(trials, "noise_fitted", lambda of, fit: fit)
     monkeypatch.setattr(
-        onset, "_moved", lambda of, fit, effect: looked.append(effect) or (problem, None)
+        trials, "moved_to_best", lambda of, fit, effect: looked.append(effect) or (problem, None)
     )
 
     def grown(*given: Any) -> Any:
         raise InterruptedError
 
-    monkeypatch.setattr(onset, "_grown", grown)
-    monkeypatch.setattr(onset.Trial, "is_out_of_reach", lambda self, of, step: not reach)
+    monkeypatch.setattr(trials, "grown_or_step", grown)
+    monkeypatch.setattr(trials.Trial, "is_out_of_reach", lambda self, of, step: not reach)
     state.fit = trial
     best = trial_worth(50.0, 0.0)
     if reach:
         with pytest.raises(InterruptedError):
-            onset._fitted(state, state, candidate, {}, best)
+            trials.fitted_change(state, state, candidate, {}, best)
     else:
-        assert onset._fitted(state, state, candidate, {}, best) is None
+        assert trials.fitted_change(state, state, candidate, {}, best) is None
     assert len(looked) == 1 + reach
 
 
 def test_a_cause_that_stands_may_change_for_less_than_a_name():
     state, *_ = weighed("changes", 1.0)
-    assert onset._least(state, "gyro_bias") == SETTINGS.tie
-    assert onset._least(state, "servo_lag") == SETTINGS.evidence
+    assert search._least(state, "gyro_bias") == SETTINGS.tie
+    assert search._least(state, "servo_lag") == SETTINGS.evidence

@@ -34,7 +34,8 @@ from coax_env.diagnosis.input_innovations import (
     with_input_innovations,
 )
 from coax_env.diagnosis.model_check import model_check
-from coax_env.diagnosis.onset import beside_onsets, moments_of, with_onsets
+from coax_env.diagnosis.onsets.moment import moments_of
+from coax_env.diagnosis.onsets.search import beside_onsets, with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import (
     held_out_before,

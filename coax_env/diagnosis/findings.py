@@ -8,7 +8,7 @@ import numpy as np
 
 from coax_env.diagnosis.confounding import Alternatives, channels_of
 from coax_env.diagnosis.evidence import Evidence
-from coax_env.diagnosis.onset import Onset
+from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.trust import Trust, of_line
 from coax_env.diagnosis.vibration import Line

@@ -77,6 +77,7 @@ OWN: dict[str, tuple[str, ...]] = {
         "tests/test_run_estimates.py", "tests/test_identification.py", "tests/test_two_step.py",
     ),
     "coax_env/comparison/two_logs/*": ("tests/test_changes.py", "tests/test_edits.py"),
+    "coax_env/diagnosis/onsets/*": ("tests/test_onset.py",),
     "coax_env/diagnosis/gain.py": ("tests/test_gain.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/trust.py": ("tests/test_trust.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/replication.py": (

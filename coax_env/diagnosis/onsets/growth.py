@@ -104,7 +104,7 @@ def _starts(problem: Problem, step: Fit, effect: str, moment: Moment) -> list[tu
     Args:
         problem, step: with the change at once, fitted. effect, moment: that changes, and when.
     """
-    last, middle = _last(problem), changing(problem).time(moment)
+    last, middle = _last(problem), changing_model(problem).time(moment)
     least = problem.engine.log_likelihood(step.values, step.noise) - WORSE
     found = []
     for length in LENGTHS:
@@ -125,7 +125,7 @@ def _about(wider: Problem, effect: str, own: Growth) -> Problem:
 
 def _last(problem: Problem) -> float:
     """Time of the last row that is fitted [s of the clock]."""
-    model = changing(problem)
+    model = changing_model(problem)
     return max(float(model.times(record)[-1]) for record in problem.engine.records)
 
 
@@ -146,7 +146,7 @@ def growth_at(
     free = problem.free_names(fit.active)
     covariance = replace(quadratic, precision=precision).covariance(free)
     places = [free.index(name) for name in own]
-    times = changing(problem).spans(fit.values)[effect]
+    times = changing_model(problem).spans(fit.values)[effect]
     return Growth(*times, covariance[np.ix_(places, places)], nats)
 
 
@@ -206,12 +206,12 @@ def with_moment(problem: Problem, effect: str, moment: Moment) -> Problem:
     Args:
         problem: in which it changes. effect, moment: that changes, and when.
     """
-    model = changing(problem)
+    model = changing_model(problem)
     moments = {**model.moments, effect: moment}
     return problem.with_model(ChangingModel(model.base, moments, model.clock))
 
 
-def changing(problem: Problem) -> ChangingModel:
+def changing_model(problem: Problem) -> ChangingModel:
     """The model of a problem in which something changes."""
     assert isinstance(problem.model, ChangingModel)
     return problem.model

@@ -1,0 +1,163 @@
+"""Does a cause begin, or change, while the machine flies? Its moment, with interval and worth.
+
+A change at every moment is scored at once, at the gains of the filter without it (a generalised
+likelihood ratio; Willsky and Jones 1976; Basseville and Nikiforov 1993, ch. 7; beginnings.py).
+What stands out is fitted, noise levels too, at the moment that the likelihood itself prefers, and must
+pay: for its numbers by their Occam factor, and for its moment, which could have been any, by the share
+of the flown time that the data leave for it. No change is preferred to one that pays less than the
+evidence of a name, a cause that was always there to one that pays less than a tie beside it. A gust
+that is over within a second is no change.
+
+What comes may come at once or grow evenly to its size. It is said to grow where that is worth more than
+a tie beside a step; where it is not worth that, the interval of the moment has both in it (growth.py).
+
+Changes last to the end of the last run: the machine is what it is then. Where one is found, causes are
+searched for again beside it: without it, others may have stood in its place.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from coax_env.diagnosis.confounding import alternatives
+from coax_env.diagnosis.evidence import Evidence
+from coax_env.diagnosis.fits import fitted, linearise, without_drifts
+from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
+from coax_env.diagnosis.onsets.changing import Changing, Onset, beginning, may_begin
+from coax_env.diagnosis.onsets.every_moment import Scored, scored
+from coax_env.diagnosis.onsets.growth import changing_model
+from coax_env.diagnosis.onsets.trial import fitted_change
+from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
+from coax_env.diagnosis.search import search
+from coax_env.diagnosis.settings import Settings
+from coax_env.estimation.changing_model import Lap
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.whiteness import Whiteness
+
+MOST_ONSETS = 2
+"""Changes that are looked for, one after the other; ours, a bound on time."""
+
+
+def with_onsets(
+    problem: Problem, fit: Fit, quadratic: Quadratic, bare: Fit, clock: Mapping[str, Lap]
+) -> Changing:
+    """The model with what begins or changes in flight, where that pays; as it is where nothing does.
+
+    Args:
+        problem, fit: after the search.
+        quadratic: linearised at the fit.
+        bare: the fit without any cause, from which a search begins again.
+        clock: of all runs in the order in which they were flown.
+    """
+    state = Changing(problem, fit, quadratic, {})
+    for _ in range(MOST_ONSETS):
+        problem.report("asking whether something began in flight")
+        found = _next(state, clock)
+        if found is None:
+            break
+        trial, onset = found
+        problem.report(f"{onset.effect} since {onset.t:.2f} s of {onset.moment.run}:"
+                       f" {onset.nats:.1f} nats")  # fmt: skip
+        after = _searched_again(trial, bare, {**state.onsets, onset.effect: onset})
+        if onset.effect not in after.onsets:
+            break  # it was another cause's work
+        if not set(after.onsets) >= set(state.onsets) and _cost_of(state) < _cost_of(after):
+            break  # it would stand in an earlier one's place, and do worse
+        state = after
+    return state
+
+
+def _next(state: Changing, clock: Mapping[str, Lap]) -> tuple[Changing, Onset] | None:
+    """The change that is worth most once fitted, where it pays."""
+    chosen = state.problem.settings
+    best = None
+    steady, found = scored(replace(state, fit=without_drifts(state.fit)))
+    near = _standing(found, chosen)
+    if near and near[0].nats < chosen.clear_evidence * chosen.evidence:
+        near = _beside_commands(steady, near)
+    for candidate in near[: chosen.most_trials]:
+        trial = fitted_change(state, steady, candidate, clock, best)
+        if trial is None:
+            continue
+        onset = trial.onset
+        worth = f"{onset.nats:.1f} nats" if math.isfinite(onset.nats) else "does not hold"
+        state.problem.report(f"{onset.effect} since {onset.t:.2f} s: {worth}, fitted")
+        if onset.nats > (best.onset.nats if best else _least(state, onset.effect)):
+            best = trial
+    return (best.state, best.onset) if best else None
+
+
+def _standing(found: Sequence[Scored], chosen: Settings) -> list[Scored]:
+    """Those that are worth a fit: beside no change, and beside a cause that was always there."""
+    least, tie = chosen.trial_share * chosen.evidence, chosen.trial_share * chosen.tie
+    return [s for s in found if s.nats > least and s.beside > tie]
+
+
+def _beside_commands(steady: Changing, near: Sequence[Scored]) -> list[Scored]:
+    """Those that stand where commands show the gusts, too.
+
+    A pilot who flies gusts out looks like a servo that gets late (input_innovations.py).
+    """
+    wider, fit = with_command_gains(steady.problem, steady.fit, coloured=True)
+    if not has_command_gains(wider):
+        return list(near)
+    _, again = scored(replace(steady, problem=wider, fit=fit))
+    stand = {s.effect for s in _standing(again, steady.problem.settings)}
+    return [s for s in near if s.effect in stand]
+
+
+def _least(state: Changing, effect: str) -> float:
+    """nats that a change is worth at least: as a name, or beside one that stands already, a tie."""
+    chosen = state.problem.settings
+    return chosen.tie if effect in state.fit.active else chosen.evidence
+
+
+def _searched_again(trial: Changing, bare: Fit, onsets: Mapping[str, Onset]) -> Changing:
+    """Causes searched for beside a change: from those that there are, and from none; the better."""
+    problem = trial.problem
+    begun = [trial.fit]
+    if set(trial.fit.active) > set(onsets):
+        own = {n: v for n, v in trial.fit.values.items() if n.partition(".")[0] in onsets}
+        alone = replace(bare.at(own), active=tuple(onsets), noise=trial.fit.noise,
+                        levels=trial.fit.levels)  # fmt: skip
+        begun.append(fitted(problem, alone))
+    ended = [search(problem, fit) for fit in begun]
+    fit, quadratic = min(ended, key=lambda e: _cost(problem, *e))
+    kept = {e: onset for e, onset in onsets.items() if e in fit.active}
+    return Changing(problem, fit, quadratic, kept)
+
+
+def _cost_of(state: Changing) -> float:
+    return _cost(state.problem, state.fit, state.quadratic)
+
+
+def _cost(problem: Problem, fit: Fit, quadratic: Quadratic) -> float:
+    """Minus the log evidence of a model, to second order [nats]."""
+    own = [n for e in fit.active for n in problem.acting_names(e)]
+    return fit.objective + (quadratic.occam(own, problem.base_names(fit.active)) if own else 0.0)
+
+
+def beside_onsets(
+    problem: Problem,
+    fit: Fit,
+    evidence: Mapping[str, Evidence],
+    white: Mapping[str, Whiteness],
+    onsets: Mapping[str, Onset],
+) -> dict[str, dict[str, Fit]]:
+    """The confounded alternatives of causes that began or changed: effects that begin when they do.
+
+    Args:
+        problem, fit: with the causes.
+        evidence: of each cause.
+        white: whiteness of the innovations, by channel.
+        onsets: of causes that began or changed.
+    """
+    found: dict[str, dict[str, Fit]] = {}
+    for effect, onset in onsets.items():
+        others = [e for e in may_begin(problem, fit, onsets) if e not in fit.active]
+        others += [e for e in exclusive_with(effect) if e in problem.candidates]
+        moments = {e: onset.moment for e in others if e not in fit.active}
+        then = beginning(problem, fit, moments, changing_model(problem).clock)
+        there, _, quadratic = linearise(then, fit)
+        found |= alternatives(then, there, quadratic, evidence, white, [effect])
+    return found
