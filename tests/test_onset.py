@@ -773,6 +773,14 @@ def test_the_interval_of_growth_is_that_of_its_likelihoods_profile(short, monkey
     assert said.nats == 30.0 / inflation
 
 
+def test_a_profile_that_falls_from_its_end_has_the_spread_of_that_fall():
+    """A nat for each second, asked every ten: the exponential law, not the one point that is best."""
+    begins = np.array([20.0, 0.0, 10.0])
+    mean, covariance = growth._moments(np.column_stack([begins, 100.0 - 2.0 * begins]), -begins)
+    assert mean == pytest.approx([1.0, 98.0], abs=0.03)
+    assert covariance == pytest.approx(np.array([[1.0, -2.0], [-2.0, 4.0]]), abs=0.1)
+
+
 def test_two_times_pay_as_one_that_is_as_rare():
     """A normal posterior's area over that of all pairs, the later one second."""
     own = growth.Growth(10.0, 20.0, np.array([[0.09, 0.0], [0.0, 0.16]]), 0.0)

@@ -34,8 +34,9 @@ BEGINS, GROWN = "moment@begins", "moment@grown"
 SHORTEST = 0.05
 """s in which something grows at least; ours: what comes faster comes at once."""
 MOVED = 5.0
-"""s, prior std of a time at which growth begins or ends, about where a fit of it begins: next to none
-beside the tenths of a second that are to be told. Its slope is taken over a fiftieth of it; ours."""
+"""s, prior std at least of a time at which growth begins or ends, about where a fit of it begins: next
+to none beside what is to be told; where it grows for longer, that length, or slow growth would stay
+where its fit begins. Its slope is taken over a fiftieth of it; ours."""
 
 _step_of: Any = None  # the model's own, put in by `_pointers`
 _measure_of: Any = None
@@ -369,8 +370,9 @@ def times_of_growth(effect: str, begins: float, grown: float, until: float) -> l
         begins, grown: where the fit of them begins [s of the clock]. until: the flight's end there.
     """
     read = effects.CATALOGUE[effect].stage == effects.SENSOR
+    std = max(MOVED, grown - begins)
     return [
-        FreeParameter(f"{effect}.{name}", time, MOVED, 0.0, until, 0.0, read)
+        FreeParameter(f"{effect}.{name}", time, std, 0.0, until, 0.0, read)
         for name, time in ((BEGINS, begins), (GROWN, grown))
     ]
 

@@ -8,8 +8,10 @@ times of the flight each was as likely.
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_at
 from coax_env.diagnosis.problem import Fit, Problem
@@ -31,6 +33,8 @@ was fitted was 128 worse before and 30 better then."""
 
 GONE, MOST_POINTS = 4.5, 10
 """nats from the best at which a time has no share in its interval, and points to each side; ours."""
+BETWEEN = 50
+"""Times between two points of a profile; ours."""
 
 
 @dataclass(frozen=True)
@@ -181,23 +185,41 @@ def profiled(
     for way in (-1.0, 1.0):
         there, step = points[0], first
         for _ in range(MOST_POINTS):
-            time = there.values[begins] + way * step
-            if not 0.0 <= time <= there.values[grown] - SHORTEST:
+            here = there.values[begins]
+            time = max(here + way * step, 0.0)
+            if time == here or time > there.values[grown] - SHORTEST:
                 break
             there, step = at(time, there), 1.3 * step
             points.append(there)
             best = max(best, likelihood(there))
             if likelihood(there) < best - GONE:
                 break
-    points.sort(key=lambda there: there.values[begins])
+    if len(points) == 1:  # nowhere to go
+        return replace(own, covariance=inflation * own.covariance, nats=nats / inflation)
     times = np.array([[there.values[begins], there.values[grown]] for there in points])
-    weight = np.exp([likelihood(there) - best for there in points])
-    weight *= np.gradient(times[:, 0]) if len(points) > 1 else 1.0
-    mean = weight @ times / weight.sum()
-    covariance = np.cov(times.T, aweights=weight, ddof=0) if len(points) > 1 else np.zeros((2, 2))
+    mean, covariance = _moments(times, np.array([likelihood(there) for there in points]))
     alone = own.covariance[1, 1] - own.covariance[0, 1] ** 2 / own.covariance[0, 0]
     covariance[1, 1] += inflation * alone  # the second beside the first
     return Growth(float(mean[0]), float(mean[1]), covariance, nats / inflation)
+
+
+def _moments(times: np.ndarray, nats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (2,) and covariance (2, 2) of both times, by the likelihood [nats] at some of the first.
+
+    Between these it goes on without a swing (pchip): the best of them may be far from the next.
+    """
+    order = np.argsort(times[:, 0])
+    times, nats = times[order], nats[order]
+    between = np.concatenate(
+        [np.linspace(a, b, BETWEEN, endpoint=False) for a, b in pairwise(times[:, 0])]
+        + [times[-1:, 0]]
+    )
+    both = PchipInterpolator(times[:, 0], times)(between)
+    share = PchipInterpolator(times[:, 0], nats)(between)
+    width = np.gradient(between)
+    width[[0, -1]] *= 0.5
+    weight = np.exp(share - share.max()) * width
+    return weight @ both / weight.sum(), np.cov(both.T, aweights=weight, ddof=0)
 
 
 def with_moment(problem: Problem, effect: str, moment: Moment) -> Problem:
