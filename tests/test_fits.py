@@ -120,6 +120,24 @@ def test_without_drifts_trims_stand_at_their_floor_and_are_not_fitted():
     assert found.noise.process == noise().process
 
 
+@pytest.mark.parametrize("short", [True, False])
+def test_noise_that_took_up_a_push_is_fitted_again_from_steady_noise(monkeypatch, short):
+    """The likelier of the two ends is kept; noise that is steady as it is asks for no second fit."""
+    there = Fit((), {}, noise(memory_force_z=7.7, force_z=0.6), 0.0)
+    monkeypatch.setattr(fits, "noise_fitted", lambda problem, fit: fit)
+
+    def fitted(problem: None, fit: Fit) -> Fit:
+        is_short = fit.noise.process["memory_force_z"] == GUST_MEMORY
+        return replace(fit, objective=-30.0 if is_short == short else -10.0)
+
+    monkeypatch.setattr(fits, "fitted", fitted)
+    found = fits.steadied(None, there)  # type: ignore[arg-type]
+    assert found.objective == -30.0
+    assert found.noise.process["memory_force_z"] == (GUST_MEMORY if short else 7.7)
+    steady = Fit((), {}, noise(), 0.0)
+    assert fits.steadied(None, steady) is steady  # type: ignore[arg-type]
+
+
 # --- turns until nothing is gained --------------------------------------------------------------------
 
 

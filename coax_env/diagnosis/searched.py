@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coax_env.diagnosis.fits import fitted, noise_fitted, start
+from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
@@ -83,7 +83,7 @@ def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
     problem.report("estimating gusts and noise of the model as given")
     bare = start(problem, noise, held=LEAST_READING_STD if coarse else ())
     problem.report("fitting the model's own parameters")
-    refitted = noise_fitted(problem, fitted(problem, bare))
+    refitted = steadied(problem, noise_fitted(problem, fitted(problem, bare)))
     problem.report("searching for causes")
     return Searched(problem, bare, refitted, *search(problem, refitted), coarse)
 
