@@ -21,6 +21,7 @@ from coax_env.env.period import DT
 from coax_env.model.layout import ACTUATOR_STATES, STATES
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
+from controllers.estimator import WINDUP
 from controllers.estimator_design import design_estimator, integrated_readings
 from controllers.feedback import Designed, Feedback
 from controllers.lqr import regulator_problem
@@ -28,7 +29,6 @@ from controllers.target import TargetView, turned
 
 NAMES = tuple(name for name, _ in (*STATES, *ACTUATOR_STATES))
 _X, _Y, _PSI = (NAMES.index(name) for name in ("x", "y", "psi"))
-_WINDUP = 20.0  # integrals stop at so many of the limits they are weighed by
 
 
 @dataclass
@@ -59,7 +59,7 @@ class StateFeedback(Feedback, Designed):
         state[:, [_X, _Y]] = turned(state[:, [_X, _Y]], -state[:, _PSI])
         known = np.hstack([state, self.integrals])
         places = [NAMES.index(name) for name in self.integrated]
-        most = _WINDUP * np.array(list(self.integrated.values()))
+        most = WINDUP * np.array(list(self.integrated.values()))
         self.integrals += DT * there[:, None] * state[:, places]
         np.clip(self.integrals, -most, most, out=self.integrals)
         return self.feedforward - known @ self.gain.T

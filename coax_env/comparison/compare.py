@@ -16,8 +16,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from coax_env.comparison.candidates import numbers, plain, scored
 from coax_env.comparison.search import Changed, Weighed, alternatives, changes_found, standing
 from coax_env.comparison.shared import (
@@ -192,8 +190,7 @@ def _changes(
 
 def _std(state: Changed, quadratic: Quadratic) -> dict[str, float]:
     """Posterior std of every number that is free: an effect that neither flight shows is not there."""
-    free = state.problem.free_names(state.fit.active)
-    return dict(zip(free, np.sqrt(np.diag(quadratic.covariance(free))).tolist(), strict=True))
+    return quadratic.std(state.problem.free_names(state.fit.active))
 
 
 def _effective(state: Changed, values: Mapping[str, float], effect: str) -> dict[str, float]:

@@ -51,7 +51,7 @@ def causes(
     """
     onsets = onsets or {}
     free = problem.free_names(fit.active)
-    std = dict(zip(free, np.sqrt(np.diag(quadratic.covariance(free))), strict=True))
+    std = quadratic.std(free)
     dt = median_step(problem.engine.records)
     entries: list[dict[str, Any]] = []
 

@@ -44,10 +44,7 @@ def start(problem: Problem, noise: Noise, held: Collection[str] = ()) -> Fit:
 
 def linearise(problem: Problem, fit: Fit) -> tuple[Fit, list[RunPass], Quadratic]:
     """The quadratic at a fit, over all parameters that may be free; the fit with its objective."""
-    everything = problem.parameters
-    passes, lin = problem.engine.linearise(fit.values, fit.noise, everything)
-    nats = objective(passes, problem.free(fit.active), fit.values)
-    return replace(fit, objective=nats), passes, Quadratic.of(lin, everything, fit.values)
+    return _linearised(problem, fit, problem.parameters, gains=True)
 
 
 def quadratic_at(
@@ -59,10 +56,16 @@ def quadratic_at(
         problem, fit: what may be free, and where.
         of: the parameters; default all that may be free.
     """
-    of = problem.parameters if of is None else of
-    passes, lin = problem.engine.linearise(fit.values, fit.noise, of, gains=False)
+    fit, _, quadratic = _linearised(problem, fit, problem.parameters if of is None else of, False)
+    return fit, quadratic
+
+
+def _linearised(
+    problem: Problem, fit: Fit, of: Sequence[FreeParameter], gains: bool
+) -> tuple[Fit, list[RunPass], Quadratic]:
+    passes, lin = problem.engine.linearise(fit.values, fit.noise, of, gains)
     nats = objective(passes, problem.free(fit.active), fit.values)
-    return replace(fit, objective=nats), Quadratic.of(lin, of, fit.values)
+    return replace(fit, objective=nats), passes, Quadratic.of(lin, of, fit.values)
 
 
 def stepped(problem: Problem, fit: Fit, passes: Sequence[RunPass], quadratic: Quadratic) -> Fit:

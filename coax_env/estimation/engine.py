@@ -34,9 +34,8 @@ NONE_KEPT = frozen_gains.Kept(np.zeros((0, 0, 0), np.float32), np.zeros(0, np.in
 OF_GAINS = ("gains", "per_sigma", "H")  # what takes most of a pass' memory
 MANY_ROWS = 50_000
 """Rows, 500 s at 100 Hz, from which on what was freed goes back before a linearisation; ours."""
-REMEMBERED = (
-    4  # points at which something was linearised, a fit ended, or the noise was scored; ours
-)
+REMEMBERED = 4
+"""Points at which something was linearised, a fit ended, or the noise was scored; ours."""
 DIVERGED = 1e6  # whitened innovations [std] that only a diverging mean has
 
 
@@ -157,20 +156,31 @@ class NoiseScore:
 
 
 @dataclass(frozen=True)
-class _Flown:
-    """What was flown at a point: the passes, without the rows' gains, and what was linearised there, in
-    `free`, if anything.
-    """
+class _Known:
+    """What is known at a point."""
 
     p: np.ndarray
     noise: Noise
-    passes: list[RunPass]
-    free: tuple[FreeParameter, ...] = ()
-    lin: Linearised | None = None
 
     def is_at(self, p: np.ndarray, noise: Noise) -> bool:
         """Whether this is the point."""
         return np.array_equal(self.p, p) and self.noise == noise
+
+
+@dataclass(frozen=True)
+class _Flown(_Known):
+    """The passes, without the rows' gains, and what was linearised there, in `free`, if anything."""
+
+    passes: list[RunPass]
+    free: tuple[FreeParameter, ...] = ()
+    lin: Linearised | None = None
+
+
+@dataclass(frozen=True)
+class _Scored(_Known):
+    """The noise's score."""
+
+    score: NoiseScore
 
 
 class _Buffers:
@@ -204,7 +214,7 @@ class Engine:
         self._readings = [int((~np.isnan(r.z)).sum()) for r in self.records]
         self._buffers: list[_Buffers] = []  # that no thread works with
         self._flown: deque[_Flown] = deque(maxlen=REMEMBERED)
-        self._scored: deque[tuple[np.ndarray, Noise, NoiseScore]] = deque(maxlen=REMEMBERED)
+        self._scored: deque[_Scored] = deque(maxlen=REMEMBERED)
 
     def _each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
         """Work done on every run (or those in `which`), the longest first so that no thread waits."""
@@ -731,9 +741,9 @@ class Engine:
             noise: levels of process and reading noise.
         """
         p = self.model.vector(values, noise)
-        for vector, of_noise, score in tuple(self._scored):
-            if np.array_equal(vector, p) and of_noise == noise:
-                return score
+        for known in tuple(self._scored):
+            if known.is_at(p, noise):
+                return known.score
         q, decay = self.model.process_noise(noise, p)
         places = self.compiled.noise_places
         nx, m = self.starts[0][0].size, len(self.model.channels)
@@ -767,7 +777,7 @@ class Engine:
             np.array([s.start_expected for s in slopes]),
             np.sum([s.reading_expected for s in slopes], axis=0),
         )
-        self._scored.append((p, noise, score))
+        self._scored.append(_Scored(p, noise, score))
         return score
 
 

@@ -155,6 +155,10 @@ class Quadratic:
         i = self.index(free)
         return np.linalg.inv(self.G[np.ix_(i, i)] + np.diag(self.precision[i]))
 
+    def std(self, free: Collection[str]) -> dict[str, float]:
+        """Posterior std of each free parameter, all of them free."""
+        return dict(zip(free, np.sqrt(np.diag(self.covariance(free))).tolist(), strict=True))
+
     def variance_inflation(self, own: Collection[str], free: Collection[str]) -> float:
         """How much more the score of `own` scatters between blocks than white innovations allow.
 
