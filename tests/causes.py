@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import injector
-from study.one_flight import catalogue_values
+from study.expected import catalogue_values
 
 from coax_env.model import effects
 

@@ -232,7 +232,8 @@ EFFECTS: dict[str, dict[str, tuple[str, float]]] = {
 
 OTHER_FORM = frozenset({"ground_effect.gain", "airframe_drag.area_x", "airframe_drag.area_y",
                         "airframe_drag.area_z", "wake_interference.gain",
-                        "rate_damping.coefficient", "vibration.amplitude", "battery_sag.rate",
+                        "rate_damping.coefficient", "yaw_damping.coefficient",
+                        "vibration.amplitude", "battery_sag.rate",
                         "battery_voltage.per_volt", "dynamic_inflow.time", "command_delay.time",
                         "servo_rate.limit",
                         "motor_droop.upper", "motor_droop.lower",

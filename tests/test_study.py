@@ -9,6 +9,7 @@ import json
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ from study import (
     threshold,
 )
 from study.baselines import Gram, by_bic, by_f, sparse, stepwise
-from study.one_flight import catalogue_values, expected_evidence, fly_and_diagnose, hide
+from study.expected import catalogue_values, expected_evidence, gust_levels, true_noise
+from study.one_flight import fly_and_diagnose, hide
 from study.plan import PlannedFlight
 
 from coax_env import load_vehicle, read_flight
@@ -513,15 +515,15 @@ def test_sizes_on_another_craft_do_what_they_do_on_the_papers() -> None:
 
 
 def test_the_levels_of_an_air_are_its_own() -> None:
-    levels = one_flight.gust_levels(GUSTY, LAMA)
+    levels = gust_levels(GUSTY, LAMA)
     known = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003}
     for group, std in known.items():
         assert levels[group] == pytest.approx(std, rel=0.2)
     for group in known:
         assert levels[f"memory_{group}"] == pytest.approx(0.5, rel=0.35)
-    light = one_flight.gust_levels(GUSTY, COAX)["force_z"] / levels["force_z"]
+    light = gust_levels(GUSTY, COAX)["force_z"] / levels["force_z"]
     assert light == pytest.approx(0.302 * 9.81 / (0.8 * 9.804))
-    lasting = one_flight.gust_levels(Air("markov", memory=(3.0, 0.1)), LAMA)
+    lasting = gust_levels(Air("markov", memory=(3.0, 0.1)), LAMA)
     assert lasting["memory_force_xy"] > 1.5 and lasting["memory_moment_xy"] < 0.15
 
 
@@ -704,7 +706,8 @@ def test_the_usual_way_finds_yaw_damping_in_still_air(damped: tuple) -> None:
 
 
 def test_expected_evidence_grows_with_the_square_of_the_size(damped: tuple) -> None:
-    """Half theta' S theta: four times as much at twice the size, but for the Occam factor."""
+    """Four times as much at twice the size, but for the Occam factor. Of small sizes: the flight itself
+    has another one, and is less and less that of the size asked."""
     planned, folder, truth = damped
     flight = read_flight(folder)
 
@@ -714,9 +717,31 @@ def test_expected_evidence_grows_with_the_square_of_the_size(damped: tuple) -> N
         assert nats is not None
         return nats
 
-    none, one, two = worth(0.0), worth(0.2), worth(0.4)
+    none, one, two = worth(0.0), worth(0.1), worth(0.2)
     assert none < 0.0 and one > none
     assert (two - none) / (one - none) == pytest.approx(4.0, rel=0.15)
+
+
+@pytest.mark.slow
+def test_expected_evidence_is_what_the_likelihood_has_in_gusts(tmp_path: Path) -> None:
+    """Of a damping, most of which a filter with its gains held would promise is not there."""
+    expected, had = [], []
+    for seed in (21, 22, 23):
+        flight = arms.planned("gusty", "one", 0, seed)
+        flight = replace(flight, effects={"axial_damping": {"coefficient": 0.11}})
+        folder = tmp_path / str(seed)
+        truth = hide(flight, folder)
+        log = read_flight(folder)
+        nats = expected_evidence(flight, log, truth, ())["axial_damping"]
+        assert nats is not None
+        vehicle = load_vehicle(log.vehicle).in_air(log.air)
+        engine = Engine(HeliModel(vehicle), [record_of(run) for run in log.runs])
+        noise = true_noise(flight, log, vehicle, {})
+        bare = engine.model.bare_values
+        with_it = engine.log_likelihood({**bare, **truth["values"]}, noise)
+        expected.append(nats)
+        had.append(with_it - engine.log_likelihood(bare, noise))
+    assert 0.5 * sum(had) < sum(expected) < 2.0 * sum(had), (expected, had)
 
 
 def test_sizes_in_the_catalogues_form() -> None:

@@ -27,7 +27,7 @@ DIMENSIONS = {
     "1": 1.0, "s": TIME, "rad": 1.0, "m/s": LENGTH / TIME, "rad/s": 1.0 / TIME, "rad/s2": 1.0 / TIME**2,
     "rev/min": 1.0 / TIME, "m2": LENGTH**2, "s/m": TIME / LENGTH, "rad per m/s": TIME / LENGTH,
     "N s/m per rad/s": MASS, "N m s": MASS * LENGTH**2 / TIME, "N/m": MASS / LENGTH,
-    "N": MASS, "N m": MASS * LENGTH,
+    "N": MASS, "N m": MASS * LENGTH, "N m/rad": MASS * LENGTH,
 }  # fmt: skip
 """Unit -> what a number in it is multiplied with."""
 

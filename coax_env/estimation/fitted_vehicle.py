@@ -28,8 +28,9 @@ def median_step(records: Sequence[Record]) -> float:
 def with_timing(parameter: FreeParameter, std: float, dt: float) -> float:
     """Std of a lag or delay with the half sample that a log cannot show.
 
-    Within a row it is not known when the machine takes a command over (zero-order hold against the
-    simulator's or autopilot's own loop): uniform over a row, std dt/sqrt(12).
+    Within a row it is not known when the machine takes a command over, or when a reading was taken
+    (zero-order hold against the simulator's or autopilot's own loop): uniform over a row, std
+    dt/sqrt(12).
 
     Args:
         parameter: the number.

@@ -36,9 +36,9 @@ class EffectParameter:
 
     ``usual`` is the usual size and the std of the prior about ``off``; ``smallest`` the size under
     which it does not matter in prediction and is never named; a ``shape`` parameter (a decay, say)
-    acts only once the effect itself does; ``timing``: a lag or delay of the command; ``probe``: finite
-    step for the signature where the effect has no slope at its off-value; ``held``: is stated, never
-    fitted, and does not act alone.
+    acts only once the effect itself does; ``timing``: a lag or delay, of commands or readings;
+    ``probe``: finite step for the signature where the effect has no slope at its off-value; ``held``:
+    is stated, never fitted, and does not act alone.
 
     Sizes, bounds and probe are lama400d's. ``scale`` says with what of the vehicle they grow on
     another machine, ``"weight * arm / rotor_speed"`` say (usual_sizes.py); empty: they do not.

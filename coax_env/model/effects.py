@@ -646,8 +646,8 @@ def cg_offset(x, f, p, e):
 
 @effect(
     LOAD,
-    EffectParameter("upper", "N m/rad", usual=0.2, smallest=0.03, lower=0.0),
-    EffectParameter("lower", "N m/rad", usual=0.2, smallest=0.03, lower=0.0),
+    EffectParameter("upper", "N m/rad", usual=0.2, smallest=0.03, lower=0.0, scale="weight * arm"),
+    EffectParameter("lower", "N m/rad", usual=0.2, smallest=0.03, lower=0.0, scale="weight * arm"),
     channels="p q",
     source="spring at the flap hinge, Johnson 1980, ch. 5",
 )
@@ -748,7 +748,7 @@ def _in_world_axes(attitude, x, y, z):
 
 @effect(
     SENSOR,
-    EffectParameter("time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3),
+    EffectParameter("time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3, timing=True),
     channels="pn pe h phi theta psi",
     source="motion capture and its network, to second order: z - d z' + d2/2 z''",
 )
@@ -768,7 +768,7 @@ def pose_delay(x, f, p, e):
 
 @effect(
     SENSOR,
-    EffectParameter("time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3),
+    EffectParameter("time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3, timing=True),
     channels="phi theta psi",
     source="attitude electronics' own filter, to second order: z - d z' + d2/2 z''",
 )
@@ -977,7 +977,7 @@ def sonar_scale(x, f, p, e):
 
 @effect(
     SENSOR,
-    EffectParameter("time", "s", usual=0.1, smallest=0.02, lower=0.0, upper=0.5),
+    EffectParameter("time", "s", usual=0.1, smallest=0.02, lower=0.0, upper=0.5, timing=True),
     channels="h",
     source="delayed echo, to first order: h - d h'",
 )

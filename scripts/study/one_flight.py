@@ -6,51 +6,36 @@ import os
 import tempfile
 import time
 import traceback
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import injector
-import numpy as np
-from injector_air import GUSTY, STILL, Air, disturbances
-from injector_craft import CRAFTS, LAMA, Craft, spread
-from injector_sensors import SENSORS
+from injector_craft import LAMA
 
 from coax_env.diagnosis.diagnose import Diagnosis, diagnose
-from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, start
+from coax_env.diagnosis.fits import fitted, noise_fitted, start
 from coax_env.diagnosis.gain import gain_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
-from coax_env.estimation.helicopter_noise import starting_noise, still_air
+from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import replay_runs
-from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.effects import CATALOGUE
 from coax_env.model.vehicle_file import load_vehicle
 from study import baselines
+from study.expected import catalogue_values, expected_evidence
 from study.judge import OWN
-from study.plan import PlannedFlight, size_on
+from study.plan import PlannedFlight, air_of, craft_of, size_on
 from study.store import code_hash
-
-GROUPS = {"force_xy": [0, 1], "force_z": [2], "moment_xy": [3, 4], "moment_z": [5]}
-"""Axes of the generator's gusts."""
 
 SHOWN_FROM = 3.0
 """Thresholds that an effect of a flight of kind "many" must be expected to be worth on all its runs; a
 quarter of them is held out, and two are then left."""
-
-SIZE_IN_CATALOGUE = {
-    # Cheeseman-Bennett between z/R 1.2 and 2.4 is 0.22 exp(-1.3 z/R)
-    "ground_effect.gain": 0.22,
-    "rate_damping.coefficient": 0.9,  # (0.8 + 0.4 |rate|) at 0.25 rad/s
-}
-"""Size of the catalogue's form per size of the generator's, where the two differ."""
-SHAPES = {"ground_effect.decay": 1.3}
 
 
 def fly_and_diagnose(flight: PlannedFlight, only_own: bool = False) -> dict[str, Any]:
@@ -147,23 +132,6 @@ def _beside_the_file(values: Mapping[str, float]) -> dict[str, float]:
     return kept
 
 
-def craft_of(planned: PlannedFlight) -> Craft:
-    """What flies."""
-    rng = np.random.default_rng(planned.seed)
-    if planned.craft == "drawn":
-        return injector.drawn(rng)
-    if planned.craft == "spread":
-        return spread(LAMA, rng)
-    return CRAFTS[planned.craft]
-
-
-def air_of(planned: PlannedFlight) -> Air:
-    """What it flies in."""
-    if planned.air is not None:
-        return Air(**planned.air)
-    return GUSTY if planned.gusts else STILL
-
-
 def showing(planned: PlannedFlight, place: Path) -> tuple[PlannedFlight, Path, dict[str, Any]]:
     """The flight with those of its effects only that can be expected to show on it, all at once.
 
@@ -181,95 +149,6 @@ def showing(planned: PlannedFlight, place: Path) -> tuple[PlannedFlight, Path, d
         if len(shown) == len(planned.effects):
             return planned, folder, truth
         planned = replace(planned, effects=shown)
-
-
-# --- what could have been known ---------------------------------------------------------------------
-
-
-def catalogue_values(values: Mapping[str, float]) -> dict[str, float]:
-    """The generator's sizes as the catalogue would have them; effects it does not list left out."""
-    result = {}
-    for name, value in values.items():
-        if name.partition(".")[0] in CATALOGUE:
-            result[name] = value * SIZE_IN_CATALOGUE.get(name, 1.0)
-    groups = {name.partition(".")[0] for name in result}
-    return result | {n: v for n, v in SHAPES.items() if n.partition(".")[0] in groups}
-
-
-def expected_evidence(
-    planned: PlannedFlight, flight: Flight, truth: Mapping[str, Any], held: Collection[str]
-) -> dict[str, float | None]:
-    """Nats each hidden effect should be worth on the runs that are fitted, from no residual.
-
-    Half theta' S theta less the Occam factor: S is the information of the effect's parameters on this
-    flight's commands, with the generator's noise, the base parameters (under their priors) and the
-    other hidden effects projected out; taken at half the effect's size, which is the midpoint rule for
-    what its whole size does. None: not in the catalogue.
-
-    Args:
-        planned: how it was flown. flight: its log. truth: of the generator, `hidden` and `values`.
-        held: names of the runs that are not fitted.
-    """
-    values = catalogue_values(truth["values"])
-    listed = [e for e in truth["hidden"] if e in CATALOGUE]
-    result: dict[str, float | None] = dict.fromkeys(truth["hidden"])
-    if not listed:
-        return result
-    vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
-    model = HeliModel(vehicle)
-    true_noise = SENSORS[planned.sensors].noise
-    noise = still_air(starting_noise(replace(flight, noise=dict(true_noise)), vehicle))
-    if planned.gusts:
-        # the model's are what shakes the vehicle as its file has it
-        levels = dict(gust_levels(air_of(planned), craft_of(planned)))
-        heavier = 1.0 + values.get("added_mass.mass", 0.0) / vehicle["mass"].value
-        levels["force_xy"] /= heavier
-        levels["force_z"] /= heavier
-        levels["moment_z"] /= 1.0 + values.get("yaw_inertia.scale", 0.0)
-        noise = noise.with_levels(levels)
-    problem = Problem.of(model, _records(flight, held, within=False), listed)
-    for effect in listed:
-        own = {name: 0.5 * values.get(name, 0.0) for name in problem.acting_names(effect)}
-        at = {**model.bare_values, **values, **own}
-        _, _, quadratic = linearise(problem, Fit(tuple(listed), at, noise))
-        result[effect] = _worth(problem, quadratic, listed, effect, values)
-    return result
-
-
-@cache
-def gust_levels(air: Air, craft: Craft) -> dict[str, float]:
-    """Std [N, N m] of an air's gusts on a craft, and correlation times [s], by two minutes of it."""
-    step = 0.002
-    history = disturbances(air, craft, 12_000, 5, step, np.random.default_rng(0))
-    history[:, 0:3] += history[:, 10:13]
-    levels = {group: float(history[:, axes].std()) for group, axes in GROUPS.items()}
-    memories = {
-        f"memory_{group}": float(np.mean([_correlation_time(history[:, i], step) for i in axes]))
-        for group, axes in GROUPS.items()
-    }
-    return levels | memories
-
-
-def _correlation_time(x: np.ndarray, step: float) -> float:
-    """s after which a history is alike to 1/e."""
-    x = x - x.mean()
-    spectrum = np.abs(np.fft.rfft(x, 2 * len(x))) ** 2
-    alike = np.fft.irfft(spectrum)[: len(x)]
-    return step * max(int(np.argmax(alike < alike[0] / math.e)), 1)
-
-
-def _worth(
-    problem: Problem,
-    quadratic: Quadratic,
-    listed: Sequence[str],
-    effect: str,
-    values: Mapping[str, float],
-) -> float:
-    own = problem.acting_names(effect)
-    rest = [n for n in problem.free_names(listed) if not n.startswith(effect + ".")]
-    S, _ = quadratic.projected(own, rest)
-    theta = np.array([values.get(name, 0.0) for name in own])  # of a line, some kinds are not there
-    return float(0.5 * theta @ S @ theta - quadratic.occam(own, rest))
 
 
 def gain_of_the_truth(

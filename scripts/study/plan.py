@@ -12,7 +12,8 @@ from typing import Any
 
 import injector
 import numpy as np
-from injector_craft import LAMA, Craft, rotors_of
+from injector_air import GUSTY, STILL, Air
+from injector_craft import CRAFTS, LAMA, Craft, rotors_of, spread
 
 from study.judge import TIES
 
@@ -286,3 +287,20 @@ def sizes_of(name: str, rng: np.random.Generator) -> dict[str, float]:
         sign = rng.choice([-1.0, 1.0]) if signed else 1.0
         sizes[parameter] = float(sign * rng.uniform(least, most))
     return sizes
+
+
+def craft_of(planned: PlannedFlight) -> Craft:
+    """What flies."""
+    rng = np.random.default_rng(planned.seed)
+    if planned.craft == "drawn":
+        return injector.drawn(rng)
+    if planned.craft == "spread":
+        return spread(LAMA, rng)
+    return CRAFTS[planned.craft]
+
+
+def air_of(planned: PlannedFlight) -> Air:
+    """What it flies in."""
+    if planned.air is not None:
+        return Air(**planned.air)
+    return GUSTY if planned.gusts else STILL

@@ -1,0 +1,196 @@
+"""What the effects hidden in a flight should be worth on it: from its truth, and from no residual.
+
+Filter passes at the truth, and with one thing changed, say how far apart the two predictions are: half
+the sum of squares of that is what the likelihood between them is expected to be (Kullback and Leibler
+1951, Ann. Math. Stat. 22, to second order). The passes are whole, since an effect may change what the
+filter expects of gusts. What else would be fitted in the effect's place takes up a part of it: the
+vehicle's own numbers, under their priors, the other hidden effects, and the levels of the noise.
+"""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+from injector_air import Air, disturbances
+from injector_craft import Craft
+from injector_sensors import SENSORS
+
+from coax_env.diagnosis.problem import Problem
+from coax_env.estimation.engine import RunPass
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise, still_air
+from coax_env.estimation.state_space import Noise
+from coax_env.logs.flight import Flight
+from coax_env.model.effects import CATALOGUE
+from coax_env.model.vehicle import Vehicle
+from coax_env.model.vehicle_file import load_vehicle
+from study.plan import PlannedFlight, air_of, craft_of
+
+GROUPS = {"force_xy": [0, 1], "force_z": [2], "moment_xy": [3, 4], "moment_z": [5]}
+"""Axes of the generator's gusts."""
+
+SIZE_IN_CATALOGUE = {
+    # Cheeseman-Bennett between z/R 1.2 and 2.4 is 0.22 exp(-1.3 z/R)
+    "ground_effect.gain": 0.22,
+    "rate_damping.coefficient": 0.9,  # (0.8 + 0.4 |rate|) at 0.25 rad/s
+    "yaw_damping.coefficient": 0.89,  # (0.85 + 0.15 |rate|) at 0.25 rad/s
+}
+"""Size of the catalogue's form per size of the generator's, where the two differ."""
+SHAPES = {"ground_effect.decay": 1.3}
+
+PRIOR_SHARE = 0.1
+"""Of a number's prior std: the step of its differences."""
+LEVEL_STEP = 0.1
+"""Step of the logarithm of a level of the noise."""
+
+
+def catalogue_values(values: Mapping[str, float]) -> dict[str, float]:
+    """The generator's sizes as the catalogue would have them; effects it does not list left out."""
+    result = {}
+    for name, value in values.items():
+        if name.partition(".")[0] in CATALOGUE:
+            result[name] = value * SIZE_IN_CATALOGUE.get(name, 1.0)
+    groups = {name.partition(".")[0] for name in result}
+    return result | {n: v for n, v in SHAPES.items() if n.partition(".")[0] in groups}
+
+
+def expected_evidence(
+    planned: PlannedFlight, flight: Flight, truth: Mapping[str, Any], held: Collection[str]
+) -> dict[str, float | None]:
+    """Nats each hidden effect should be worth on the runs that are fitted; None: not in the catalogue.
+
+    Args:
+        planned: how it was flown. flight: its log. truth: of the generator, `hidden` and `values`.
+        held: names of the runs that are not fitted.
+    """
+    values = catalogue_values(truth["values"])
+    listed = [e for e in truth["hidden"] if e in CATALOGUE]
+    result: dict[str, float | None] = dict.fromkeys(truth["hidden"])
+    if not listed:
+        return result
+    vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
+    model = HeliModel(vehicle)
+    records = [record_of(run) for run in flight.runs if run.name not in held]
+    problem = Problem.of(model, records, listed)
+    off = {n: v for effect in listed for n, v in problem.off_values(effect).items()}
+    noise = true_noise(planned, flight, vehicle, values)
+    about = _Truth(problem, {**model.bare_values, **off, **values}, noise, listed)
+    return result | {effect: about.worth(effect) for effect in listed}
+
+
+def true_noise(
+    planned: PlannedFlight, flight: Flight, vehicle: Vehicle, values: Mapping[str, float]
+) -> Noise:
+    """The generator's noise as the model has it.
+
+    Args:
+        planned: how it was flown. flight: its log. vehicle: its file's.
+        values: of the hidden effects: gusts shake what is heavier than the file says less.
+    """
+    own = SENSORS[planned.sensors].noise
+    noise = still_air(starting_noise(replace(flight, noise=dict(own)), vehicle))
+    if not planned.gusts:
+        return noise
+    levels = dict(gust_levels(air_of(planned), craft_of(planned)))
+    heavier = 1.0 + values.get("added_mass.mass", 0.0) / vehicle["mass"].value
+    levels["force_xy"] /= heavier
+    levels["force_z"] /= heavier
+    levels["moment_z"] /= 1.0 + values.get("yaw_inertia.scale", 0.0)
+    return noise.with_levels(levels)
+
+
+@cache
+def gust_levels(air: Air, craft: Craft) -> dict[str, float]:
+    """Std [N, N m] of an air's gusts on a craft, and correlation times [s], by two minutes of it."""
+    step = 0.002
+    history = disturbances(air, craft, 12_000, 5, step, np.random.default_rng(0))
+    history[:, 0:3] += history[:, 10:13]
+    levels = {group: float(history[:, axes].std()) for group, axes in GROUPS.items()}
+    memories = {
+        f"memory_{group}": float(np.mean([_correlation_time(history[:, i], step) for i in axes]))
+        for group, axes in GROUPS.items()
+    }
+    return levels | memories
+
+
+def _correlation_time(x: np.ndarray, step: float) -> float:
+    """s after which a history is alike to 1/e."""
+    x = x - x.mean()
+    spectrum = np.abs(np.fft.rfft(x, 2 * len(x))) ** 2
+    alike = np.fft.irfft(spectrum)[: len(x)]
+    return step * max(int(np.argmax(alike < alike[0] / math.e)), 1)
+
+
+@dataclass(frozen=True)
+class _Prediction:
+    """What a filter expects of every reading: innovations and std, (readings,) each."""
+
+    innovations: np.ndarray
+    std: np.ndarray
+
+    @staticmethod
+    def of(passes: Sequence[RunPass]) -> "_Prediction":
+        whitened = [run.innovations[~np.isnan(run.innovations)] for run in passes]
+        std = 1.0 / np.concatenate([run.per_sigma for run in passes])
+        return _Prediction(np.concatenate(whitened) * std, std)
+
+    def beside(self, other: "_Prediction") -> np.ndarray:
+        """How far the other is away, (2 readings,): half its sum of squares is in nats."""
+        mean = (self.innovations - other.innovations) / np.sqrt(self.std * other.std)
+        return np.concatenate([mean, math.sqrt(2.0) * np.log(self.std / other.std)])
+
+
+@dataclass(frozen=True)
+class _Truth:
+    """A flight's truth, to be asked what is expected near it.
+
+    problem: of the fitted runs. values, noise: the true ones. listed: hidden effects of the catalogue.
+    """
+
+    problem: Problem
+    values: Mapping[str, float]
+    noise: Noise
+    listed: Sequence[str]
+
+    def worth(self, effect: str) -> float:
+        """Nats of an effect, less the Occam factor."""
+        problem, truth = self.problem, self.prediction({}, {})
+        away = truth.beside(self.prediction(problem.off_values(effect), {}))
+        own = problem.acting_names(effect)
+        rest, precision = self._rest(truth, effect)
+        precisions = np.diag(precision)
+        left = away - rest.T @ np.linalg.solve(rest @ rest.T + precisions, rest @ away)
+        mine = np.array([self._slope(truth, name) for name in own])
+        mine_left = mine - (mine @ rest.T) @ np.linalg.solve(rest @ rest.T + precisions, rest)
+        prior = np.array([f.std for f in problem.own[effect] if f.name in own])
+        posterior = np.outer(prior, prior) * (mine @ mine_left.T) + np.eye(len(own))
+        return float(0.5 * away @ left - 0.5 * np.linalg.slogdet(posterior)[1])
+
+    def prediction(self, values: Mapping[str, float], levels: Mapping[str, float]) -> _Prediction:
+        """Of the truth with some values and levels of the noise changed."""
+        passes = self.problem.engine.filter(
+            {**self.values, **values}, self.noise.with_levels(levels), keep=True
+        )
+        return _Prediction.of(passes)
+
+    def _slope(self, truth: _Prediction, name: str) -> np.ndarray:
+        """Of the predictions in a parameter."""
+        parameter = next(f for f in self.problem.parameters if f.name == name)
+        step = PRIOR_SHARE * parameter.std
+        if self.values[name] + step > parameter.upper:
+            step = -step
+        return truth.beside(self.prediction({name: self.values[name] + step}, {})) / step
+
+    def _rest(self, truth: _Prediction, effect: str) -> tuple[np.ndarray, np.ndarray]:
+        """Slopes in all that is fitted without it, (r, 2 readings), and their precisions, (r,)."""
+        free = self.problem.free([e for e in self.listed if e != effect])
+        slopes = [self._slope(truth, f.name) for f in free]
+        known = [f.std**-2 for f in free]
+        for name in fitted_levels(self.noise):
+            level = self.noise.level(name) * math.exp(LEVEL_STEP)
+            slopes.append(truth.beside(self.prediction({}, {name: level})) / LEVEL_STEP)
+            known.append(self.noise.prior.get(name, (1.0, math.inf))[1] ** -2)
+        return np.array(slopes), np.array(known)
