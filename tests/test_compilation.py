@@ -11,7 +11,7 @@ from numba.extending import overload
 
 from coax_env.estimation import beginnings, compile_ahead, frozen_gains, kalman, noise_score
 from coax_env.kernel import compilation
-from coax_env.kernel.compilation import compiled_when_called
+from coax_env.kernel.compilation import compiled, compiled_when_called
 from coax_env.kernel.numba_internals import PackagedCacheLocator
 
 
@@ -27,6 +27,32 @@ def test_what_only_python_calls_is_compiled_when_it_is_called(tmp_path, monkeypa
     assert doubled(1.5) == 3.0 and doubled.prepare() is doubled.prepare()
     assert list(tmp_path.rglob("*doubled*.nbc"))
     assert not (tmp_path / "with a user's effect").exists()
+
+
+def test_what_compiled_code_alone_calls_has_no_wrapper_until_python_calls_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(compilation, "CACHE_DIR", tmp_path)
+
+    def a_new_process():
+        @compiled()
+        def doubled(x):
+            return x + x
+
+        @compiled()
+        def and_one(x):
+            return doubled(x) + 1.0
+
+        return doubled, and_one
+
+    def compiled_now(*functions):
+        return [sum(f.stats.cache_misses.values()) for f in functions]
+
+    doubled, and_one = a_new_process()
+    assert and_one(1.5) == 4.0 and compiled_now(doubled, and_one) == [1, 1]
+    assert doubled(1.5) == 3.0 and and_one(2.5) == 6.0
+    assert compiled_now(doubled, and_one) == [2, 1]
+    stored, another = a_new_process()
+    assert another(1.5) == 4.0 and stored(1.5) == 3.0
+    assert compiled_now(stored) == [0], "with a wrapper it serves both"
 
 
 def test_a_copy_of_the_package_loads_what_was_compiled_for_the_other(tmp_path):

@@ -18,9 +18,16 @@ from typing import Any
 
 import numba
 
-from coax_env.kernel.numba_internals import PACKAGE, cached_in, compile_uncollected
+from coax_env.kernel.numba_internals import (
+    PACKAGE,
+    cached_in,
+    compare_flags_quickly,
+    compile_uncollected,
+    wrapped_when_called,
+)
 
 compile_uncollected()
+compare_flags_quickly()
 
 COMPILED_ROOMS = ("kernel", "model")
 
@@ -115,7 +122,7 @@ def compiled(
         name_apart(function)
         with _own_cache(folder):
             if signature is None:
-                return numba.njit(**settings)(function)
+                return wrapped_when_called(numba.njit(**settings)(function))
             return numba.njit(signature, **settings)(function)
 
     return decorate
