@@ -2,6 +2,8 @@
 
 import gc
 import subprocess
+import threading
+import time
 from pathlib import Path
 
 import numba
@@ -12,7 +14,7 @@ from numba.extending import overload
 from coax_env.estimation import beginnings, compile_ahead, frozen_gains, kalman, noise_score
 from coax_env.kernel import compilation
 from coax_env.kernel.compilation import compiled, compiled_when_called
-from coax_env.kernel.numba_internals import PackagedCacheLocator
+from coax_env.kernel.numba_internals import PackagedCacheLocator, cached_in
 
 
 def test_what_only_python_calls_is_compiled_when_it_is_called(tmp_path, monkeypatch):
@@ -67,6 +69,26 @@ def test_a_copy_of_the_package_loads_what_was_compiled_for_the_other(tmp_path):
 
 def probed(x):
     """Of which the compiler asks, while it compiles, how it is to be compiled."""
+
+
+def test_settings_of_one_thread_are_not_those_of_another(tmp_path):
+    """They were: what a batch of two threads compiled was now and then cached in the working folder."""
+    before = numba.config.CACHE_DIR
+    entered, found = threading.Event(), []
+
+    def one_more() -> None:
+        with cached_in(str(tmp_path / "first")):
+            entered.set()
+            time.sleep(0.05)  # [s] the other comes to its own
+            found.append(numba.config.CACHE_DIR)
+
+    thread = threading.Thread(target=one_more)
+    thread.start()
+    entered.wait()
+    with cached_in(str(tmp_path / "second")):
+        thread.join()
+        assert str(tmp_path / "second") == numba.config.CACHE_DIR
+    assert found == [str(tmp_path / "first")] and before == numba.config.CACHE_DIR
 
 
 def test_no_garbage_is_collected_while_numba_compiles_and_it_is_again_afterwards():

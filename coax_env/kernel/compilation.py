@@ -23,7 +23,7 @@ from coax_env.kernel.numba_internals import (
     cached_in,
     compare_flags_quickly,
     compile_uncollected,
-    wrapped_when_called,
+    njit_for_compiled,
 )
 
 compile_uncollected()
@@ -122,7 +122,7 @@ def compiled(
         name_apart(function)
         with _own_cache(folder):
             if signature is None:
-                return wrapped_when_called(numba.njit(**settings)(function))
+                return njit_for_compiled(**settings)(function)
             return numba.njit(signature, **settings)(function)
 
     return decorate

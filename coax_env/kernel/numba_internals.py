@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from llvmlite import ir
-from numba import config, types
+from numba import config, njit, types
 from numba.core import caching, cgutils, event, targetconfig
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.imputils import impl_ret_borrowed
@@ -62,18 +62,30 @@ class PackagedCacheLocator(caching.UserProvidedCacheLocator):
 def cached_in(folder: str) -> Iterator[None]:
     """What is decorated meanwhile is cached there, each source in a folder of its own.
 
+    One thread at a time, which may be compiling: numba's settings are the process's.
+
     Args:
         folder: named by the content of all sources.
     """
-    names = ("CACHE_DIR", "CACHE_LOCATOR_CLASSES")
-    before = {name: getattr(config, name) for name in names}
-    config.CACHE_DIR = folder
-    config.CACHE_LOCATOR_CLASSES = f"{__name__}.{PackagedCacheLocator.__name__}"
+    here = {
+        "CACHE_DIR": folder,
+        "CACHE_LOCATOR_CLASSES": f"{__name__}.{PackagedCacheLocator.__name__}",
+    }
+    with global_compiler_lock, _changed(vars(config), **here):
+        yield
+
+
+@contextmanager
+def _changed(names: dict[str, Any], **values: Any) -> Iterator[None]:
+    """Names mean something else meanwhile."""
+    before = {name: names[name] for name in values if name in names}
+    names.update(values)
     try:
         yield
     finally:
-        for name, value in before.items():
-            setattr(config, name, value)
+        for name in values:
+            del names[name]
+        names.update(before)
 
 
 class _Uncollected(event.Listener):
@@ -158,24 +170,19 @@ def _is_wrapped(cres: Any) -> bool:
     return bool(cres.library.get_pointer_to_function(cres.fndesc.llvm_cpython_wrapper_name))
 
 
-@contextmanager
-def _changed(names: dict[str, Any], **values: Any) -> Iterator[None]:
-    names.update(values)
-    try:
-        yield
-    finally:
-        for name in values:
-            del names[name]
-
-
-def wrapped_when_called(dispatcher: Any) -> Any:
-    """Let a function of ``numba.njit`` have its wrapper when Python calls it.
+def njit_for_compiled(**options: Any) -> Callable[[Callable], Any]:
+    """``numba.njit`` of a function that compiled code calls; Python may, and then waits for a wrapper.
 
     Args:
-        dispatcher: the function, not compiled yet.
+        options: of ``numba.njit``.
     """
-    dispatcher.__class__ = _WrappedWhenCalled
-    return dispatcher
+
+    def decorate(function: Callable) -> Any:
+        dispatcher = njit(**{"no_cfunc_wrapper": True, **options})(function)
+        dispatcher.__class__ = _WrappedWhenCalled
+        return dispatcher
+
+    return decorate
 
 
 def define_call(
