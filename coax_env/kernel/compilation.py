@@ -21,13 +21,11 @@ import numba
 from coax_env.kernel.numba_internals import (
     PACKAGE,
     cached_in,
-    compare_flags_quickly,
-    compile_uncollected,
+    compile_quickly,
     njit_for_compiled,
 )
 
-compile_uncollected()
-compare_flags_quickly()
+compile_quickly()
 
 COMPILED_ROOMS = ("kernel", "model")
 
