@@ -2,6 +2,8 @@
 
 import gc
 import subprocess
+import threading
+import time
 from pathlib import Path
 
 import numba
@@ -11,8 +13,8 @@ from numba.extending import overload
 
 from coax_env.estimation import beginnings, compile_ahead, frozen_gains, kalman, noise_score
 from coax_env.kernel import compilation
-from coax_env.kernel.compilation import compiled_when_called
-from coax_env.kernel.numba_internals import PackagedCacheLocator
+from coax_env.kernel.compilation import compiled, compiled_when_called
+from coax_env.kernel.numba_internals import PackagedCacheLocator, cached_in
 
 
 def test_what_only_python_calls_is_compiled_when_it_is_called(tmp_path, monkeypatch):
@@ -29,6 +31,32 @@ def test_what_only_python_calls_is_compiled_when_it_is_called(tmp_path, monkeypa
     assert not (tmp_path / "with a user's effect").exists()
 
 
+def test_what_compiled_code_alone_calls_has_no_wrapper_until_python_calls_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(compilation, "CACHE_DIR", tmp_path)
+
+    def a_new_process():
+        @compiled()
+        def doubled(x):
+            return x + x
+
+        @compiled()
+        def and_one(x):
+            return doubled(x) + 1.0
+
+        return doubled, and_one
+
+    def compiled_now(*functions):
+        return [sum(f.stats.cache_misses.values()) for f in functions]
+
+    doubled, and_one = a_new_process()
+    assert and_one(1.5) == 4.0 and compiled_now(doubled, and_one) == [1, 1]
+    assert doubled(1.5) == 3.0 and and_one(2.5) == 6.0
+    assert compiled_now(doubled, and_one) == [2, 1]
+    stored, another = a_new_process()
+    assert another(1.5) == 4.0 and stored(1.5) == 3.0
+    assert compiled_now(stored) == [0], "with a wrapper it serves both"
+
+
 def test_a_copy_of_the_package_loads_what_was_compiled_for_the_other(tmp_path):
     """The place in the cache is the file's in the package; a user's own file keeps its whole path."""
     package = Path(compilation.__file__).parents[1]
@@ -41,6 +69,26 @@ def test_a_copy_of_the_package_loads_what_was_compiled_for_the_other(tmp_path):
 
 def probed(x):
     """Of which the compiler asks, while it compiles, how it is to be compiled."""
+
+
+def test_settings_of_one_thread_are_not_those_of_another(tmp_path):
+    """They were: what a batch of two threads compiled was now and then cached in the working folder."""
+    before = numba.config.CACHE_DIR
+    entered, found = threading.Event(), []
+
+    def one_more() -> None:
+        with cached_in(str(tmp_path / "first")):
+            entered.set()
+            time.sleep(0.05)  # [s] the other comes to its own
+            found.append(numba.config.CACHE_DIR)
+
+    thread = threading.Thread(target=one_more)
+    thread.start()
+    entered.wait()
+    with cached_in(str(tmp_path / "second")):
+        thread.join()
+        assert str(tmp_path / "second") == numba.config.CACHE_DIR
+    assert found == [str(tmp_path / "first")] and before == numba.config.CACHE_DIR
 
 
 def test_no_garbage_is_collected_while_numba_compiles_and_it_is_again_afterwards():

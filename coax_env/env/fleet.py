@@ -296,9 +296,10 @@ class Fleet:
         before = self.x
         self.x = x = np.empty_like(before) if simd else before.copy()
 
+        fly = _simd_loop(self.makeup) if simd else None
+
         def rows(first: int, last: int) -> None:
-            if simd:
-                fly = _simd_loop(self.makeup)
+            if fly:
                 fly(first, last, active, actions, before, x, heli, world, mission, outcome)
             else:
                 if self._disturbed:

@@ -18,9 +18,14 @@ from typing import Any
 
 import numba
 
-from coax_env.kernel.numba_internals import PACKAGE, cached_in, compile_uncollected
+from coax_env.kernel.numba_internals import (
+    PACKAGE,
+    cached_in,
+    compile_quickly,
+    njit_for_compiled,
+)
 
-compile_uncollected()
+compile_quickly()
 
 COMPILED_ROOMS = ("kernel", "model")
 
@@ -115,7 +120,7 @@ def compiled(
         name_apart(function)
         with _own_cache(folder):
             if signature is None:
-                return numba.njit(**settings)(function)
+                return njit_for_compiled(**settings)(function)
             return numba.njit(signature, **settings)(function)
 
     return decorate

@@ -13,11 +13,11 @@ from collections.abc import Callable, Mapping, Sequence
 from types import FunctionType
 from typing import Any, NamedTuple
 
-from numba import njit
 from numba.extending import is_jitted
 
 from coax_env.kernel.compilation import BORROWING, compiled
 from coax_env.kernel.lazy import lazily_compiled
+from coax_env.kernel.numba_internals import njit_for_compiled
 
 WITH_EFFECTS = True
 """In a variant's source: whether it is the one with effects."""
@@ -111,7 +111,7 @@ def inlined(
             options = {**BORROWING, "nogil": True, "forceinline": forced}
             if is_jitted(value):  # a user's effect may make arrays
                 options["_nrt"] = value.targetoptions.get("_nrt", False)
-            made[id(plain)] = njit(**options)(under_names(plain, own, kind))
+            made[id(plain)] = njit_for_compiled(**options)(under_names(plain, own, kind))
         return made[id(plain)]
 
     return tuple(of(function) for function in functions)

@@ -47,10 +47,12 @@ def find_outliers(channel: str, values: np.ndarray, noise: float | None = None) 
         return flagged
     padded = np.pad(y, HALF_WINDOW, mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * HALF_WINDOW + 1)
-    centre = np.median(windows, axis=1)
-    spread = _NORMAL * np.median(np.abs(windows - centre[:, None]), axis=1)
-    scale = np.maximum(spread, noise if noise is not None else _noise_level(y))
-    outlier = _short_bursts(np.abs(y - centre) > THRESHOLD * scale)
+    centre = _median_of_each(windows)
+    least = noise if noise is not None else _noise_level(y)
+    far = np.abs(y - centre) > THRESHOLD * least  # few: their spread alone is asked for
+    spread = _NORMAL * _median_of_each(np.abs(windows[far] - centre[far, None]))
+    far[far] = np.abs(y - centre)[far] > THRESHOLD * spread
+    outlier = _short_bursts(far)
     flagged[present[outlier]] = True
     return flagged
 
@@ -87,6 +89,12 @@ def find_leaps(channel: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
             if abs(y[back + 1] - y[out]) < LEAP_REST * least:
                 flagged[present[out + 1 : back + 1]] = True
     return flagged
+
+
+def _median_of_each(windows: np.ndarray) -> np.ndarray:
+    """np.median of an odd number of readings (n, 2 HALF_WINDOW + 1), in a quarter of its time."""
+    middle: np.ndarray = np.partition(windows, HALF_WINDOW, axis=1)[:, HALF_WINDOW]
+    return middle
 
 
 def _present(channel: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

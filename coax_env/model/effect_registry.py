@@ -11,10 +11,10 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from coax_env.errors import InputError
 from coax_env.kernel.compilation import BORROWING, name_apart
+from coax_env.kernel.numba_internals import njit_for_compiled
 from coax_env.model import generic_terms
 from coax_env.model import parameters as P
 from coax_env.model.layout import CHANNELS
@@ -145,7 +145,8 @@ def effect(
             if channel not in CHANNELS:
                 raise InputError(f"effect {own!r}: no channel {channel!r}")
         own_code = function.__module__.startswith("coax_env.")  # a user's may make arrays
-        function_compiled = njit(**{**BORROWING, "_nrt": not own_code})(name_apart(function))
+        settings = {**BORROWING, "_nrt": not own_code}
+        function_compiled = njit_for_compiled(**settings)(name_apart(function))
         entry = Effect(
             name=own,
             stage=stage,
@@ -296,7 +297,7 @@ def completed(effect_name: str, table: Mapping[str, Any], make: Callable) -> dic
 
 def stage_function(stage: int) -> Callable:
     """One function that runs all effects of a stage in the catalogue's order, for compiled code."""
-    return njit(**BORROWING)(stage_source(stage))
+    return njit_for_compiled(**BORROWING)(stage_source(stage))
 
 
 def stage_source(stage: int, used: Collection[str] | None = None) -> FunctionType:
