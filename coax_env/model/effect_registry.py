@@ -167,7 +167,7 @@ def effect(
         GROUPS[own] = entry
         if not generic:
             CATALOGUE[own] = entry
-        _offs.cache_clear()
+        _forget_tables()
         return function_compiled
 
     return enter
@@ -183,7 +183,13 @@ def forget(names: Collection[str]) -> None:
     for name in names:
         GROUPS.pop(name)
         CATALOGUE.pop(name, None)
-    _offs.cache_clear()
+    _forget_tables()
+
+
+def _forget_tables() -> None:
+    """What is looked up in the catalogue is looked up anew."""
+    for table in (_offs, _places, _off_vector):
+        table.cache_clear()
 
 
 def n_parameters() -> int:
@@ -205,19 +211,28 @@ def _offs() -> tuple[np.ndarray, np.ndarray]:
 # --- what the kernel and the vehicle files read -----------------------------------------------------
 
 
+@cache
+def _places() -> dict[str, int]:
+    """Place of every parameter in the parameter vector, by full name."""
+    places = {name: i for i, name in enumerate(P.BASE)}
+    places |= {name: P.COMMAND_GAIN + i for i, name in enumerate(P.COMMAND_GAINS)}
+    for entry in GROUPS.values():
+        places |= {name: entry.index + i for i, name in enumerate(entry.names())}
+    return places
+
+
 def parameter_index(name: str) -> int:
     """Place of ``"mass"`` or ``"ground_effect.gain"`` in the parameter vector."""
-    group, _, own = name.rpartition(".")
-    if not group:
-        return list(P.BASE).index(name)
-    if name in P.COMMAND_GAINS:
-        return P.COMMAND_GAIN + list(P.COMMAND_GAINS).index(name)
-    entry = GROUPS[group]
-    return entry.index + [p.name for p in entry.parameters].index(own)
+    return _places()[name]
 
 
 def off_vector() -> np.ndarray:
     """Parameter vector with every effect off and the base parameters NaN."""
+    return _off_vector().copy()
+
+
+@cache
+def _off_vector() -> np.ndarray:
     vector = np.full(n_parameters(), np.nan)
     vector[P.GUST_MEMORIES] = GUST_MEMORY
     vector[P.AIR_DOWN : P.N_FIXED] = 0.0
@@ -229,8 +244,8 @@ def off_vector() -> np.ndarray:
 def pack(values: Mapping[str, float]) -> np.ndarray:
     """The kernel's parameter vector from full names and values; effects not named are off."""
     vector = off_vector()
-    for name, value in values.items():
-        vector[parameter_index(name)] = value
+    places = _places()
+    vector[[places[name] for name in values]] = list(values.values())
     for reference, own in P.GUST_REFERENCE.items():
         vector[reference] = vector[own]
     set_switches(vector)
