@@ -85,7 +85,12 @@ def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
     problem.report("fitting the model's own parameters")
     refitted = steadied(problem, noise_fitted(problem, fitted(problem, bare)))
     problem.report("searching for causes")
-    return Searched(problem, bare, refitted, *search(problem, refitted), coarse)
+    fit, quadratic = search(problem, refitted)
+    steady = steadied(problem, fit)  # the noise had taken up what now has a name
+    if steady.objective < fit.objective - problem.settings.tie:
+        problem.report("searching on from steadier noise")
+        fit, quadratic = search(problem, steady)
+    return Searched(problem, bare, refitted, fit, quadratic, coarse)
 
 
 def _with_jitter(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] | None:

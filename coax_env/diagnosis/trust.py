@@ -2,8 +2,8 @@
 
 Sure is what holds: under half and twice every noise level (noise_variation.py), without any one run and
 on halves of the flights (replication.py), with white innovations where it shows, a usual size, a number
-that the flights determine, and no other effect that would do as well. A doubtful cause still improves
-the model, and stays in it.
+that the flights determine, no other effect that would do as well, and gusts that do not come in single
+shocks (shocks.py). A doubtful cause still improves the model, and stays in it.
 """
 
 import math
@@ -17,6 +17,7 @@ from coax_env.diagnosis.noise_variation import not_holding
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, of_runs, replications
 from coax_env.diagnosis.settings import SETTINGS, Settings
+from coax_env.diagnosis.shocks import gust_kurtosis
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
 from coax_env.estimation.quadratic import Quadratic
@@ -83,6 +84,7 @@ def trusts(
     worth = {effect: weighed.nats for effect, weighed in evidence.items()}
     replicated = replications(problem, fit, quadratic, worth)
     falling = not_holding(problem, fit, quadratic, worth)
+    in_shocks = bool(fit.active) and gust_kurtosis(problem, fit) > problem.settings.shocks
     runs = len(of_runs(problem.engine.records))
     result = {}
     for effect in fit.active:
@@ -94,6 +96,7 @@ def trusts(
             *_sizes(problem, fit, effect),
             *_undetermined(problem, effect, known),
             *_alternatives(found[effect]),
+            *(_in_shocks(worth[effect], problem.settings) if in_shocks else ()),
         )
         of_parts = replicated[effect]
         result[effect] = Trust(
@@ -210,6 +213,11 @@ def _alternatives(names: Iterable[str]) -> Iterable[str]:
     alternatives = [plain(name) for name in names]
     if alternatives:
         yield f"these flights cannot distinguish it from {and_list(alternatives)}"
+
+
+def _in_shocks(nats: float, chosen: Settings) -> Iterable[str]:
+    if nats < chosen.clear_evidence * chosen.evidence:
+        yield f"gusts come in single shocks here, and {nats:.0f} nats may be one of them"
 
 
 # --- priors beside a large axis ---------------------------------------------------------------------

@@ -133,14 +133,15 @@ class _Prediction:
 
     @staticmethod
     def of(passes: Sequence[RunPass]) -> "_Prediction":
-        whitened = [run.innovations[~np.isnan(run.innovations)] for run in passes]
+        whitened = [run.innovations[~np.isnan(run.record.z)] for run in passes]
         std = 1.0 / np.concatenate([run.per_sigma for run in passes])
         return _Prediction(np.concatenate(whitened) * std, std)
 
     def beside(self, other: "_Prediction") -> np.ndarray:
         """How far the other is away, (2 readings,): half its sum of squares is in nats."""
         mean = (self.innovations - other.innovations) / np.sqrt(self.std * other.std)
-        return np.concatenate([mean, math.sqrt(2.0) * np.log(self.std / other.std)])
+        away = np.concatenate([mean, math.sqrt(2.0) * np.log(self.std / other.std)])
+        return np.nan_to_num(away, nan=0.0, posinf=0.0, neginf=0.0)  # of a run that diverges: none
 
 
 @dataclass(frozen=True)

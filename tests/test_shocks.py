@@ -1,0 +1,45 @@
+"""Gusts that come in shocks: what is known of the kurtosis of a few distributions."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.diagnosis.shocks import STATES, gust_kurtosis
+from coax_env.estimation.state_space import Noise
+
+DT = 0.01
+
+
+def fitted(increments: np.ndarray, level: float = 0.2) -> float:
+    """Of a flight whose gusts move so from tenth to tenth of a second, on one axis after the other."""
+    places = [place for places in STATES.values() for place in places]
+    states = np.zeros((10 * (len(increments) + 1), max(places) + 1))
+    walk = np.concatenate([np.zeros((1, increments.shape[1])), np.cumsum(increments, axis=0)])
+    states[:, places] = np.repeat(walk, 10, axis=0)
+    record = SimpleNamespace(t=DT * np.arange(len(states)))
+    engine = SimpleNamespace(
+        records=[record], filter=lambda values, noise: [SimpleNamespace(states=states)]
+    )
+    noise = Noise(dict.fromkeys(STATES, level), floor=dict.fromkeys(STATES, 0.01))
+    return gust_kurtosis(SimpleNamespace(engine=engine), SimpleNamespace(values={}, noise=noise))
+
+
+def draw(kind: str) -> np.ndarray:
+    return getattr(np.random.default_rng(3), kind)(size=(20_000, 6))
+
+
+def test_the_kurtosis_is_that_of_the_distribution() -> None:
+    assert fitted(draw("normal")) == pytest.approx(0.0, abs=0.2)
+    assert fitted(draw("laplace")) == pytest.approx(3.0, rel=0.25)
+
+
+def test_one_axis_in_shocks_is_enough() -> None:
+    increments = draw("normal")
+    increments[::500, 4] *= 20.0
+    assert fitted(increments) > 10.0 * SETTINGS.shocks
+
+
+def test_gusts_at_their_floor_are_none() -> None:
+    assert fitted(draw("standard_cauchy"), level=0.01) == 0.0
