@@ -2,8 +2,9 @@
 
 Sure is what holds: under half and twice every noise level (noise_variation.py), without any one run and
 on halves of the flights (replication.py), with white innovations where it shows, a usual size, a number
-that the flights determine, no other effect that would do as well, and gusts that do not come in single
-shocks (shocks.py). A doubtful cause still improves the model, and stays in it.
+that the flights determine, no other effect that would do as well, and more evidence than something that
+no list has, or a single gust (shocks.py), gives a wrong name. A doubtful cause still improves the
+model, and stays in it.
 """
 
 import math
@@ -96,7 +97,7 @@ def trusts(
             *_sizes(problem, fit, effect),
             *_undetermined(problem, effect, known),
             *_alternatives(found[effect]),
-            *(_in_shocks(worth[effect], problem.settings) if in_shocks else ()),
+            *_weak(worth[effect], in_shocks, problem.settings),
         )
         of_parts = replicated[effect]
         result[effect] = Trust(
@@ -215,9 +216,11 @@ def _alternatives(names: Iterable[str]) -> Iterable[str]:
         yield f"these flights cannot distinguish it from {and_list(alternatives)}"
 
 
-def _in_shocks(nats: float, chosen: Settings) -> Iterable[str]:
-    if nats < chosen.clear_evidence * chosen.evidence:
+def _weak(nats: float, in_shocks: bool, chosen: Settings) -> Iterable[str]:
+    if in_shocks and nats < chosen.clear_evidence * chosen.evidence:
         yield f"gusts come in single shocks here, and {nats:.0f} nats may be one of them"
+    elif nats < chosen.sure_evidence:
+        yield f"it is worth {nats:.0f} nats, as what is in no list may be by its name"
 
 
 # --- priors beside a large axis ---------------------------------------------------------------------
