@@ -353,3 +353,17 @@ def test_a_trial_that_diverges_is_refused_and_says_so(monkeypatch):
     monkeypatch.setattr(moves, "fitted", lambda problem, fit: replace(fit, objective=math.inf))
     assert accepted(problem, fit, proposal) is None
     assert said == [f"refused + {EFFECTS[0]}: with it the filter diverges"]
+
+
+@pytest.mark.parametrize(
+    ("nats", "in_shocks", "words"),
+    [
+        (2.9 * SETTINGS.evidence, False, "in no list"),
+        (3.1 * SETTINGS.evidence, False, ""),
+        (3.1 * SETTINGS.evidence, True, "single shocks"),
+        (11.0 * SETTINGS.evidence, True, ""),
+    ],
+)
+def test_little_evidence_leaves_a_doubt_and_more_of_it_is_asked_in_shocks(nats, in_shocks, words):
+    found = list(trust_module._weak(nats, in_shocks, SETTINGS))
+    assert bool(found) == bool(words) and all(words in text for text in found)

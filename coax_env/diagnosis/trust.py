@@ -220,7 +220,7 @@ def _weak(nats: float, in_shocks: bool, chosen: Settings) -> Iterable[str]:
     if in_shocks and nats < chosen.clear_evidence * chosen.evidence:
         yield f"gusts come in single shocks here, and {nats:.0f} nats may be one of them"
     elif nats < chosen.sure_evidence:
-        yield f"it is worth {nats:.0f} nats, as what is in no list may be by its name"
+        yield f"it is worth {nats:.0f} nats only: an effect that is in no list may look like it"
 
 
 # --- priors beside a large axis ---------------------------------------------------------------------
