@@ -6,23 +6,24 @@ import numpy as np
 import pytest
 
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.diagnosis.shocks import STATES, gust_kurtosis
+from coax_env.diagnosis.shocks import gust_kurtosis
+from coax_env.estimation.helicopter_noise import GUST_LEVELS
 from coax_env.estimation.state_space import Noise
+from coax_env.model.layout import GUSTS, N_FULL
 
 DT = 0.01
 
 
 def fitted(increments: np.ndarray, level: float = 0.2) -> float:
     """Of a flight whose gusts move so from tenth to tenth of a second, on one axis after the other."""
-    places = [place for places in STATES.values() for place in places]
-    states = np.zeros((10 * (len(increments) + 1), max(places) + 1))
+    states = np.zeros((10 * (len(increments) + 1), N_FULL))
     walk = np.concatenate([np.zeros((1, increments.shape[1])), np.cumsum(increments, axis=0)])
-    states[:, places] = np.repeat(walk, 10, axis=0)
+    states[:, GUSTS] = np.repeat(walk, 10, axis=0)
     record = SimpleNamespace(t=DT * np.arange(len(states)))
     engine = SimpleNamespace(
         records=[record], filter=lambda values, noise: [SimpleNamespace(states=states)]
     )
-    noise = Noise(dict.fromkeys(STATES, level), floor=dict.fromkeys(STATES, 0.01))
+    noise = Noise(dict.fromkeys(GUST_LEVELS, level), floor=dict.fromkeys(GUST_LEVELS, 0.01))
     return gust_kurtosis(SimpleNamespace(engine=engine), SimpleNamespace(values={}, noise=noise))
 
 

@@ -11,15 +11,11 @@ from scipy.stats import kurtosis
 
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.fitted_vehicle import median_step
-from coax_env.model import state as S
+from coax_env.estimation.helicopter_noise import GUST_AXES
+from coax_env.model.layout import GUSTS
 
 SECONDS = 0.1
 """s between gusts of which the difference is looked at: beyond the readings' own noise; ours."""
-STATES = {
-    "force_xy": (S.GUST_X, S.GUST_Y), "force_z": (S.GUST_Z,),
-    "moment_xy": (S.GUST_L, S.GUST_M), "moment_z": (S.GUST_N,),
-}  # fmt: skip
-"""Level of the gusts -> the states that it is of."""
 
 
 def gust_kurtosis(problem: Problem, fit: Fit) -> float:
@@ -28,16 +24,10 @@ def gust_kurtosis(problem: Problem, fit: Fit) -> float:
     Args:
         problem, fit: with the causes. An axis whose level stands at a bound has no gusts.
     """
-    if any(level not in fit.noise.process for level in STATES):
+    moving = [not fit.noise.at_bound(level) for level in GUST_AXES]
+    if not any(moving):
         return 0.0
-    states = [
-        state
-        for level, of in STATES.items()
-        if not fit.noise.at_bound(level)
-        for state in of
-    ]  # fmt: skip
     apart = max(round(SECONDS / median_step(problem.engine.records)), 1)
     passes = problem.engine.filter(fit.values, fit.noise)
-    moved = [np.diff(run.states[::apart, states], axis=0) for run in passes]
-    largest = kurtosis(np.concatenate(moved), axis=0) if states else np.zeros(0)
-    return float(np.max(largest, initial=0.0))
+    moved = [np.diff(run.states[::apart, GUSTS][:, moving], axis=0) for run in passes]
+    return float(np.max(kurtosis(np.concatenate(moved), axis=0), initial=0.0))

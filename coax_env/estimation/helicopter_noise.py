@@ -111,7 +111,8 @@ _REACTING = np.array([[S.R, S.OMEGA_U], [S.R, S.OMEGA_L]])
 NOISE_PLACES = np.vstack([np.repeat(np.arange(N_FULL)[:, None], 2, axis=1), _REACTING])
 """Entries of the process noise's covariance: the diagonal, then yaw rate with each rotor's speed."""
 _SPIN_UP = effects.parameter_index("spin_up_reaction.gain")
-_GUST_AXES = ("force_xy", "force_xy", "force_z", "moment_xy", "moment_xy", "moment_z")
+GUST_AXES = ("force_xy", "force_xy", "force_z", "moment_xy", "moment_xy", "moment_z")
+"""Group of each gust state."""
 
 
 _USUAL = {
@@ -147,7 +148,7 @@ def process_noise(noise: Noise, p: np.ndarray) -> ProcessNoise:
     )  # fmt: skip
     q[S.R] += float(per_speed @ per_speed) * level[ROTOR_LEVEL] ** 2
     q[N_FULL:] = per_speed * level[ROTOR_LEVEL] ** 2
-    memory = np.array([level[f"memory_{axes}"] for axes in _GUST_AXES])
+    memory = np.array([level[f"memory_{axes}"] for axes in GUST_AXES])
     q[GUSTS] = 2.0 * gust_levels(noise) ** 2 / memory
     decay[GUSTS] = 1.0 / memory
     q[TRIMS] = [level[name] ** 2 for name in TRIM_LEVELS]
@@ -164,7 +165,7 @@ def start_noise(noise: Noise) -> np.ndarray:
 
 def gust_levels(noise: Noise) -> np.ndarray:
     """Std of the six gust states [N, N m]."""
-    return np.array([noise.process.get(axes, 0.0) for axes in _GUST_AXES])
+    return np.array([noise.process.get(axes, 0.0) for axes in GUST_AXES])
 
 
 def with_memories(p: np.ndarray, noise: Noise) -> None:

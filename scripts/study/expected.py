@@ -10,7 +10,8 @@ vehicle's own numbers, under their priors, the other hidden effects, and the lev
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,7 @@ SHAPES = {"ground_effect.decay": 1.3}
 
 PRIOR_SHARE = 0.1
 """Of a number's prior std: the step of its differences."""
+EMPTY: Mapping[str, float] = MappingProxyType({})
 LEVEL_STEP = 0.1
 """Step of the logarithm of a level of the noise."""
 
@@ -158,40 +160,51 @@ class _Truth:
 
     def worth(self, effect: str) -> float:
         """Nats of an effect, less the Occam factor."""
-        problem, truth = self.problem, self.prediction({}, {})
-        away = truth.beside(self.prediction(problem.off_values(effect), {}))
+        problem = self.problem
+        away = self._as_it_is.beside(self._changed(values=problem.off_values(effect)))
         own = problem.acting_names(effect)
-        rest, precision = self._rest(truth, effect)
-        precisions = np.diag(precision)
-        left = away - rest.T @ np.linalg.solve(rest @ rest.T + precisions, rest @ away)
-        mine = np.array([self._slope(truth, name) for name in own])
-        mine_left = mine - (mine @ rest.T) @ np.linalg.solve(rest @ rest.T + precisions, rest)
+        mine = np.array([self._slopes[name] for name in own])
+        rest = problem.free([e for e in self.listed if e != effect])
+        levels, known = self._of_levels
+        R = np.array([*(self._slopes[f.name] for f in rest), *levels])
+        precision = np.diag([*(f.std**-2 for f in rest), *known])
+        asked = np.vstack([away, mine])
+        left = asked - (asked @ R.T) @ np.linalg.solve(R @ R.T + precision, R)
         prior = np.array([f.std for f in problem.own[effect] if f.name in own])
-        posterior = np.outer(prior, prior) * (mine @ mine_left.T) + np.eye(len(own))
-        return float(0.5 * away @ left - 0.5 * np.linalg.slogdet(posterior)[1])
+        posterior = np.outer(prior, prior) * (mine @ left[1:].T) + np.eye(len(own))
+        return float(0.5 * away @ left[0] - 0.5 * np.linalg.slogdet(posterior)[1])
 
-    def prediction(self, values: Mapping[str, float], levels: Mapping[str, float]) -> _Prediction:
+    def _changed(
+        self, values: Mapping[str, float] = EMPTY, levels: Mapping[str, float] = EMPTY
+    ) -> _Prediction:
         """Of the truth with some values and levels of the noise changed."""
         passes = self.problem.engine.filter(
             {**self.values, **values}, self.noise.with_levels(levels), keep=True
         )
         return _Prediction.of(passes)
 
-    def _slope(self, truth: _Prediction, name: str) -> np.ndarray:
-        """Of the predictions in a parameter."""
-        parameter = next(f for f in self.problem.parameters if f.name == name)
-        step = PRIOR_SHARE * parameter.std
-        if self.values[name] + step > parameter.upper:
-            step = -step
-        return truth.beside(self.prediction({name: self.values[name] + step}, {})) / step
+    @cached_property
+    def _as_it_is(self) -> _Prediction:
+        return self._changed()
 
-    def _rest(self, truth: _Prediction, effect: str) -> tuple[np.ndarray, np.ndarray]:
-        """Slopes in all that is fitted without it, (r, 2 readings), and their precisions, (r,)."""
-        free = self.problem.free([e for e in self.listed if e != effect])
-        slopes = [self._slope(truth, f.name) for f in free]
-        known = [f.std**-2 for f in free]
+    @cached_property
+    def _slopes(self) -> dict[str, np.ndarray]:
+        """Of the predictions in every parameter, (2 readings,) each."""
+        result = {}
+        for f in self.problem.parameters:
+            step = PRIOR_SHARE * f.std
+            if self.values[f.name] + step > f.upper:
+                step = -step
+            there = self._changed(values={f.name: self.values[f.name] + step})
+            result[f.name] = self._as_it_is.beside(there) / step
+        return result
+
+    @cached_property
+    def _of_levels(self) -> tuple[list[np.ndarray], list[float]]:
+        """Slopes in the logarithm of every level that is fitted, and what is known of it beforehand."""
+        slopes, known = [], []
         for name in fitted_levels(self.noise):
-            level = self.noise.level(name) * math.exp(LEVEL_STEP)
-            slopes.append(truth.beside(self.prediction({}, {name: level})) / LEVEL_STEP)
+            there = self._changed(levels={name: self.noise.level(name) * math.exp(LEVEL_STEP)})
+            slopes.append(self._as_it_is.beside(there) / LEVEL_STEP)
             known.append(self.noise.prior.get(name, (1.0, math.inf))[1] ** -2)
-        return np.array(slopes), np.array(known)
+        return slopes, known
