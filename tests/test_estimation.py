@@ -311,7 +311,8 @@ def stacked(record: Record, q: np.ndarray, first: np.ndarray, R: np.ndarray) -> 
     """Covariance of all readings of a linear record that there are, one after the other.
 
     Args:
-        q: (2,) intensities of the noise. first: (2,) variances of the first state. R: (3,).
+        q: (2,) or, by row, (n, 2) intensities of the noise. first: (2,) variances of the first state.
+        R: (3,).
     """
     n, H = record.t.size, np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
     k, d = TRUTH["stiffness"], TRUTH["damping"]
@@ -322,7 +323,7 @@ def stacked(record: Record, q: np.ndarray, first: np.ndarray, R: np.ndarray) -> 
         for later in range(row, n):
             blocks[later, :, row, :], blocks[row, :, later, :] = cross, cross.T
             cross = F @ cross
-        P = F @ P @ F.T + np.diag(q * DT)
+        P = F @ P @ F.T + np.diag(np.broadcast_to(q, (n, 2))[row] * DT)
     H_all = np.kron(np.eye(n), H)
     V = H_all @ blocks.reshape(2 * n, 2 * n) @ H_all.T + np.diag(np.tile(R, n))
     there = np.isfinite(record.z.ravel())

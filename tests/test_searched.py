@@ -61,6 +61,7 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
 
     monkeypatch.setattr(searched, "_searched", one)
     monkeypatch.setattr(searched, "_with_jitter", lambda problem, fit: None)
+    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
     monkeypatch.setattr(searched, "_flies_better", lambda *fits: answers.pop(0))
     engine = SimpleNamespace(filter=lambda values, noise: [])
@@ -71,3 +72,39 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
     assert asked == pytest.approx(stds) and found.coarse == coarse
     kept = sum(flies)
     assert found.fit.noise.reading["phi"] == pytest.approx(stds[kept])
+
+
+@pytest.mark.parametrize(
+    ("white", "found", "beside"),
+    [
+        (False, ("wind",), ["wind"]),  # strengths do not make innovations white: none are used
+        (True, (), ["wind", "refitted"]),  # nothing stands strengths of the model without a cause
+        (True, ("wind",), ["wind", "refitted", "wind"]),  # what stands them is asked beside its own
+    ],
+)
+def test_strengths_of_gusts_are_fitted_beside_what_stood_them(monkeypatch, white, found, beside):
+    """The engine's likelihoods are no part of this: which model's strengths are asked, and used."""
+    asked: list[str] = []
+
+    def shaken(problem: Any, fit: Any) -> Any:
+        asked.append(fit.active[0] if fit.active else "refitted")
+        return problem_of(f"strengths {len(asked)}"), fit
+
+    def problem_of(name: str) -> Any:
+        engine = SimpleNamespace(filter=lambda values, noise: [])
+        model = SimpleNamespace(channels=())
+        return SimpleNamespace(name=name, engine=engine, model=model, report=lambda text: None)
+
+    def search(problem: Any, noise: Noise) -> Any:
+        return SimpleNamespace(fit=Fit(found, {}, noise), of=problem.name)
+
+    monkeypatch.setattr(searched, "with_shocks", shaken)
+    monkeypatch.setattr(searched, "_searched", search)
+    monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
+    first = SimpleNamespace(fit=Fit(("wind",), {}, FINE), refitted=Fit((), {}, FINE))
+    problem, best = searched._in_shocks(problem_of("steady"), first, FINE)  # type: ignore[arg-type]
+    assert asked == beside
+    if not white:
+        assert best is first and problem.name == "steady"
+    else:
+        assert best.of == problem.name == f"strengths {len(beside)}"

@@ -4,7 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from study import arms
+from study.one_flight import hide
 
+from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.diagnosis.shocks import gust_kurtosis
 from coax_env.estimation.helicopter_noise import GUST_LEVELS
@@ -44,3 +47,20 @@ def test_one_axis_in_shocks_is_enough() -> None:
 
 def test_gusts_at_their_floor_are_none() -> None:
     assert fitted(draw("standard_cauchy"), level=0.01) == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arm", "kind", "number"),
+    [
+        ("heavy_tails", "clean", 1),  # a servo delay and a gyro scale without strengths
+        ("one_minus_cosine", "clean", 0),  # a rate damping
+        ("heavy_tails", "three", 0),
+    ],
+)
+def test_strengths_leave_what_is_there_and_nothing_else(arm, kind, number, tmp_path):
+    """Gusts of another form than the filter's, in closed loop, by other code."""
+    hidden = set(hide(arms.planned(arm, kind, number, 52), tmp_path / "flight")["hidden"])
+    found = diagnose(tmp_path / "flight").findings["causes"]
+    assert {c["effect"] for c in found} <= hidden
+    assert bool(hidden) == any(c["trust"] == "sure" for c in found)

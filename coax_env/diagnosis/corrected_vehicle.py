@@ -8,6 +8,7 @@ import numpy as np
 from coax_env.diagnosis.findings import stated_std
 from coax_env.diagnosis.input_innovations import has_command_gains, with_input_innovations
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.shocks import engine_of
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.engine import Engine, objective
 from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step
@@ -91,7 +92,7 @@ def with_held_out(
     names = [f.name for f in free]
     if not held:
         return {name: fit.values[name] for name in names}, quadratic.covariance(names)
-    engine = Engine(problem.model, held)
+    engine = engine_of(problem, held, fit)
     if has_command_gains(problem):
         engine = with_input_innovations(engine, fit)
     passes, lin = engine.linearise(fit.values, fit.noise, free)

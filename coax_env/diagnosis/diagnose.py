@@ -45,10 +45,10 @@ from coax_env.diagnosis.remarks import (
 )
 from coax_env.diagnosis.searched import searched
 from coax_env.diagnosis.settings import SETTINGS, Settings
+from coax_env.diagnosis.shocks import engine_of
 from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
 from coax_env.estimation.changing_model import clock_of
-from coax_env.estimation.engine import Engine
 from coax_env.estimation.fitted_vehicle import double_counting
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
@@ -348,19 +348,20 @@ def _gain(
         return [[], [], []], None
     problem.report("flying the held-out runs")
     horizon = problem.settings.horizon
-    engine = Engine(problem.model, held)
     bare, refitted, fit = fits
-    own = with_input_innovations(engine, fit) if has_command_gains(problem) else engine
-    before, own_numbers, after = (
-        replay_runs(engine, bare.values, bare.noise, horizon),
-        replay_runs(engine, refitted.values, refitted.noise, horizon),
-        replay_runs(own, fit.values, fit.noise, horizon, floor=True),
+    own = engine_of(problem, held, fit)
+    if has_command_gains(problem):
+        own = with_input_innovations(own, fit)
+    before, own_numbers = (
+        replay_runs(engine_of(problem, held, given), given.values, given.noise, horizon)
+        for given in (bare, refitted)
     )
+    after = replay_runs(own, fit.values, fit.noise, horizon, floor=True)
     flexible: list[RunReplay] = []
     if ceiling:
         problem.report("fitting a black box, for comparison")
         box = black_box(problem, refitted)
-        flexible = replay_runs(engine, box.values, box.noise, horizon)
+        flexible = replay_runs(engine_of(problem, held, box), box.values, box.noise, horizon)
     gain = gain_of(before, own_numbers, after, sensors, horizon, flexible)
     gain["held_out"] = list(dict.fromkeys(r.whole for r in held))
     return [before, own_numbers, after], gain

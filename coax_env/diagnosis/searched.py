@@ -20,6 +20,7 @@ import numpy as np
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
+from coax_env.diagnosis.shocks import in_shocks, with_shocks
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import pooled_rms, replay_runs
@@ -59,6 +60,8 @@ def searched(problem: Problem, noise: Noise) -> Searched:
         problem: what may be free. noise: levels to start from.
     """
     best = _searched(problem, noise)
+    if in_shocks(problem, best.fit):
+        problem, best = _in_shocks(problem, best, noise)
     found = _with_jitter(problem, best.fit)
     if found is not None:
         problem, levels = found
@@ -77,6 +80,28 @@ def searched(problem: Problem, noise: Noise) -> Searched:
             break
         best = other
     return best
+
+
+def _in_shocks(problem: Problem, first: Searched, noise: Noise) -> tuple[Problem, Searched]:
+    """The search with a strength of the gusts for each block of time.
+
+    First with strengths of the model without a cause, which take what a shock may be for one; then, if
+    causes stand that, with strengths beside these. What a model lacks looks like shocks too, and
+    strengths would believe it less just there: they must make its innovations white, or none are used.
+    """
+    trial, with_causes = with_shocks(problem, first.fit)
+    if not is_white(
+        trial.engine.filter(with_causes.values, with_causes.noise), problem.model.channels
+    ):
+        return problem, first
+    problem.report("gusts come in single shocks: searching again with a strength for each")
+    problem, _ = with_shocks(problem, first.refitted)
+    best = _searched(problem, noise)
+    if best.fit.active:
+        problem.report("searching again with strengths beside what was found")
+        problem, _ = with_shocks(problem, best.fit)
+        best = _searched(problem, noise)
+    return problem, best
 
 
 def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:

@@ -3,31 +3,80 @@
 One gust that stands out of the others is then a push on one run, and some effect always fits such
 pushes a little. Measured on clean synthetic flights of 108 s (`study_diagnosis.py --seed 52`, three of
 each arm): the largest excess kurtosis of an axis is 0.1 to 0.6 where gusts have an exponential memory,
-0.6 to 2.4 in Dryden turbulence, 5.9 to 10 of 1-cosine gusts, 6 to 154 of heavy-tailed ones.
+0.6 to 2.4 in Dryden turbulence, 5.9 to 10 of 1-cosine gusts, 6 to 154 of heavy-tailed ones. Where they
+do, each block of time gets a strength of its own (estimation/gust_strength.py).
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.stats import kurtosis
 
+from coax_env.diagnosis.fits import fitted, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.fitted_vehicle import median_step
+from coax_env.estimation.gust_strength import with_strengths
 from coax_env.estimation.helicopter_noise import GUST_AXES
-from coax_env.model.layout import GUSTS
+from coax_env.estimation.state_space import Record
+from coax_env.model.layout import GUSTS, N_FULL
 
 SECONDS = 0.1
 """s between gusts of which the difference is looked at: beyond the readings' own noise; ours."""
+ROUNDS = 3
+"""Of strengths and levels by turns: a level that strengths make smaller shows more of them; ours."""
+
+
+def in_shocks(problem: Problem, fit: Fit) -> bool:
+    """Whether some axis' gusts come in shocks that no strengths speak for."""
+    return not _has_strengths(problem) and gust_kurtosis(problem, fit) > problem.settings.shocks
 
 
 def gust_kurtosis(problem: Problem, fit: Fit) -> float:
     """Largest excess kurtosis of the increments of the gusts as filtered; 0 where there are none.
 
     Args:
-        problem, fit: with the causes. An axis whose level stands at a bound has no gusts.
+        problem, fit: with the causes.
     """
-    moving = [not fit.noise.at_bound(level) for level in GUST_AXES]
-    if not any(moving):
+    moving = _moving(fit)
+    if not moving.size:
         return 0.0
     apart = max(round(SECONDS / median_step(problem.engine.records)), 1)
     passes = problem.engine.filter(fit.values, fit.noise)
-    moved = [np.diff(run.states[::apart, GUSTS][:, moving], axis=0) for run in passes]
+    moved = [np.diff(run.states[::apart, moving], axis=0) for run in passes]
     return float(np.max(kurtosis(np.concatenate(moved), axis=0), initial=0.0))
+
+
+def with_shocks(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """The problem with a strength of the gusts for each block of time, and the fit to it.
+
+    Args:
+        problem, fit: with the causes.
+    """
+    for _ in range(ROUNDS):
+        records = with_strengths(problem.engine, fit.values, fit.noise, _moving(fit))
+        problem = problem.with_records(records)
+        fit = noise_fitted(problem, fitted(problem, fit))
+    return problem, fit
+
+
+def engine_of(problem: Problem, records: Sequence[Record], fit: Fit) -> Engine:
+    """An engine over other records, the strengths of their gusts fitted where the problem has some.
+
+    Args:
+        problem: whose model it has. records: that were not fitted. fit: of the model that flies them.
+    """
+    engine = Engine(problem.model, records)
+    if not _has_strengths(problem):
+        return engine
+    shaken = with_strengths(engine, fit.values, fit.noise, _moving(fit))
+    return Engine(problem.model, shaken)
+
+
+def _has_strengths(problem: Problem) -> bool:
+    return bool(problem.engine.records[0].strength.block.size)
+
+
+def _moving(fit: Fit) -> np.ndarray:
+    """Gust states whose level is not at a bound; at one, an axis has no gusts."""
+    return np.arange(N_FULL)[GUSTS][[not fit.noise.at_bound(level) for level in GUST_AXES]]

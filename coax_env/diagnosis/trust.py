@@ -18,7 +18,7 @@ from coax_env.diagnosis.noise_variation import not_holding
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, of_runs, replications
 from coax_env.diagnosis.settings import SETTINGS, Settings
-from coax_env.diagnosis.shocks import gust_kurtosis
+from coax_env.diagnosis.shocks import in_shocks
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
 from coax_env.estimation.quadratic import Quadratic
@@ -85,7 +85,7 @@ def trusts(
     worth = {effect: weighed.nats for effect, weighed in evidence.items()}
     replicated = replications(problem, fit, quadratic, worth)
     falling = not_holding(problem, fit, quadratic, worth)
-    in_shocks = bool(fit.active) and gust_kurtosis(problem, fit) > problem.settings.shocks
+    shaken = bool(fit.active) and in_shocks(problem, fit)
     runs = len(of_runs(problem.engine.records))
     result = {}
     for effect in fit.active:
@@ -97,7 +97,7 @@ def trusts(
             *_sizes(problem, fit, effect),
             *_undetermined(problem, effect, known),
             *_alternatives(found[effect]),
-            *_weak(worth[effect], in_shocks, problem.settings),
+            *_weak(worth[effect], shaken, problem.settings),
         )
         of_parts = replicated[effect]
         result[effect] = Trust(
@@ -216,8 +216,8 @@ def _alternatives(names: Iterable[str]) -> Iterable[str]:
         yield f"these flights cannot distinguish it from {and_list(alternatives)}"
 
 
-def _weak(nats: float, in_shocks: bool, chosen: Settings) -> Iterable[str]:
-    if in_shocks and nats < chosen.clear_evidence * chosen.evidence:
+def _weak(nats: float, shaken: bool, chosen: Settings) -> Iterable[str]:
+    if shaken and nats < chosen.clear_evidence * chosen.evidence:
         yield f"gusts come in single shocks here, and {nats:.0f} nats may be one of them"
     elif nats < chosen.sure_evidence:
         yield f"it is worth {nats:.0f} nats only: an effect that is in no list may look like it"

@@ -19,6 +19,7 @@ import numpy as np
 from coax_env.estimation import frozen_gains, kalman, noise_score
 from coax_env.estimation.beginnings import Asked, Beginning, Moved, Sums, beginnings_pass
 from coax_env.estimation.freed_memory import return_freed_memory
+from coax_env.estimation.noise_score import Slopes
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.sparse import add_gram, aligned, padded
 from coax_env.estimation.state_space import FreeParameter, Model, Noise, Record
@@ -325,7 +326,7 @@ class Engine:
         gains = kalman.Gains(K, per_sigma, H)
         path = kalman.Path(F, F_of, predicted, decaying, rows_of_P, beyond)
         log_likelihood, deweighted = kalman.filter_pass(
-            self.compiled, kalman.RunData(self.intervals[i], u, record.z),
+            self.compiled, kalman.RunData(self.intervals[i], u, record.z, record.strength),
             kalman.Variances(x0, P0, R, q, decay), p, GATE, self._refresh[i],
             kalman.Trace(states, e, gains, path), kalman.Covariances(P, slots),
         )  # fmt: skip
@@ -744,41 +745,66 @@ class Engine:
         for known in tuple(self._scored):
             if known.is_at(p, noise):
                 return known.score
-        q, decay = self.model.process_noise(noise, p)
-        places = self.compiled.noise_places
-        nx, m = self.starts[0][0].size, len(self.model.channels)
-        decaying = np.flatnonzero(decay[:nx] > 0.0)
-
-        def one(i: int) -> tuple[float, noise_score.Slopes]:
-            t = self.records[i].t
-            block = ((t - t[0]) / BLOCK).astype(np.int64)
-            shape = (int(block[-1]) + 1, q.size)
-            slopes = noise_score.Slopes(
-                np.zeros(shape), np.zeros(shape), np.zeros(nx), np.zeros((shape[0], m)),
-                np.zeros(q.size), np.zeros(nx), np.zeros(m),
-            )  # fmt: skip
-            with self._borrowed_buffers() as buffers:
-                run, at = self._filter_run(i, p, noise, buffers, buffers, decaying=decaying)
-                if np.isfinite(run.log_likelihood):
-                    noise_score.score_pass(
-                        self.intervals[i], _trace(run, at), places, q, decay, GATE,
-                        self._refresh[i], block, slopes,
-                    )  # fmt: skip
-            return run.log_likelihood, slopes
-
-        log_likelihood, slopes = zip(*self._each(one), strict=True)
+        blocks = [((r.t - r.t[0]) / BLOCK).astype(np.int64) for r in self.records]
+        log_likelihood, slopes = self._slopes(p, noise, blocks)
         score = NoiseScore(
             float(sum(log_likelihood)),
             np.concatenate([s.in_noise for s in slopes]),
             np.concatenate([s.in_decay for s in slopes]),
             np.array([s.in_start for s in slopes]),
             np.concatenate([s.in_reading for s in slopes]),
-            np.sum([s.noise_expected for s in slopes], axis=0),
+            np.sum([s.noise_expected.sum(axis=0) for s in slopes], axis=0),
             np.array([s.start_expected for s in slopes]),
             np.sum([s.reading_expected for s in slopes], axis=0),
         )
         self._scored.append(_Scored(p, noise, score))
         return score
+
+    def strength_slopes(
+        self, values: Mapping[str, float], noise: Noise
+    ) -> tuple[float, list[np.ndarray], list[np.ndarray]]:
+        """Log-likelihood [nats], and its slopes in the logarithms of the records' `Strength`.
+
+        Args:
+            values: of the parameters, by name. noise: levels of process and reading noise.
+
+        Returns:
+            -inf where a filter diverged; by record (blocks, e) what the data show of the noise and what
+            was expected, whose difference is the slope.
+        """
+        p = self.model.vector(values, noise)
+        q, _ = self.model.process_noise(noise, p)
+        log_likelihood, slopes = self._slopes(p, noise, [r.strength.block for r in self.records])
+        expected = [q * s.noise_expected for s in slopes]
+        shown = [q * (s.in_noise + s.noise_expected) for s in slopes]
+        return float(sum(log_likelihood)), shown, expected
+
+    def _slopes(
+        self, p: np.ndarray, noise: Noise, blocks: Sequence[np.ndarray]
+    ) -> tuple[list[float], list[Slopes]]:
+        """Each record's log-likelihood and its slopes, by blocks (n,) of its rows."""
+        q, decay = self.model.process_noise(noise, p)
+        nx, m = self.starts[0][0].size, len(self.model.channels)
+        decaying = np.flatnonzero(decay[:nx] > 0.0)
+
+        def one(i: int) -> tuple[float, Slopes]:
+            shape = (int(blocks[i].max()) + 1, q.size)
+            slopes = Slopes(
+                np.zeros(shape), np.zeros(shape), np.zeros(nx), np.zeros((shape[0], m)),
+                np.zeros(shape), np.zeros(nx), np.zeros(m),
+            )  # fmt: skip
+            with self._borrowed_buffers() as buffers:
+                run, at = self._filter_run(i, p, noise, buffers, buffers, decaying=decaying)
+                if np.isfinite(run.log_likelihood):
+                    noise_score.score_pass(
+                        self.intervals[i], self.records[i].strength, _trace(run, at),
+                        self.compiled.noise_places, q, decay, GATE, self._refresh[i], blocks[i],
+                        slopes,
+                    )  # fmt: skip
+            return run.log_likelihood, slopes
+
+        log_likelihood, slopes = zip(*self._each(one), strict=True)
+        return list(log_likelihood), list(slopes)
 
 
 def _without_gains(passes: Sequence[RunPass]) -> list[RunPass]:

@@ -35,6 +35,7 @@ from coax_env.estimation.sparse import (
     padded,
     with_places,
 )
+from coax_env.estimation.state_space import STEADY, Strength
 from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled, compiled_when_called, pointer
 from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks, transpose
@@ -104,11 +105,16 @@ class CompiledModel(NamedTuple):
 
 
 class RunData(NamedTuple):
-    """dt: (n,) seconds from each row to the next. u: (n, nu). z: (n, m), NaN where missing."""
+    """What a pass is given of a run.
+
+    dt: (n,) seconds from each row to the next. u: (n, nu). z: (n, m), NaN where missing.
+    strength: of its process noise, see state_space.Strength.
+    """
 
     dt: np.ndarray
     u: np.ndarray
     z: np.ndarray
+    strength: Strength = STEADY
 
 
 class Variances(NamedTuple):
@@ -241,7 +247,8 @@ MODEL = types.NamedTuple(
     [STEP, MEASURE, STEP, boolean[::1], boolean[::1], _A, int64, int64[:, ::1], boolean, LANES_STEP,
      LANES_MEASURE, LANES_STEP], CompiledModel
 )  # fmt: skip
-RUN_DATA = types.NamedTuple([_A, _M, _M], RunData)
+STRENGTH = types.NamedTuple([_N, _M], Strength)
+RUN_DATA = types.NamedTuple([_A, _M, _M, STRENGTH], RunData)
 VARIANCES = types.NamedTuple([_A, _M, _A, _A, _A], Variances)
 GAINS = types.NamedTuple([float32[:, ::1], _A, float32[:, :, ::1]], Gains)
 PATH = types.NamedTuple([float32[:, :, ::1], _N, _M, _N, float32[:, :, ::1], _A], Path)
@@ -476,11 +483,23 @@ def growth(dt, decay):
     return -math.expm1(-2.0 * decay * dt) / (2.0 * decay)
 
 
+@compiled()
+def strength_changes(strength, k, other):
+    """Whether process noise has another strength in row `k` than in the row `other`.
+
+    Args:
+        strength: of the process noise. k, other: rows.
+    """
+    return strength.block.size > 0 and strength.block[k] != strength.block[other]
+
+
 @compiled(**REORDER)
-def _grow(assumed, dt, w):
-    """Growth of the covariance over a row, by entry, into Q."""
+def _grow(assumed, dt, strength, k, w):
+    """Growth of the covariance over row `k`, of `dt` seconds, by entry, into Q."""
     for e in range(w.Q.size):
         w.Q[e] = assumed.q[e] * growth(dt, assumed.decay[e])
+        if strength.block.size:
+            w.Q[e] *= strength.factor[strength.block[k], e]
 
 
 @compiled(**REORDER)
@@ -602,8 +621,8 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
                 F_slot += 1
                 _store_matrix(w.F.values, trace.path.F[F_slot])
             trace.path.F_of[k] = F_slot
-        if abs(dt - dt_of_Q) > SAME_STEP * dt:
-            _grow(assumed, dt, w)
+        if abs(dt - dt_of_Q) > SAME_STEP * dt or strength_changes(run.strength, k, k - 1):
+            _grow(assumed, dt, run.strength, k, w)
             dt_of_Q = dt
         _predict(model.noise_places, w)
     return log_likelihood, deweighted

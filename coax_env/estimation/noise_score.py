@@ -6,7 +6,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import float64, int64, types
 
-from coax_env.estimation.kalman import _A, _M, _N, SAME_STEP, TRACE, growth
+from coax_env.estimation.kalman import (
+    _A,
+    _M,
+    _N,
+    SAME_STEP,
+    STRENGTH,
+    TRACE,
+    growth,
+    strength_changes,
+)
 from coax_env.estimation.sparse import (
     REORDER,
     aligned,
@@ -79,8 +88,8 @@ class Slopes(NamedTuple):
     in_noise: (blocks, e) in the intensity of each entry of the process noise, by blocks of time, and
     in_decay: (blocks, e) in its decay. in_start: (nx,) in each variance of the first state.
     in_reading: (blocks, m) in the variance of each channel's readings. Those in variances are what the
-    data show less what was expected; the latter, as shapes but for the blocks, is in
-    noise_expected: (e,), start_expected: (nx,), reading_expected: (m,).
+    data show less what was expected; the latter is in
+    noise_expected: (blocks, e), start_expected: (nx,), reading_expected: (m,).
     """
 
     in_noise: np.ndarray
@@ -92,7 +101,7 @@ class Slopes(NamedTuple):
     reading_expected: np.ndarray
 
 
-SLOPES = types.NamedTuple([_M, _M, _A, _M, _A, _A, _A], Slopes)
+SLOPES = types.NamedTuple([_M, _M, _A, _M, _M, _A, _A], Slopes)
 
 
 class _Backward(NamedTuple):
@@ -167,11 +176,14 @@ def _decay_slope(g, x, P, dt, w):
 
 
 @compiled(**REORDER)
-def _grow(decay, dt, w):
-    """What a row of `dt` seconds adds, into `grown` and `left`."""
+def _grow(decay, dt, strength, k, w):
+    """What row `k`, of `dt` seconds, adds, into `grown` and `left`."""
     for e in range(decay.size):
         w.grown[e] = growth(dt, decay[e])
         w.left[e] = dt * math.exp(-2.0 * decay[e] * dt)
+        if strength.block.size:
+            w.grown[e] *= strength.factor[strength.block[k], e]
+            w.left[e] *= strength.factor[strength.block[k], e]
 
 
 @compiled(**REORDER)
@@ -189,10 +201,10 @@ def _noise_slopes(places, q, decay, w, in_noise, in_decay, expected):
 
 
 @compiled_when_called(
-    types.void(_A, TRACE, int64[:, ::1], _A, _A, float64, int64, _N, SLOPES),
+    types.void(_A, STRENGTH, TRACE, int64[:, ::1], _A, _A, float64, int64, _N, SLOPES),
     makes_arrays=True, **REORDER,
 )  # fmt: skip
-def score_pass(dt, trace, places, q, decay, gate, refresh, block, out):
+def score_pass(dt, strength, trace, places, q, decay, gate, refresh, block, out):
     """Slopes of the log-likelihood in the noise levels, backwards over a run.
 
     With r the slope in the predicted state and N its variance, the slope in a variance added to
@@ -201,7 +213,8 @@ def score_pass(dt, trace, places, q, decay, gate, refresh, block, out):
     has the slope of what the gate takes off the likelihood.
 
     Args:
-        dt: (n,) seconds from each row to the next. trace: of the filter pass, with gains and path.
+        dt: (n,) seconds from each row to the next. strength: of the process noise, as in RunData.
+        trace: of the filter pass, with gains and path.
         places: (e, 2) entries of the process noise. q, decay: (e,) as in the filter pass.
         gate, refresh: as in the filter pass. block: (n,) which block of time each row is in.
         out: Slopes, from zero.
@@ -224,12 +237,13 @@ def score_pass(dt, trace, places, q, decay, gate, refresh, block, out):
     beyond = 0.5 * (gate * gate - 1.0)
     for k in range(n - 1, -1, -1):
         if k < n - 1:
-            if abs(dt[k] - dt_of_growth) > SAME_STEP * dt[k]:
-                _grow(decay, dt[k], w)
+            other = abs(dt[k] - dt_of_growth) > SAME_STEP * dt[k]
+            if other or strength_changes(strength, k, k + 1):
+                _grow(decay, dt[k], strength, k, w)
                 dt_of_growth = dt[k]
             _noise_slopes(
                 places, q, decay, w, out.in_noise[block[k]], out.in_decay[block[k]],
-                out.noise_expected,
+                out.noise_expected[block[k]],
             )  # fmt: skip
             if path.F_of[k] != F_slot:
                 F_slot = path.F_of[k]

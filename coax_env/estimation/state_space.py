@@ -25,6 +25,21 @@ class FreeParameter:
     reading_only: bool = False
 
 
+class Strength(NamedTuple):
+    """How much stronger than its level process noise is, by blocks of time.
+
+    block: (n,) the block of each row. factor: (blocks, e) of the intensity of each entry of the
+    model's `noise_places`. Both are empty where it is steady.
+    """
+
+    block: np.ndarray
+    factor: np.ndarray
+
+
+STEADY = Strength(np.zeros(0, np.int64), np.zeros((0, 0)))
+"""Process noise of one level from the first row to the last."""
+
+
 @dataclass(frozen=True)
 class Record:
     """One run as the engine sees it.
@@ -34,7 +49,7 @@ class Record:
     origin: time at which the run began, also where the record is a part of it.
     run: name of the run of which it is a part; empty where it is a run itself.
     input_innovations: (n, k) what each command shows beyond the readings before it, or None
-    (input_innovations.py). battery: (n,) its voltage [V], or None.
+    (input_innovations.py). battery: (n,) its voltage [V], or None. strength: of its process noise.
     """
 
     name: str
@@ -45,6 +60,7 @@ class Record:
     input_innovations: np.ndarray | None = None
     run: str = ""
     battery: np.ndarray | None = None
+    strength: Strength = STEADY
 
     @property
     def whole(self) -> str:
@@ -65,6 +81,9 @@ def part(record: Record, rows: np.ndarray) -> Record:
         z=record.z[rows],
         input_innovations=of(record.input_innovations),
         battery=of(record.battery),
+        strength=Strength(record.strength.block[rows], record.strength.factor)
+        if record.strength.block.size
+        else STEADY,
     )
 
 

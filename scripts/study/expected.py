@@ -19,7 +19,8 @@ from injector_air import Air, disturbances
 from injector_craft import Craft
 from injector_sensors import SENSORS
 
-from coax_env.diagnosis.problem import Problem
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.shocks import in_shocks, with_shocks
 from coax_env.estimation.engine import RunPass
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise, still_air
@@ -79,7 +80,11 @@ def expected_evidence(
     problem = Problem.of(model, records, listed)
     off = {n: v for effect in listed for n, v in problem.off_values(effect).items()}
     noise = true_noise(planned, flight, vehicle, values)
-    about = _Truth(problem, {**model.bare_values, **off, **values}, noise, listed)
+    fit = Fit(tuple(listed), {**model.bare_values, **off, **values}, noise)
+    if in_shocks(problem, fit):  # the level beside the strengths is another
+        problem, shaken = with_shocks(problem, replace(fit, levels=fitted_levels(noise)))
+        noise = shaken.noise
+    about = _Truth(problem, fit.values, noise, listed)
     return result | {effect: about.worth(effect) for effect in listed}
 
 

@@ -19,6 +19,7 @@ from coax_env.diagnosis.fits import fitted, noise_fitted, start
 from coax_env.diagnosis.gain import gain_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.diagnosis.shocks import engine_of, in_shocks, with_shocks
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
@@ -183,7 +184,9 @@ def forced(
     fit = replace(fit, active=tuple(hidden))
     for _ in range(2):
         fit = fitted(problem, noise_fitted(problem, fit))
-    return fit, Engine(model, _records(flight, held, True))
+    if in_shocks(problem, fit):
+        problem, fit = with_shocks(problem, fit)
+    return fit, engine_of(problem, _records(flight, held, True), fit)
 
 
 def _records(flight: Flight, held: Collection[str], within: bool) -> list[Record]:
