@@ -21,7 +21,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, replications
 from coax_env.diagnosis.scores import lost
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.diagnosis.trust import beside_large_axes, determined, of_line, on_parts
+from coax_env.diagnosis.trust import at_limit, beside_large_axes, determined, of_line, on_parts
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
@@ -280,6 +280,22 @@ def test_a_size_is_unusual_from_two_and_a_half_on_and_a_limit_at_five(size, word
     values = {"gyro_bias.x": 0.0, "gyro_bias.y": size * usual, "gyro_bias.z": 0.0}
     found = list(trust_module._sizes(problem, Fit(("gyro_bias",), values, Noise({})), "gyro_bias"))
     assert bool(found) == bool(words) and all(words in text for text in found)
+
+
+@pytest.mark.parametrize(
+    ("size", "channels", "doubted"),
+    [(5.0, ["q", "r"], True), (4.9, ["q", "r"], False), (5.0, ["r", "h"], False)],
+)
+def test_what_shows_where_another_stands_at_its_limit_is_doubted(size, channels, doubted):
+    model = HeliModel(LAMA)
+    fit = Fit((), {f.name: f.value for f in model.effect_parameters("gyro_bias")}, Noise({}))
+    usual = model.effect_parameters("gyro_bias")[1].std
+    fit = fit.at({"gyro_bias.y": -size * usual})
+    problem = replace(problem_of(1), model=model)
+    limited = {"gyro_bias": ["p", "q"]} if at_limit(problem, fit, "gyro_bias") else {}
+    found = list(trust_module._beside_limits("servo_delay", channels, limited))
+    assert bool(found) == doubted and all("gyro bias" in text for text in found)
+    assert not list(trust_module._beside_limits("gyro_bias", ["p", "q"], limited))
 
 
 def test_a_size_is_that_beyond_the_off_value():

@@ -1,10 +1,10 @@
 """When may a name be believed? Each cause is sure, or doubtful with the reasons in plain words.
 
 Sure is what holds: under half and twice every noise level (noise_variation.py), without any one run and
-on halves of the flights (replication.py), with white innovations where it shows, a usual size, a number
-that the flights determine, no other effect that would do as well, and more evidence than something that
-no list has, or a single gust (shocks.py), gives a wrong name. A doubtful cause still improves the
-model, and stays in it.
+on halves of the flights (replication.py), with white innovations where it shows, a usual size and no
+cause at its limit beside it, a number that the flights determine, no other effect that would do as
+well, and more evidence than something that no list has, or a single gust (shocks.py), gives a wrong
+name. A doubtful cause still improves the model, and stays in it.
 """
 
 import math
@@ -22,6 +22,7 @@ from coax_env.diagnosis.shocks import in_shocks
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.model import effects
 from coax_env.plain_words import and_list, channel_name, plain
@@ -87,14 +88,17 @@ def trusts(
     falling = not_holding(problem, fit, quadratic, worth)
     shaken = bool(fit.active) and in_shocks(problem, fit)
     runs = len(of_runs(problem.engine.records))
+    channels = {e: channels_of(problem, fit, quadratic, e) for e in fit.active}
+    limited = {e: channels[e] for e in fit.active if at_limit(problem, fit, e)}
     result = {}
     for effect in fit.active:
         known = determined(problem, fit, quadratic, effect, evidence[effect].inflation)
         doubts = (
-            *_not_white(channels_of(problem, fit, quadratic, effect), white),
+            *_not_white(channels[effect], white),
             *_under_noise(falling[effect]),
             *on_parts(replicated[effect], runs, problem.settings),
             *_sizes(problem, fit, effect),
+            *_beside_limits(effect, channels[effect], limited),
             *_undetermined(problem, effect, known),
             *_alternatives(found[effect]),
             *_weak(worth[effect], shaken, problem.settings),
@@ -198,11 +202,35 @@ def _sizes(problem: Problem, fit: Fit, effect: str) -> Iterable[str]:
         effect
     ):  # usual sizes, however wide the priors are now
         size = abs(fit.values[f.name] - f.value)
-        if size > AT_BOUND * MOST_USUAL_SIZES * f.std:
+        if _is_limit(size, f):
             limit = f"{plain(f.name)} stands at the limit of what is believed"
             yield f"{limit}: something else hides behind the name"
         elif size > UNUSUAL_FROM * f.std:
             yield f"{plain(f.name)} is {size / f.std:.1f} usual sizes"
+
+
+def at_limit(problem: Problem, fit: Fit, effect: str) -> bool:
+    """Whether a number of an effect is as large as is believed at most.
+
+    Args:
+        problem, fit: with the effect. effect: an active one.
+    """
+    numbers = problem.model.effect_parameters(effect)
+    return any(_is_limit(abs(fit.values[f.name] - f.value), f) for f in numbers)
+
+
+def _is_limit(size: float, f: FreeParameter) -> bool:
+    return size > AT_BOUND * MOST_USUAL_SIZES * f.std
+
+
+def _beside_limits(
+    effect: str, channels: Sequence[str], limited: Mapping[str, Sequence[str]]
+) -> Iterable[str]:
+    """What stands at its limit leaves a part of itself to others that show in its channels."""
+    others = [plain(e) for e, of in limited.items() if e != effect and set(of) & set(channels)]
+    if others:
+        limit = f"{and_list(others)} beside it stands at the limit of what is believed"
+        yield f"{limit}: it may be a part of that"
 
 
 def _undetermined(problem: Problem, effect: str, known: Mapping[str, bool]) -> Iterable[str]:
