@@ -121,7 +121,7 @@ class Tracker:
 
     def _aimed(self, observations: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Observations from the point asked for; where that has moved, the estimate moves too."""
-        reach = self._approach.reach(self._view.way(observations), which)
+        reach = self._approach.reach(self._view.way(observations), which, DT * self._rows)
         seen, asked, there = self._view.relative_to_target(observations, reach)
         moved = np.where((self._rows > 0)[:, None], asked - self._asked, 0.0)[which]
         heading = asked[which, HEADING] + seen[which, self._view.names.index("psi")]
@@ -140,6 +140,8 @@ class Tracker:
 
     def acted(self, actions: np.ndarray) -> None:
         """Move on by one control period under actions (count, 4)."""
+        if self._view.aims:
+            self._approach.acted(actions)
         self._command = self.offset + self.design.action_scale * actions
         _predict(
             self._command, self._A, self._B, self._turn, self._turned, self._yaw_rate, self.state

@@ -20,6 +20,7 @@ from coax_env.diagnosis.diagnose import diagnose
 from coax_env.env import tasks
 from coax_env.errors import InputError
 from coax_env.files import write_json, write_text
+from coax_env.logs.flight import Flight
 from coax_env.model.usual_sizes import sized_for
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle, vehicle_toml
@@ -127,10 +128,7 @@ def _diagnosed(
     if truth:
         corrected, named, verdict = machine, list(machine.effects), "the truth"
     else:
-        result = diagnose(simulate(machine, MANEUVERS, seed=seed), bare)
-        corrected = result.vehicle_after
-        named = [cause["effect"] for cause in result.findings["causes"]]
-        verdict = result.findings["verdict"]
+        corrected, named, verdict = _named(simulate(machine, MANEUVERS, seed=seed), bare)
     found = {
         "seed": seed,
         "hidden": {
@@ -144,6 +142,16 @@ def _diagnosed(
     write_text(path.with_suffix(".toml"), vehicle_toml(corrected))
     write_json(path, found)
     return found
+
+
+def _named(flight: Flight, bare: Vehicle) -> tuple[Vehicle, list[str], str]:
+    """Corrected vehicle, causes, verdict; `bare` stays where the diagnosis refuses the flight."""
+    try:
+        result = diagnose(flight, bare)
+    except InputError as refusal:
+        return bare, [], f"no diagnosis: {refusal}"
+    causes = [cause["effect"] for cause in result.findings["causes"]]
+    return result.vehicle_after, causes, result.findings["verdict"]
 
 
 def _designs(

@@ -150,7 +150,7 @@ def train(
     return path
 
 
-BRISKER = {"position": 0.4, "speed": 1.2}
+BRISKER = {"position": 0.3, "speed": 1.2}
 """Limits [m, m/s] of the feedback under a policy that sees a target, and of its cost in training, which
 makes it calmer again: with lqr.BRISK it reaches fewer waypoints than LQG."""
 

@@ -4,7 +4,8 @@ In the tasks ``position`` and ``waypoints`` the observation ends with the vector
 (coax_env/env/tasks.py). Moved and rotated so that the target lies at the start's position, height
 and heading, it is an observation of ``hover``, and a hover controller flies it. A distant target is
 approached through setpoints on the way, no farther than REACH: a larger error would only saturate
-a linear controller. What the wind blows back from where it has been returns through nearer ones.
+a linear controller. What the wind blows back from where it has been returns through nearer ones, and
+so does a flight begin that is busy with the wind.
 """
 
 import math
@@ -13,16 +14,26 @@ import numpy as np
 
 from coax_env.env import hover, tasks
 from coax_env.env.hover import DOWN, HEADING, HORIZONTAL
+from coax_env.env.period import DT
 from coax_env.env.tasks import FORWARD, RIGHT, TURN, UP
 from coax_env.model.sensors import slow_instruments, suite
 
 REACH = {"place": 0.5, "height": 0.4, "heading": math.radians(10.0)}
 """Farthest setpoint at once [m, m, rad]."""
-RETURN = 0.2
+RETURN = 0.1
 """[m] the farthest place of a machine that was blown back: a brisk return is fast for long."""
-BLOWN_BACK = (0.25, 0.5)
+BLOWN_BACK = (0.1, 0.4)
 """[m] farther from the target than it has been: the setpoint comes nearer from the first on, and is
 RETURN's from the second."""
+CALM = (0.7, 1.0)
+"""[s] from the start: up to the first a machine whose swash plate is busy keeps its heading and goes no
+farther than CALM_PLACE at once, from the second on REACH holds. A level machine must first lean into
+the wind. In the model the stabiliser bar turns with a machine that yaws: what it remembers of the tilt
+then points elsewhere."""
+CALM_PLACE = 0.1  # [m]
+BUSY = (0.5, 0.9)
+"""Of the swash plate's range: smoothed use from which the plate is beginning to be busy, and is."""
+BUSY_MEMORY = 0.1  # [s] of that use
 NEW_TARGET = 0.3  # [m] a change of the distance in a control period that no flight makes
 AXES = range(3)
 PLACE_AXIS, HEIGHT_AXIS, HEADING_AXIS = AXES
@@ -92,13 +103,14 @@ class TargetView:
                 seen[:, self.names.index(name)] -= -motion[:, 2] if k == 2 else level[:, k]
 
     def relative_to_target(
-        self, observations: np.ndarray, place: np.ndarray | None = None
+        self, observations: np.ndarray, farthest: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Observations (count, width + 4) as those of a hover at the target, or on the way to it.
 
         Args:
             observations: with a target in them.
-            place: how far the setpoint may be away [m], (count,); None: REACH's.
+            farthest: how far the setpoint's place and heading may be away [m, rad], (count, 2);
+                None: REACH's.
 
         Returns:
             observations (count, width); the setpoint, x y z psi (count, 4); whether it is
@@ -107,7 +119,7 @@ class TargetView:
         assert self.places is not None
         seen = np.array(observations[:, : self.width], dtype=float)
         whole = self.way(observations)
-        way = _within_reach(whole, place)
+        way = _within_reach(whole, farthest)
         x, y, z, psi = self.places
         heading = seen[:, psi].copy()
         setpoint = np.empty((len(seen), 4))
@@ -125,38 +137,54 @@ class TargetView:
 
 
 class Approach:
-    """How near each of many helicopters has come to its target, which tells who was blown back."""
+    """How near each of many helicopters has come to its target, which tells who was blown back; and how
+    far its setpoint may then be away."""
 
     def __init__(self, count: int) -> None:
         self._nearest, self._last = np.full(count, np.nan), np.full(count, np.nan)
+        self._plate = np.ones(count)
 
     def reset(self, which: np.ndarray) -> None:
         """The rows of a mask (count,) begin new flights."""
-        self._last[which] = np.nan
+        self._last[which], self._plate[which] = np.nan, 1.0
 
-    def reach(self, way: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """How far the setpoint may be away [m], (count,): REACH's, down to RETURN where blown back.
+    def acted(self, actions: np.ndarray) -> None:
+        """Take in the actions (count, 4) of a control period."""
+        use = np.abs(actions[:, 2:]).max(axis=1)
+        self._plate += DT / BUSY_MEMORY * (use - self._plate)
+
+    def reach(self, way: np.ndarray, which: np.ndarray, flown: np.ndarray) -> np.ndarray:
+        """How far the setpoint's place and heading may be away [m, rad], (count, 2): REACH's; down to
+        RETURN where blown back, and to CALM_PLACE and nothing at a busy start.
 
         Args:
             way: to the target, (count, 4). which: rows whose way is new, (count,) bool.
+            flown: time since each flight's start [s], (count,).
         """
         distance = np.hypot(way[:, FORWARD], way[:, RIGHT])
         goes_on = np.abs(distance - self._last) < NEW_TARGET
         nearest = np.where(goes_on, np.minimum(self._nearest, distance), distance)
         self._nearest[which], self._last[which] = nearest[which], distance[which]
-        first, last = BLOWN_BACK
-        back = np.clip((distance - self._nearest - first) / (last - first), 0.0, 1.0)
-        return np.asarray(REACH["place"] + back * (RETURN - REACH["place"]))
+        back = _share(distance - self._nearest, BLOWN_BACK)
+        place = REACH["place"] + back * (RETURN - REACH["place"])
+        calm = (1.0 - _share(flown, CALM)) * _share(self._plate, BUSY)
+        place = place + calm * (np.minimum(place, CALM_PLACE) - place)
+        return np.column_stack([place, (1.0 - calm) * REACH["heading"]])
 
 
-def _within_reach(way: np.ndarray, place: np.ndarray | None = None) -> np.ndarray:
-    """A way (count, 4), or its beginning where it is longer than REACH, or than `place` (count,)."""
+def _share(values: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
+    """0 up to the first of two ends, 1 from the second on, linear between them."""
+    return np.asarray(np.clip((values - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0))
+
+
+def _within_reach(way: np.ndarray, farthest: np.ndarray | None = None) -> np.ndarray:
+    """A way (count, 4), or its beginning where longer than REACH, or than `farthest` (count, 2)."""
     way = way.copy()
     distance = np.maximum(np.hypot(way[:, FORWARD], way[:, RIGHT]), 1e-9)
-    farthest = np.asarray(REACH["place"] if place is None else place)
-    way[:, HORIZONTAL] *= np.minimum(1.0, farthest / distance)[:, None]
+    place, turn = (REACH["place"], REACH["heading"]) if farthest is None else farthest.T
+    way[:, HORIZONTAL] *= np.minimum(1.0, place / distance)[:, None]
     way[:, UP] = np.clip(way[:, UP], -REACH["height"], REACH["height"])
-    way[:, TURN] = np.clip(way[:, TURN], -REACH["heading"], REACH["heading"])
+    way[:, TURN] = np.clip(way[:, TURN], -turn, turn)
     return way
 
 

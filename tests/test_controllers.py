@@ -498,19 +498,41 @@ def test_what_is_blown_back_returns_through_nearer_setpoints():
     def reach(*ahead: float, which: np.ndarray = every) -> list[float]:
         way = np.zeros((2, 4))
         way[:, 0] = ahead
-        return approach.reach(way, which).tolist()
+        return approach.reach(way, which, np.full(2, 5.0))[:, 0].tolist()
 
     assert reach(1.0, 1.0) == [0.5, 0.5]
-    for away in np.linspace(0.0, 0.6, 7):  # the first is blown back, the second comes nearer
+    for away in np.linspace(0.0, 0.5, 6):  # the first is blown back, the second comes nearer
         found = reach(1.0 + away, 1.0 - away)
-    assert found == pytest.approx([0.2, 0.5])
-    assert reach(1.375, 0.4) == pytest.approx([0.35, 0.5]), "half between"
+    assert found == pytest.approx([0.1, 0.5])
+    assert reach(1.25, 0.4) == pytest.approx([0.3, 0.5]), "half between"
     assert reach(3.0, 2.0) == [0.5, 0.5], "new targets"
-    assert reach(3.2, 2.2) == [0.5, 0.5] and reach(3.4, 2.4) == pytest.approx([0.32, 0.32])
+    assert reach(3.1, 2.1) == pytest.approx([0.5, 0.5])
+    assert reach(3.34, 2.34) == pytest.approx([0.18, 0.18])
     approach.reset(np.array([True, False]))
-    assert reach(3.4, 2.4) == pytest.approx([0.5, 0.32])
-    assert reach(9.0, 2.6, which=np.array([False, True]))[1] == pytest.approx(0.2)
-    assert reach(3.4, 2.6) == pytest.approx([0.5, 0.2]), "the first saw nothing before"
+    assert reach(3.34, 2.34) == pytest.approx([0.5, 0.18])
+    assert reach(9.0, 2.5, which=np.array([False, True]))[1] == pytest.approx(0.1)
+    assert reach(3.4, 2.5) == pytest.approx([0.5, 0.1]), "the first saw nothing before"
+
+
+def test_a_flight_begins_with_near_setpoints_in_its_own_heading():
+    """Up to 0.7 s 0.1 m and no turn, from 1 s on all of the reach; nearer where blown back already, and
+    none of it once the plate is no longer busy."""
+    approach, one = Approach(1), np.array([True])
+
+    def reach(distance: float, flown: float) -> list[float]:
+        return approach.reach(np.array([[distance, 0.0, 0.0, 2.0]]), one, np.array([flown]))[0]
+
+    assert reach(1.0, 0.0) == pytest.approx([0.1, 0.0])
+    assert reach(1.0, 0.7) == pytest.approx([0.1, 0.0])
+    assert reach(1.0, 0.85) == pytest.approx([0.3, np.radians(5.0)])
+    assert reach(1.0, 1.0) == pytest.approx([0.5, np.radians(10.0)])
+    assert reach(1.25, 0.85) == pytest.approx([0.2, np.radians(5.0)])
+    for _ in range(100):
+        approach.acted(np.array([[1.0, -1.0, 0.1, -0.2]]))
+    assert reach(1.0, 0.3) == pytest.approx([0.5, np.radians(10.0)])
+    for _ in range(100):
+        approach.acted(np.array([[0.0, 0.0, 0.1, -0.7]]))
+    assert reach(1.0, 0.3) == pytest.approx([0.3, np.radians(5.0)], rel=1e-3)
 
 
 def test_drawn_vehicles_are_judged_by_the_worst(onboard):
@@ -814,6 +836,20 @@ def test_machines_are_flown_once(tmp_path):
     assert "machine 2" in machines.machines_page(first)
     with pytest.raises(InputError, match="another world"):
         list(machines.fly_machines([2], LAMA, tmp_path, 2, truth=True, wind=2.0))
+
+
+def test_a_machine_whose_flight_is_refused_flies_the_bare_model_on_both_sides(
+    tmp_path, monkeypatch
+):
+    from controllers import machines
+
+    def refuse(flight, bare):
+        raise InputError("the log contradicts itself")
+
+    monkeypatch.setattr(machines, "diagnose", refuse)
+    found = machines.fly_machine(2, LAMA, tmp_path, 2)
+    assert found["named"] == [] and "contradicts itself" in found["verdict"]
+    assert found["scores"]["lqg"]["bare"] == found["scores"]["lqg"]["corrected"]
 
 
 @pytest.mark.slow

@@ -21,8 +21,9 @@ _FILTER_MEMBERS = (
     "float asked[4]; /* the setpoint: x y z psi */",
     "float speed; /* asked for [m/s] */",
     "float nearest, last; /* distances from the target [m] */",
+    "float plate; /* its smoothed use, of its range */",
     "int row; /* of the sensors' cycle */",
-    "int started;",
+    "int periods; /* since the start, counted until the setpoint's reach is whole */",
 )
 _PID_MEMBERS = (
     "float smooth[3]; /* forward, right, down [m/s] */",

@@ -22,7 +22,17 @@ from controllers.lqr import LQG
 from controllers.pid import PID
 from controllers.policy import BEYOND, FEATURE_LIMIT, Policy
 from controllers.schedule import BRAKING, GATHERING, Schedule
-from controllers.target import BLOWN_BACK, NEW_TARGET, REACH, RETURN, TargetView
+from controllers.target import (
+    BLOWN_BACK,
+    BUSY,
+    BUSY_MEMORY,
+    CALM,
+    CALM_PLACE,
+    NEW_TARGET,
+    REACH,
+    RETURN,
+    TargetView,
+)
 
 _ACTIVATIONS = {
     "tanh": "#define ACTIVATION(x) tanhf(x)",
@@ -124,6 +134,12 @@ def _common_numbers(sensors: str, trim: np.ndarray, scale: np.ndarray) -> list[s
         macro("REACH_RETURN", RETURN),
         macro("BLOWN_FIRST", BLOWN_BACK[0]),
         macro("BLOWN_LAST", BLOWN_BACK[1]),
+        macro("CALM_PLACE", CALM_PLACE),
+        macro("CALM_FIRST", CALM[0]),
+        macro("CALM_LAST", CALM[1]),
+        macro("BUSY_FIRST", BUSY[0]),
+        macro("BUSY_LAST", BUSY[1]),
+        macro("BUSY_SHARE", DT / BUSY_MEMORY),
         macro("NEW_TARGET", NEW_TARGET),
         macro("REACH_HEADING", REACH["heading"]),
         macro("AT_NORTH", place("pn", "x")),

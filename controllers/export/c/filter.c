@@ -25,21 +25,35 @@ void coax_reset(coax_controller *c)
     c->asked[DOWN] = -HOVER_HEIGHT;
     c->speed = 0.0f;
     c->nearest = c->last = -1.0f; /* none yet: no distance is near it */
-    c->row = 0;
-    c->started = 0;
+    c->plate = 1.0f;
+    c->row = c->periods = 0;
 }
 
-/* How far the setpoint may be away: less where the machine was blown back from where it has been. */
-static float reach(coax_controller *c, const float *way)
+/* 0 up to `first`, 1 from `last` on, linear between them. */
+static float share_between(float value, float first, float last)
+{
+    return within((value - first) / (last - first), 0.0f, 1.0f);
+}
+
+/* How far the setpoint may be away, by axis: less where the machine was blown back from where it has
+ * been, and at a busy start.
+ */
+static void reach(coax_controller *c, const float *way, float *farthest)
 {
     const float distance = hypotf(way[FORWARD], way[RIGHT]);
+    const float calm = (1.0f - share_between(PERIOD * (float)c->periods, CALM_FIRST, CALM_LAST))
+                       * share_between(c->plate, BUSY_FIRST, BUSY_LAST);
+    float place;
 
     if (isfinite(distance)) {
         c->nearest = fabsf(distance - c->last) < NEW_TARGET ? fminf(c->nearest, distance) : distance;
         c->last = distance;
     }
-    return REACH_PLACE + within((c->last - c->nearest - BLOWN_FIRST) / (BLOWN_LAST - BLOWN_FIRST), 0.0f, 1.0f)
-                             * (REACH_RETURN - REACH_PLACE);
+    place = REACH_PLACE + share_between(c->last - c->nearest, BLOWN_FIRST, BLOWN_LAST)
+                              * (REACH_RETURN - REACH_PLACE);
+    farthest[AXIS_PLACE] = place + calm * (fminf(place, CALM_PLACE) - place);
+    farthest[AXIS_HEIGHT] = REACH_HEIGHT;
+    farthest[AXIS_HEADING] = (1.0f - calm) * REACH_HEADING;
 }
 
 /* The setpoint has moved: so has the estimate, which is relative to it. */
@@ -63,7 +77,7 @@ static void follow(coax_controller *c, const float *before, float heading)
 static void correct_by(const coax_controller *c, const design_point *p, float weight,
                        const float *seen, float *reading, float *change)
 {
-    const float(*gain)[STATES] = c->started ? p->gain[c->row] : p->first_gain;
+    const float(*gain)[STATES] = c->periods ? p->gain[c->row] : p->first_gain;
     float y[READINGS], expected[READINGS], dx[STATES], du[COAX_COMMANDS];
 
     deviation(c->state, p, dx);
@@ -117,6 +131,8 @@ static void correct(coax_controller *c, const blend *b, const float *seen, float
 /* On by one control period under the action that was given. */
 static void predict(coax_controller *c, const blend *b, const float *reading, const int *there)
 {
+    const float use = fmaxf(fabsf(c->action[COAX_COMMAND_DELTA_LON]),
+                            fabsf(c->action[COAX_COMMAND_DELTA_LAT]));
     float next[STATES] = {0.0f}, dx[STATES], moved[STATES], du[COAX_COMMANDS];
 
     for (int s = 0; s < b->count; s++) {
@@ -146,5 +162,7 @@ static void predict(coax_controller *c, const blend *b, const float *reading, co
         c->integral[k] = within(c->integral[k], -MOST[k], MOST[k]);
     }
     c->row = (c->row + 1) % CYCLE;
-    c->started = 1;
+    c->plate += BUSY_SHARE * (use - c->plate);
+    if (PERIOD * (float)c->periods < CALM_LAST)
+        c->periods++;
 }

@@ -8,7 +8,8 @@ static void beyond_setpoint(const float *way, float *left)
     for (int k = 0; k < BEYOND; k++)
         left[k] = 0.0f;
     if (way && isfinite(way[FORWARD] + way[RIGHT] + way[UP] + way[TURN])) {
-        within_reach(way, REACH_PLACE, left);
+        const float farthest[AXES] = {REACH_PLACE, REACH_HEIGHT, REACH_HEADING};
+        within_reach(way, farthest, left);
         for (int k = 0; k < BEYOND; k++)
             left[k] = way[k] - left[k];
     }

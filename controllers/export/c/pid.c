@@ -35,12 +35,13 @@ void coax_step(coax_controller *c, const float observation[COAX_OBSERVED], const
                            0.5f / GAIN_HEIGHT_SUM, 0.5f / GAIN_HEADING_SUM};
     float held[COAX_OBSERVED], y[COAX_OBSERVED];
     float forward, right, pitch, roll, lift, twist, error[4], speed[3];
+    const float farthest[AXES] = {REACH_PLACE, REACH_HEIGHT, REACH_HEADING};
     int there[AXES] = {1, 1, 1};
 
     for (int k = 0; k < COAX_OBSERVED; k++) /* a reading that is no number: the last one that was */
         held[k] = c->last[k] = isfinite(observation[k]) ? observation[k] : c->last[k];
     if (way)
-        see_from_target(held, way, REACH_PLACE, c->asked, y, there);
+        see_from_target(held, way, farthest, c->asked, y, there);
     else
         for (int k = 0; k < COAX_OBSERVED; k++)
             y[k] = held[k];

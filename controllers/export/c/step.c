@@ -4,7 +4,7 @@
 void coax_step(coax_controller *c, const float observation[COAX_OBSERVED], const float way[4],
                float action[COAX_COMMANDS], float command[COAX_COMMANDS])
 {
-    float seen[COAX_OBSERVED], reading[READINGS], before[4];
+    float seen[COAX_OBSERVED], reading[READINGS], before[4], farthest[AXES];
     const float *now = observation;
     int there[AXES] = {1, 1, 1};
     blend b;
@@ -12,9 +12,10 @@ void coax_step(coax_controller *c, const float observation[COAX_OBSERVED], const
     if (way) {
         for (int k = 0; k < 4; k++)
             before[k] = c->asked[k];
-        see_from_target(observation, way, reach(c, way), c->asked, seen, there);
+        reach(c, way, farthest);
+        see_from_target(observation, way, farthest, c->asked, seen, there);
         now = seen;
-        if (c->started && isfinite(now[OBSERVED_PSI]))
+        if (c->periods && isfinite(now[OBSERVED_PSI]))
             follow(c, before, c->asked[HEADING] + now[OBSERVED_PSI]);
     }
     choose_points(c, way, &b);

@@ -1,26 +1,26 @@
 
 /* --- the flight, seen from the target ------------------------------------------------------------- */
 
-/* A way, or its beginning where it is longer than a setpoint may be away at once. */
-static void within_reach(const float *way, float place, float *first)
+/* A way, or its beginning where it is longer than a setpoint may be away at once: `farthest`, by axis. */
+static void within_reach(const float *way, const float *farthest, float *first)
 {
     const float distance = fmaxf(hypotf(way[FORWARD], way[RIGHT]), LEAST_DISTANCE);
-    const float share = fminf(1.0f, place / distance);
+    const float share = fminf(1.0f, farthest[AXIS_PLACE] / distance);
 
     first[FORWARD] = way[FORWARD] * share;
     first[RIGHT] = way[RIGHT] * share;
-    first[UP] = within(way[UP], -REACH_HEIGHT, REACH_HEIGHT);
-    first[TURN] = within(way[TURN], -REACH_HEADING, REACH_HEADING);
+    first[UP] = within(way[UP], -farthest[AXIS_HEIGHT], farthest[AXIS_HEIGHT]);
+    first[TURN] = within(way[TURN], -farthest[AXIS_HEADING], farthest[AXIS_HEADING]);
 }
 
 /* The observation as that of a hover at the target, or on the way to it.
  *
- * place: how far the setpoint may be away [m]. asked: the setpoint, x y z psi; without a way or a
- * reading that it takes, it stays the last one. there: whether it is the target itself in place, height
- * and heading.
+ * farthest: how far the setpoint may be away, by axis [m, m, rad]. asked: the setpoint, x y z psi;
+ * without a way or a reading that it takes, it stays the last one. there: whether it is the target
+ * itself in place, height and heading.
  */
-static void see_from_target(const float *observation, const float *way, float place, float *asked,
-                            float *seen, int *there)
+static void see_from_target(const float *observation, const float *way, const float *farthest,
+                            float *asked, float *seen, int *there)
 {
     const float x = observation[AT_NORTH], y = observation[AT_EAST];
     const float z = HEIGHT_SIGN * observation[AT_HEIGHT], psi = observation[AT_HEADING];
@@ -28,7 +28,7 @@ static void see_from_target(const float *observation, const float *way, float pl
     there[AXIS_PLACE] = there[AXIS_HEIGHT] = there[AXIS_HEADING] = 1;
     if (isfinite(measured) && isfinite(wanted)) {
         float first[4];
-        within_reach(way, place, first);
+        within_reach(way, farthest, first);
         there[AXIS_PLACE] = first[FORWARD] == way[FORWARD] && first[RIGHT] == way[RIGHT];
         there[AXIS_HEIGHT] = first[UP] == way[UP];
         there[AXIS_HEADING] = first[TURN] == way[TURN];
