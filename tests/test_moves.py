@@ -113,7 +113,8 @@ def test_no_more_causes_than_are_allowed(monkeypatch):
 def test_the_cause_worth_least_is_dropped_where_a_refit_confirms_it(
     monkeypatch, worth, large, confirmed, gone
 ):
-    """One too small to matter goes whatever it is worth."""
+    """One too small to matter goes, if settled noise makes it no larger."""
+    monkeypatch.setattr(moves, "converged", lambda problem, fit: fit)
     monkeypatch.setattr(moves, "inflation", lambda *given: 2.0)
     monkeypatch.setattr(
         moves, "loss", lambda problem, q, active, e, by: worth[e] + (0.0 if by == 2.0 else 1e3)
@@ -133,6 +134,29 @@ def test_the_cause_worth_least_is_dropped_where_a_refit_confirms_it(
         assert found.history == ((f"- {gone}", nats),)
     if large and confirmed:
         assert moves.drop(PROBLEM, FIT, None, coloured=False) is None, "white ones are not inflated"
+
+
+@pytest.mark.parametrize(
+    ("worth", "grows", "stays"), [(141.0, True, True), (139.0, True, False), (141.0, False, False)]
+)
+def test_what_is_worth_ten_thresholds_may_grow_as_the_noise_settles(
+    monkeypatch, worth, grows, stays
+):
+    """Small beside noise that had taken it up, and worth much: it stands if it is large in the end."""
+    at_last = FIT.at({"gyro_bias.x": 1.0})
+    monkeypatch.setattr(moves, "converged", lambda problem, fit: at_last)
+    monkeypatch.setattr(moves, "inflation", lambda *given: 1.0)
+    monkeypatch.setattr(moves, "loss", lambda problem, q, active, e, by: worth)
+    monkeypatch.setattr(
+        moves, "is_large",
+        lambda problem, e, values: e != "gyro_bias" or (grows and values is at_last.values),
+    )  # fmt: skip
+    monkeypatch.setattr(
+        moves, "at_optimum", lambda problem, fit, q, active, at: replace(fit, active=active)
+    )
+    found = moves.drop(PROBLEM, FIT, None, coloured=False)  # type: ignore[arg-type]
+    assert found is not None and (found is at_last) == stays
+    assert ("gyro_bias" in found.active) == stays
 
 
 @pytest.mark.parametrize(("risen", "gone"), [(33.9, True), (34.1, False)])

@@ -103,8 +103,8 @@ class _Memory:
 
 def _backward(problem: Problem, fit: Fit, quadratic: Quadratic, memory: _Memory) -> Fit | None:
     moved = drop(problem, fit, quadratic, coloured=False)
-    if moved:
-        gone = set(fit.active) - set(moved.active)
+    gone = set(fit.active) - set(moved.active) if moved else set()
+    if gone:
         memory.drops.update(gone)
         memory.banned |= gone
         memory.failures += 1
