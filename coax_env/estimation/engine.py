@@ -45,7 +45,8 @@ class RunPass:
 
     innovations: (n, m) whitened, NaN where there is no reading. states: (n, nx) filtered.
     gains: (readings, nx), per_sigma: (readings,), H: (n / rows between new ones, m, nx), see kalman.py,
-    empty unless kept. start_covariances: (s, nx, nx) of the filtered state at `start_rows`.
+    empty unless kept; shown: (nx,) of which states these are.
+    start_covariances: (s, nx, nx) of the filtered state at `start_rows`.
     deweighted: how many readings were beyond the gate.
     """
 
@@ -58,6 +59,7 @@ class RunPass:
     gains: np.ndarray
     per_sigma: np.ndarray
     H: np.ndarray
+    shown: np.ndarray
     start_rows: np.ndarray
     start_covariances: np.ndarray
 
@@ -79,7 +81,7 @@ class PassJacobians:
 
 
 def _trace(run: RunPass, at: PassJacobians) -> kalman.Trace:
-    gains = kalman.Gains(run.gains, run.per_sigma, run.H)
+    gains = kalman.Gains(run.gains, run.per_sigma, run.H, run.shown)
     path = kalman.Path(at.F, at.F_of, at.predicted, at.decaying, at.P, at.beyond)
     return kalman.Trace(run.states, run.innovations, gains, path)
 
@@ -322,7 +324,8 @@ class Engine:
         slots = np.full(n, -1, np.int64)
         slots[starts] = np.arange(starts.size)
         P = np.zeros((starts.size, nx, nx))
-        gains = kalman.Gains(K, per_sigma, H)
+        shown = np.full(nx, -1)
+        gains = kalman.Gains(K, per_sigma, H, shown)
         path = kalman.Path(F, F_of, predicted, decaying, rows_of_P, beyond)
         log_likelihood, deweighted = kalman.filter_pass(
             self.compiled, kalman.RunData(self.intervals[i], u, record.z),
@@ -331,7 +334,9 @@ class Engine:
         )  # fmt: skip
         if not np.isfinite(log_likelihood):
             K[:], per_sigma[:], H[:] = 0.0, 0.0, 0.0
-        run = RunPass(record, u, log_likelihood, e, states, deweighted, K, per_sigma, H, starts, P)
+        run = RunPass(
+            record, u, log_likelihood, e, states, deweighted, K, per_sigma, H, shown, starts, P
+        )
         return run, PassJacobians(F, F_of, predicted, decaying, rows_of_P, beyond)
 
     def log_likelihood(
@@ -602,7 +607,7 @@ class Engine:
                 yield e[there] if self._frozen(i, run, vector, e) else np.full(there.sum(), np.nan)
             return
         data = kalman.RunData(self.intervals[i], run.inputs, run.record.z)
-        gains = kalman.Gains(run.gains, run.per_sigma, run.H)
+        gains = kalman.Gains(run.gains, run.per_sigma, run.H, run.shown)
         for first in range(0, len(vectors), SIMD_WIDTH):
             some = vectors[first : first + SIMD_WIDTH]
             lanes = [*some, *[p] * (SIMD_WIDTH - len(some))]
@@ -671,7 +676,8 @@ class Engine:
         return sum(self._each(one)) + penalty(free, values)
 
     def _frozen(self, i: int, run: RunPass, p: np.ndarray, out: np.ndarray) -> bool:
-        u, gains = self.model.inputs(run.record, p), kalman.Gains(run.gains, run.per_sigma, run.H)
+        u = self.model.inputs(run.record, p)
+        gains = kalman.Gains(run.gains, run.per_sigma, run.H, run.shown)
         return frozen_gains.mean_pass(
             self.compiled, kalman.RunData(self.intervals[i], u, run.record.z), self.starts[i][0], p,
             gains, self._refresh[i], out,
