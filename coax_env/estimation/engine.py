@@ -349,6 +349,10 @@ class Engine:
             noise: levels of process and reading noise.
             which: indices of records; None: all.
         """
+        p = self.model.vector(values, noise)
+        for known in tuple(self._scored) if which is None else ():
+            if known.is_at(p, noise):
+                return known.score.log_likelihood
         return float(sum(p.log_likelihood for p in self.filter(values, noise, which=which)))
 
     def linearise(
@@ -630,7 +634,8 @@ class Engine:
         """Move along a step, halved until the cost at frozen gains falls.
 
         Args:
-            passes: of the filter at `values`, whose gains are used.
+            passes: of the filter at `values`, whose gains are used, and whose innovations are those of
+                no move.
             free: parameters with their priors and bounds.
             values: of all parameters, by name.
             noise: levels of process and reading noise.
@@ -639,7 +644,7 @@ class Engine:
         Returns:
             the new values and the gain, nats (0 and the old values where no shortening helped).
         """
-        before = self.frozen_cost(passes, free, values, noise)
+        before = penalty(free, values) + _half_squares(passes)
         limits = {f.name: (f.lower, f.upper) for f in free}
         for damping in (1.0, 0.5, 0.25, 0.1, 0.03):
             trial = dict(values)
@@ -793,6 +798,12 @@ def _without_gains(passes: Sequence[RunPass]) -> list[RunPass]:
         replace(run, **{name: np.empty_like(getattr(run, name)[:0]) for name in OF_GAINS})
         for run in passes
     ]
+
+
+def _half_squares(passes: Sequence[RunPass]) -> float:
+    """Half the squared innovations; a pass that diverged has no gains, and counts nothing."""
+    steady = [run for run in passes if np.isfinite(run.log_likelihood)]
+    return 0.5 * float(sum(np.nansum(run.innovations**2) for run in steady))
 
 
 def objective(

@@ -207,6 +207,7 @@ class _Signatures(NamedTuple):
     power: Any  # sums of squares of dv, whitened (m, width)
     F: Any  # Sparse (r, r)
     H: Any  # Sparse (m, r)
+    K: Any  # gain of one reading (r,)
 
 
 MOVES = types.NamedTuple([_M, _A, boolean[::1], float64[:, :, ::1], _N, _N], Moves)
@@ -295,8 +296,10 @@ def _effects_of_moves(row, model, dt, trace, p, moves, w):
 
 
 @compiled(**REORDER)
-def _take_in(i, H, K, w):
+def _take_in(i, H, gain, w):
     """Reading `i`: dv = dv - H s, s = s + K dv."""
+    for a in range(w.K.size):
+        w.K[a] = gain[a]  # in doubles once, and not for each register
     blocks = np.uint64(w.s.shape[1] // SIMD_WIDTH)
     s, dv = simd_blocks(w.s), simd_blocks(w.dv)
     at = np.uint64(i) * blocks
@@ -307,7 +310,7 @@ def _take_in(i, H, K, w):
             change -= H.values[i, j] * s[j * blocks + b]
         dv[at + b] = change
         for a in range(np.uint64(w.shown.size)):
-            s[a * blocks + b] += float64(K[a]) * change
+            s[a * blocks + b] += w.K[a] * change
 
 
 @compiled(**REORDER)
@@ -412,7 +415,7 @@ def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channe
         work=np.zeros(model.work_size),
         lanes=lanes_of(nx, moves.u.shape[2], p, scratch, m),
         groups=groups, per_step=aligned(1, width)[0], still=still, power=aligned(m, width),
-        F=with_places(aligned(r, padded(r)), r), H=with_places(aligned(m, padded(r)), r),
+        F=with_places(aligned(r, padded(r)), r), H=with_places(aligned(m, padded(r)), r), K=np.zeros(r),
     )  # fmt: skip
     for i in range(r):
         w.exact[i] = model.exact[w.shown[i]]

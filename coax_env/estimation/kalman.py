@@ -10,10 +10,13 @@ e = v / s, and so the likelihood is
     -2 log L = sum over readings of  e^2 + log s^2 + log 2 pi.
 
 F and H are mostly zero, and only what is not is multiplied (sparse.py); tests/test_kalman.py holds the
-pass against the same filter with dense matrices. One departure from the book: both Jacobians are those
-at the predicted state, from one look at the rates, and serve some rows (`refresh`); that of the first
-step is taken where the first readings have put the state. What it stores, its
-gains K, 1 / s and Jacobians, is what the passes of frozen_gains.py and noise_score.py work with.
+pass against the same filter with dense matrices. States that no reading shows, neither by itself nor
+through others, have no covariance (`_find_shown`): the likelihood is the same.
+
+One departure from the book: both Jacobians are those at the predicted state, from one look at the
+rates, and serve some rows (`refresh`); that of the first step is taken where the first readings have
+put the state. What it stores, its gains K, 1 / s and Jacobians, is what the passes of frozen_gains.py
+and noise_score.py work with.
 
 Bar-Shalom, Li and Kirubarajan 2001, ch. 5 and 10; Durbin and Koopman 2012, sec. 6.4 (one reading at a
 time); Maybeck 1979.
