@@ -873,7 +873,7 @@ def a_pass(e: np.ndarray) -> RunPass:
     n = len(e)
     record = Record("made", 0.01 * np.arange(n), np.zeros((n, 1)), e)
     none = np.empty(0)
-    return RunPass(record, none, 0.0, e, none, 0, none, none, none, none.astype(int), none)
+    return RunPass(record, none, 0.0, e, none, 0, none, none, none, none, none.astype(int), none)
 
 
 def test_white_noise_is_white():

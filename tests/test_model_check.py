@@ -97,7 +97,7 @@ def loud(rows: int, rate: float = 20.0) -> RunPass:
     innovations[unseen:, CHANNELS.index("q")] = e
     none = np.empty(0)
     record = Record("loud", t, np.zeros((t.size, 4)), innovations)
-    return RunPass(record, none, 0.0, innovations, none, 0, none, none, none, none, none)
+    return RunPass(record, none, 0.0, innovations, none, 0, none, none, none, none, none, none)
 
 
 def test_a_band_is_loud_where_so_much_power_is_no_chance():
@@ -254,7 +254,7 @@ def passed(e: np.ndarray, t: np.ndarray, command: np.ndarray | None = None) -> R
     innovations[:, CHANNELS.index("q")] = e
     none = np.empty(0)
     record = Record("a", t, np.zeros((t.size, 4)) if command is None else command, innovations)
-    return RunPass(record, none, 0.0, innovations, none, 0, none, none, none, none, none)
+    return RunPass(record, none, 0.0, innovations, none, 0, none, none, none, none, none, none)
 
 
 def test_a_bands_power_is_that_of_its_frequencies():

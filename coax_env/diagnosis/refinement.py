@@ -28,13 +28,15 @@ def refined(problem: Problem, fit: Fit) -> Fit:
     engine, chosen = problem.engine, problem.settings
     fit = replace(fit, std_ratio={})
     own = [f for e in fit.active for f in problem.own[e]]
-    if not own or not is_white(engine.filter(fit.values, fit.noise), engine.model.channels):
-        return fitted(problem, fit, chosen.most_steps, chosen.refinement_gain)
     free = problem.free(fit.active)
+    passes, lin = engine.linearise(fit.values, fit.noise, free, gains=False)
+    if not own or not is_white(passes, engine.model.channels):
+        return fitted(problem, fit, chosen.most_steps, chosen.refinement_gain)
     names = [f.name for f in free]
     missing = np.zeros(len(names))  # of the slope with the gains held; it hardly changes on the way
     for count in range(chosen.most_refinements):
-        passes, lin = engine.linearise(fit.values, fit.noise, free, gains=False)
+        if count:
+            passes, lin = engine.linearise(fit.values, fit.noise, free, gains=False)
         quadratic = Quadratic.of(lin, free, fit.values)
         if count == 0:
             fit = replace(fit, objective=objective(passes, free, fit.values))

@@ -18,7 +18,7 @@ import numpy as np
 from numba import float64, int64, types
 
 from coax_env.estimation.frozen_gains import KEPT, Kept
-from coax_env.estimation.kalman import _M, _N, TRACE
+from coax_env.estimation.kalman import _M, _N, TRACE, how_many
 from coax_env.estimation.noise_score import reading_back, row_back, turned_jacobian
 from coax_env.estimation.sparse import (
     REORDER,
@@ -100,7 +100,7 @@ class _Answers(NamedTuple):
     beside: Any
     pairs: Any
     scratch: Any  # (nx, width) of to_J
-    half: Any  # (nx, width) of to_C
+    half: Any  # (width, width) of to_C
     turned: Any  # the same
     s: Any  # (nx, width) derivatives of the state at the row
     taken: Any  # (width,)
@@ -177,12 +177,12 @@ def beginnings_pass(trace, refresh, moved, asked, out):
         moved: Moved. asked: Asked. out: Sums.
     """
     n, m = trace.e.shape
-    nx, width = moved.kept.s.shape[1], moved.J.shape[1]
+    nx, width = how_many(trace.gains.shown), moved.J.shape[1]
     narrow = padded(nx)
     w = _Answers(
         to_e=np.zeros(nx), to_J=aligned(nx, width), to_C=aligned(nx, narrow), e=aligned(1, width)[0],
         beside=aligned(asked.beside.size, width), pairs=np.zeros(asked.first.size),
-        scratch=aligned(nx, width), half=aligned(nx, narrow), turned=aligned(nx, narrow),
+        scratch=aligned(nx, width), half=aligned(narrow, narrow), turned=aligned(narrow, narrow),
         s=aligned(nx, width), taken=aligned(1, width)[0], K=np.zeros(narrow),
         NK=aligned(1, narrow)[0], F=with_places(aligned(nx, narrow), nx),
     )  # fmt: skip

@@ -46,7 +46,8 @@ class RunPass:
 
     innovations: (n, m) whitened, NaN where there is no reading. states: (n, nx) filtered.
     gains: (readings, nx), per_sigma: (readings,), H: (n / rows between new ones, m, nx), see kalman.py,
-    empty unless kept. start_covariances: (s, nx, nx) of the filtered state at `start_rows`.
+    empty unless kept; shown: (nx,) of which states these are.
+    start_covariances: (s, nx, nx) of the filtered state at `start_rows`.
     deweighted: how many readings were beyond the gate.
     """
 
@@ -59,6 +60,7 @@ class RunPass:
     gains: np.ndarray
     per_sigma: np.ndarray
     H: np.ndarray
+    shown: np.ndarray
     start_rows: np.ndarray
     start_covariances: np.ndarray
 
@@ -80,7 +82,7 @@ class PassJacobians:
 
 
 def _trace(run: RunPass, at: PassJacobians) -> kalman.Trace:
-    gains = kalman.Gains(run.gains, run.per_sigma, run.H)
+    gains = kalman.Gains(run.gains, run.per_sigma, run.H, run.shown)
     path = kalman.Path(at.F, at.F_of, at.predicted, at.decaying, at.P, at.beyond)
     return kalman.Trace(run.states, run.innovations, gains, path)
 
@@ -323,7 +325,8 @@ class Engine:
         slots = np.full(n, -1, np.int64)
         slots[starts] = np.arange(starts.size)
         P = np.zeros((starts.size, nx, nx))
-        gains = kalman.Gains(K, per_sigma, H)
+        shown = np.full(nx, -1)
+        gains = kalman.Gains(K, per_sigma, H, shown)
         path = kalman.Path(F, F_of, predicted, decaying, rows_of_P, beyond)
         log_likelihood, deweighted = kalman.filter_pass(
             self.compiled, kalman.RunData(self.intervals[i], u, record.z, record.strength),
@@ -332,7 +335,9 @@ class Engine:
         )  # fmt: skip
         if not np.isfinite(log_likelihood):
             K[:], per_sigma[:], H[:] = 0.0, 0.0, 0.0
-        run = RunPass(record, u, log_likelihood, e, states, deweighted, K, per_sigma, H, starts, P)
+        run = RunPass(
+            record, u, log_likelihood, e, states, deweighted, K, per_sigma, H, shown, starts, P
+        )
         return run, PassJacobians(F, F_of, predicted, decaying, rows_of_P, beyond)
 
     def log_likelihood(
@@ -345,6 +350,10 @@ class Engine:
             noise: levels of process and reading noise.
             which: indices of records; None: all.
         """
+        p = self.model.vector(values, noise)
+        for known in tuple(self._scored) if which is None else ():
+            if known.is_at(p, noise):
+                return known.score.log_likelihood
         return float(sum(p.log_likelihood for p in self.filter(values, noise, which=which)))
 
     def linearise(
@@ -603,7 +612,7 @@ class Engine:
                 yield e[there] if self._frozen(i, run, vector, e) else np.full(there.sum(), np.nan)
             return
         data = kalman.RunData(self.intervals[i], run.inputs, run.record.z)
-        gains = kalman.Gains(run.gains, run.per_sigma, run.H)
+        gains = kalman.Gains(run.gains, run.per_sigma, run.H, run.shown)
         for first in range(0, len(vectors), SIMD_WIDTH):
             some = vectors[first : first + SIMD_WIDTH]
             lanes = [*some, *[p] * (SIMD_WIDTH - len(some))]
@@ -626,7 +635,8 @@ class Engine:
         """Move along a step, halved until the cost at frozen gains falls.
 
         Args:
-            passes: of the filter at `values`, whose gains are used.
+            passes: of the filter at `values`, whose gains are used, and whose innovations are those of
+                no move.
             free: parameters with their priors and bounds.
             values: of all parameters, by name.
             noise: levels of process and reading noise.
@@ -635,7 +645,7 @@ class Engine:
         Returns:
             the new values and the gain, nats (0 and the old values where no shortening helped).
         """
-        before = self.frozen_cost(passes, free, values, noise)
+        before = penalty(free, values) + _half_squares(passes)
         limits = {f.name: (f.lower, f.upper) for f in free}
         for damping in (1.0, 0.5, 0.25, 0.1, 0.03):
             trial = dict(values)
@@ -672,7 +682,8 @@ class Engine:
         return sum(self._each(one)) + penalty(free, values)
 
     def _frozen(self, i: int, run: RunPass, p: np.ndarray, out: np.ndarray) -> bool:
-        u, gains = self.model.inputs(run.record, p), kalman.Gains(run.gains, run.per_sigma, run.H)
+        u = self.model.inputs(run.record, p)
+        gains = kalman.Gains(run.gains, run.per_sigma, run.H, run.shown)
         return frozen_gains.mean_pass(
             self.compiled, kalman.RunData(self.intervals[i], u, run.record.z), self.starts[i][0], p,
             gains, self._refresh[i], out,
@@ -813,6 +824,12 @@ def _without_gains(passes: Sequence[RunPass]) -> list[RunPass]:
         replace(run, **{name: np.empty_like(getattr(run, name)[:0]) for name in OF_GAINS})
         for run in passes
     ]
+
+
+def _half_squares(passes: Sequence[RunPass]) -> float:
+    """Half the squared innovations; a pass that diverged has no gains, and counts nothing."""
+    steady = [run for run in passes if np.isfinite(run.log_likelihood)]
+    return 0.5 * float(sum(np.nansum(run.innovations**2) for run in steady))
 
 
 def objective(

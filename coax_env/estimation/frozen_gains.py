@@ -21,6 +21,7 @@ from coax_env.estimation.kalman import (
     MODEL,
     RUN_DATA,
     TRACE,
+    how_many,
     in_every_lane,
     lanes_of,
 )
@@ -32,7 +33,9 @@ from coax_env.estimation.sparse import (
     TWO,
     aligned,
     four_of_product,
+    in_fours,
     padded,
+    three_of_product,
     unpack,
     with_places,
 )
@@ -60,7 +63,8 @@ def mean_pass(model, run, x0, p, gains, refresh, e):
     x_next = np.zeros(nx)
     work = np.zeros(model.work_size)
     h = np.zeros(m)
-    H = with_places(np.zeros((m, padded(nx))), nx)
+    shown = gains.shown[: how_many(gains.shown)]
+    H = with_places(np.zeros((m, padded(shown.size))), shown.size)
     reading = 0
     for k in range(n):
         if k % refresh == 0:
@@ -77,11 +81,11 @@ def mean_pass(model, run, x0, p, gains, refresh, e):
                 if not math.isfinite(residual):
                     return False
                 for c in range(H.counts[i]):
-                    a = H.places[i, c]
-                    residual -= H.values[i, a] * (x[a] - x_next[a])
+                    a = shown[H.places[i, c]]
+                    residual -= H.values[i, H.places[i, c]] * (x[a] - x_next[a])
                 e[k, i] = residual * gains.per_sigma[reading]
-                for j in range(nx):
-                    x[j] += gains.K[reading, j] * residual
+                for j in range(shown.size):
+                    x[shown[j]] += gains.K[reading, j] * residual
                 reading += 1
         if k < n - 1:
             model.step(x, run.u[k], run.dt[k], p, work, x_next)
@@ -107,11 +111,12 @@ def mean_passes(model, run, x0, p, moved, u, gains, refresh, e):
     n, m = run.z.shape
     nx, nu = x0.size, u.shape[2]
     lanes = lanes_of(nx, nu, p, model.work_size, m)
-    x, out, shown = simd_blocks(lanes.x), simd_blocks(lanes.out), simd_blocks(e)
+    x, out, found = simd_blocks(lanes.x), simd_blocks(lanes.out), simd_blocks(e)
     predicted = aligned(nx, SIMD_WIDTH)
     before = simd_blocks(predicted)
     in_every_lane(x0, lanes.x)
-    H = with_places(np.zeros((m, padded(nx))), nx)
+    shown = gains.shown[: how_many(gains.shown)]
+    H = with_places(np.zeros((m, padded(shown.size))), shown.size)
     reading = np.uint64(0)
     for k in range(n):
         if k % refresh == 0:
@@ -129,11 +134,11 @@ def mean_passes(model, run, x0, p, moved, u, gains, refresh, e):
             if model.wraps[i]:
                 residuals = wrap_angle(residuals)
             for c in range(H.counts[i]):
-                a = H.places[i, c]
-                residuals -= H.values[i, a] * (x[a] - before[a])
-            shown[reading] = residuals * gains.per_sigma[reading]
-            for j in range(nx):
-                x[j] += float64(gains.K[reading, j]) * residuals
+                a = shown[H.places[i, c]]
+                residuals -= H.values[i, H.places[i, c]] * (x[a] - before[a])
+            found[reading] = residuals * gains.per_sigma[reading]
+            for j in range(shown.size):
+                x[shown[j]] += float64(gains.K[reading, j]) * residuals
             reading += ONE
         if k < n - 1:
             model.step_of_lanes(lanes.x, lanes.u, run.dt[k], moved, lanes.work, lanes.out)
@@ -166,8 +171,9 @@ class Portion(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """The state's derivatives at some rows, before their readings: s (rows kept, nx, k or more), and
-    places: (n,) where in it a row's stand, or -1; empty: of none.
+    """The state's derivatives at some rows, before their readings: s (rows kept, nx, k or more), of the
+    states that any reading shows, in their order; and places: (n,) where in it a row's stand, or -1;
+    empty: of none.
     """
 
     s: np.ndarray
@@ -175,11 +181,14 @@ class Kept(NamedTuple):
 
 
 class _Signatures(NamedTuple):
-    """The arrays that a signature pass works in: a row for each state or reading, a column for each
-    parameter, as many as are `padded`.
+    """The arrays that a signature pass works in: a row for each state that any reading shows, or for
+    each reading, a column for each parameter, as many as are `padded`.
     """
 
-    s: Any  # derivatives of the state (nx, width)
+    shown: Any  # (r,) those states
+    exact: Any  # (r,) the model's
+
+    s: Any  # derivatives of the state (r, width)
     b: Any  # what the parameters add to the state over a row
     half: Any  # s + b / 2
     before: Any  # s, a row ago
@@ -195,6 +204,10 @@ class _Signatures(NamedTuple):
     )
     per_step: Any  # (width,) 1 / steps, 0 beyond the last
     still: int  # groups at first that never move the state
+    power: Any  # sums of squares of dv, whitened (m, width)
+    F: Any  # Sparse (r, r)
+    H: Any  # Sparse (m, r)
+    K: Any  # gain of one reading (r,)
 
 
 MOVES = types.NamedTuple([_M, _A, boolean[::1], float64[:, :, ::1], _N, _N], Moves)
@@ -209,7 +222,7 @@ def _effects_in_lanes(row, model, dt, trace, moves, w):
     state, u, lanes = trace.states[row], moves.u[0, row], w.lanes
     out, dv, added = simd_blocks(lanes.out), simd_blocks(w.dv), simd_blocks(w.b)
     per_step = simd_blocks(w.per_step)
-    m, nx = np.uint64(w.dv.shape[0]), np.uint64(state.size)
+    m, r = np.uint64(w.dv.shape[0]), np.uint64(w.shown.size)
     in_every_lane(u, lanes.u)
     for drifts in range(2):
         in_every_lane(state if drifts else trace.path.predicted[row], lanes.x)
@@ -226,8 +239,8 @@ def _effects_in_lanes(row, model, dt, trace, moves, w):
             at = np.uint64(g)
             if drifts:
                 model.drift_of_lanes(lanes.x, lanes.u, dt, w.groups[g], lanes.work, lanes.out)
-                for i in range(nx):
-                    added[i * blocks + at] = out[i]
+                for i in range(r):
+                    added[i * blocks + at] = out[np.uint64(w.shown[i])]
             else:
                 model.measure_of_lanes(lanes.x, lanes.u, w.groups[g], lanes.work, lanes.out)
                 for i in range(m):
@@ -238,7 +251,7 @@ def _effects_in_lanes(row, model, dt, trace, moves, w):
         base = w.dv[i, count]
         for b in range(blocks):
             dv[i * blocks + b] = (base - dv[i * blocks + b]) * per_step[b]
-    for i in range(nx):
+    for i in range(r):
         base = w.b[i, count]
         for b in range(np.uint64(w.still), blocks):
             added[i * blocks + b] = (added[i * blocks + b] - base) * per_step[b]
@@ -267,7 +280,7 @@ def _groups_of(moves, p):
 def _effects_of_moves(row, model, dt, trace, p, moves, w):
     """dv = -dh/dp at the predicted state and b at the filtered one, of one row."""
     predicted, state, u = trace.path.predicted[row], trace.states[row], moves.u[0, row]
-    m, nx = w.h_base.size, state.size
+    m = w.h_base.size
     model.measure(predicted, u, p, w.work, w.h_base)
     model.drift_and_readings(state, u, dt, p, w.work, w.base)
     for k in range(moves.steps.size):
@@ -278,13 +291,15 @@ def _effects_of_moves(row, model, dt, trace, p, moves, w):
             w.dv[i, k] = (w.h_base[i] - w.h_here[i]) * per_step
         if not moves.reading_only[k]:
             model.drift_and_readings(state, u, dt, moves.p[k], w.work, w.here)
-            for i in range(nx):
-                w.b[i, k] = (w.here[i] - w.base[i]) * per_step
+            for i in range(w.shown.size):
+                w.b[i, k] = (w.here[w.shown[i]] - w.base[w.shown[i]]) * per_step
 
 
 @compiled(**REORDER)
-def _take_in(i, H, K, w):
+def _take_in(i, H, gain, w):
     """Reading `i`: dv = dv - H s, s = s + K dv."""
+    for a in range(w.K.size):
+        w.K[a] = gain[a]  # in doubles once, and not for each register
     blocks = np.uint64(w.s.shape[1] // SIMD_WIDTH)
     s, dv = simd_blocks(w.s), simd_blocks(w.dv)
     at = np.uint64(i) * blocks
@@ -294,28 +309,70 @@ def _take_in(i, H, K, w):
             j = np.uint64(H.places[i, c])
             change -= H.values[i, j] * s[j * blocks + b]
         dv[at + b] = change
-        for a in range(np.uint64(K.size)):
-            s[a * blocks + b] += float64(K[a]) * change
+        for a in range(np.uint64(w.shown.size)):
+            s[a * blocks + b] += w.K[a] * change
 
 
 @compiled(**REORDER)
-def _propagate(exact, F, w):
+def _propagate(F, w):
     """s = F (s + b/2) + b/2; of a state that the drift takes exactly F s + b."""
-    nx, blocks = np.uint64(w.s.shape[0]), np.uint64(w.s.shape[1] // SIMD_WIDTH)
+    r, blocks = np.uint64(w.shown.size), np.uint64(w.s.shape[1] // SIMD_WIDTH)
     s, added = simd_blocks(w.s), simd_blocks(w.b)
     half, before = simd_blocks(w.half), simd_blocks(w.before)
-    for a in range(nx * blocks):
+    fours = in_fours(blocks)
+    for a in range(r * blocks):
         half[a] = s[a] + 0.5 * added[a]
         before[a] = s[a]
-    for i in range(nx):
-        source = before if exact[i] else half
-        own = 1.0 if exact[i] else 0.5
-        for b in range(np.uint64(0), blocks, FOUR):
+    for i in range(r):
+        source = before if w.exact[i] else half
+        own = 1.0 if w.exact[i] else 0.5
+        for b in range(np.uint64(0), fours, FOUR):
             first, second, third, fourth = four_of_product(F, i, source, b, blocks)
             at = i * blocks + b
             s[at], s[at + ONE] = own * added[at] + first, own * added[at + ONE] + second
             s[at + TWO] = own * added[at + TWO] + third
             s[at + THREE] = own * added[at + THREE] + fourth
+        if fours < blocks:
+            first, second, third = three_of_product(F, i, source, fours, blocks)
+            at = i * blocks + fours
+            s[at], s[at + ONE] = own * added[at] + first, own * added[at + ONE] + second
+            s[at + TWO] = own * added[at + TWO] + third
+
+
+@compiled(**REORDER)
+def _signature_rows(model, dt, trace, p, moves, refresh, portion, J, kept, w):
+    """`signature_pass` in arrays that are there."""
+    n, m = trace.e.shape
+    k_all, width = moves.steps.size, w.s.shape[1]
+    F_slot, reading = -1, portion.reading
+    for row in range(portion.first, portion.last):
+        at = kept.places[row] if kept.places.size else -1
+        if at >= 0:
+            for j in range(w.shown.size):
+                for k in range(k_all):
+                    kept.s[at, j, moves.columns[k]] = w.s[j, k]
+        if row % refresh == 0 or row == portion.first:
+            unpack(trace.gains.H, row // refresh, w.H)
+        if model.has_lanes:
+            _effects_in_lanes(row, model, dt[row], trace, moves, w)
+        else:
+            _effects_of_moves(row, model, dt[row], trace, p, moves, w)
+        for i in range(m):
+            if math.isnan(trace.e[row, i]):
+                continue
+            _take_in(i, w.H, trace.gains.K[reading], w)
+            for k in range(width):
+                w.dv[i, k] *= trace.gains.per_sigma[reading]
+                w.power[i, k] += w.dv[i, k] * w.dv[i, k]
+            for k in range(k_all):
+                J[reading - portion.reading, moves.columns[k]] = w.dv[i, k]
+            reading += 1
+        if row == n - 1:
+            break
+        if trace.path.F_of[row] != F_slot:
+            F_slot = trace.path.F_of[row]
+            unpack(trace.path.F, F_slot, w.F)
+        _propagate(w.F, w)
 
 
 @compiled_when_called(
@@ -346,54 +403,25 @@ def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channe
         by_channel: (k or more, m) their squares, added.
         kept: Kept, out.
     """
-    n, m = trace.e.shape
-    nx, k_all = model.exact.size, moves.steps.size
-    width = padded(k_all + 1)
+    m, k_all = trace.e.shape[1], moves.steps.size
+    nx, r, width = model.exact.size, how_many(trace.gains.shown), padded(k_all + 1)
     groups, still = _groups_of(moves, p)
     scratch = model.work_size if model.has_lanes else 0
     w = _Signatures(
-        s=s, b=aligned(nx, width), half=aligned(nx, width),
-        before=aligned(nx, width), dv=aligned(m, width),
+        shown=trace.gains.shown[:r], exact=np.zeros(r, np.bool_),
+        s=s, b=aligned(r, width), half=aligned(r, width),
+        before=aligned(r, width), dv=aligned(m, width),
         base=np.zeros(nx + m), here=np.zeros(nx + m), h_base=np.zeros(m), h_here=np.zeros(m),
         work=np.zeros(model.work_size),
         lanes=lanes_of(nx, moves.u.shape[2], p, scratch, m),
-        groups=groups, per_step=aligned(1, width)[0], still=still,
+        groups=groups, per_step=aligned(1, width)[0], still=still, power=aligned(m, width),
+        F=with_places(aligned(r, padded(r)), r), H=with_places(aligned(m, padded(r)), r), K=np.zeros(r),
     )  # fmt: skip
+    for i in range(r):
+        w.exact[i] = model.exact[w.shown[i]]
     for k in range(k_all):
         w.per_step[k] = 1.0 / moves.steps[k]
-    power = np.zeros((m, width))
-    F = with_places(np.zeros((nx, padded(nx))), nx)
-    H = with_places(np.zeros((m, padded(nx))), nx)
-    F_slot = -1
-    reading = portion.reading
-    for row in range(portion.first, portion.last):
-        at = kept.places[row] if kept.places.size else -1
-        if at >= 0:
-            for j in range(nx):
-                for k in range(k_all):
-                    kept.s[at, j, moves.columns[k]] = s[j, k]
-        if row % refresh == 0 or row == portion.first:
-            unpack(trace.gains.H, row // refresh, H)
-        if model.has_lanes:
-            _effects_in_lanes(row, model, dt[row], trace, moves, w)
-        else:
-            _effects_of_moves(row, model, dt[row], trace, p, moves, w)
-        for i in range(m):
-            if math.isnan(trace.e[row, i]):
-                continue
-            _take_in(i, H, trace.gains.K[reading], w)
-            for k in range(width):
-                w.dv[i, k] *= trace.gains.per_sigma[reading]
-                power[i, k] += w.dv[i, k] * w.dv[i, k]
-            for k in range(k_all):
-                J[reading - portion.reading, moves.columns[k]] = w.dv[i, k]
-            reading += 1
-        if row == n - 1:
-            break
-        if trace.path.F_of[row] != F_slot:
-            F_slot = trace.path.F_of[row]
-            unpack(trace.path.F, F_slot, F)
-        _propagate(model.exact, F, w)
+    _signature_rows(model, dt, trace, p, moves, refresh, portion, J, kept, w)
     for k in range(k_all):
         for i in range(m):
-            by_channel[moves.columns[k], i] += power[i, k]
+            by_channel[moves.columns[k], i] += w.power[i, k]

@@ -10,10 +10,13 @@ e = v / s, and so the likelihood is
     -2 log L = sum over readings of  e^2 + log s^2 + log 2 pi.
 
 F and H are mostly zero, and only what is not is multiplied (sparse.py); tests/test_kalman.py holds the
-pass against the same filter with dense matrices. One departure from the book: both Jacobians are those
-at the predicted state, from one look at the rates, and serve some rows (`refresh`); that of the first
-step is taken where the first readings have put the state. What it stores, its
-gains K, 1 / s and Jacobians, is what the passes of frozen_gains.py and noise_score.py work with.
+pass against the same filter with dense matrices. States that no reading shows, neither by itself nor
+through others, have no covariance (`_find_shown`): the likelihood is the same.
+
+One departure from the book: both Jacobians are those at the predicted state, from one look at the
+rates, and serve some rows (`refresh`); that of the first step is taken where the first readings have
+put the state. What it stores, its gains K, 1 / s and Jacobians, is what the passes of frozen_gains.py
+and noise_score.py work with.
 
 Bar-Shalom, Li and Kirubarajan 2001, ch. 5 and 10; Durbin and Koopman 2012, sec. 6.4 (one reading at a
 time); Maybeck 1979.
@@ -30,15 +33,18 @@ from coax_env.estimation.sparse import (
     REORDER,
     SPARSE,
     aligned,
+    along,
     find_non_zeros,
     multiply,
     padded,
+    row_of_product,
     with_places,
 )
 from coax_env.estimation.state_space import STEADY, Strength
 from coax_env.kernel.angles import wrap_angle
 from coax_env.kernel.compilation import compiled, compiled_when_called, pointer
-from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks, transpose
+from coax_env.kernel.simd import SIMD_WIDTH, negated, simd_blocks, transpose
+from coax_env.kernel.simd import lanes as lanes_that
 
 _A = float64[::1]
 _M = float64[:, ::1]
@@ -51,6 +57,8 @@ MOST_DECAY = 0.5
 """Share of a state that may decay in a row for the series of the exponential to be used."""
 SAME_STEP = 1e-6
 """Steps that differ by no more of themselves are the same: what is left of a clock's rounding."""
+LEAST, MOST = 1e-100, 1e100
+"""Of a product of variances before its logarithm is taken; far from the least and largest number."""
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -135,11 +143,15 @@ class Variances(NamedTuple):
 class Gains(NamedTuple):
     """K: (readings, nx) and per_sigma: (readings,) 1 / s, of each reading that there is, in the order
     of the innovations. H: (n / refresh, m, nx) Jacobians of the readings; empty: not to be stored.
+
+    shown: (nx,) the r states that any reading shows (`_find_shown`), then -1. States of K and H, and of
+    F and P of the path, are these, r of nx and in this order; behind them is whatever was there.
     """
 
     K: np.ndarray
     per_sigma: np.ndarray
     H: np.ndarray
+    shown: np.ndarray
 
 
 class Path(NamedTuple):
@@ -179,22 +191,31 @@ class Covariances(NamedTuple):
 
 
 class _Filter(NamedTuple):
-    """The arrays that a pass works in; matrices are `padded` to the right."""
+    """The arrays that a pass works in; matrices are `padded` to the right.
 
-    x: Any  # mean
+    Of the r states that any reading shows, and in the order of `order`, are correction, P, K, H, F, A
+    and what is as large; AH has the same order, the other states behind.
+    """
+
+    order: Any  # (nx,) states: those that any reading shows, then the others
+    place_of: Any  # (nx,) a state's in it, -1 of the others
+    places: Any  # (e, 2) of the process noise' entries in P, or -1
+    exact: Any  # (r,) the model's
+    channels: Any  # (m,) whether the run has any reading
+    x: Any  # mean of all states
     P: Any  # covariance
-    predicted: Any  # mean before the row's readings
+    correction: Any  # what the row's readings have added to the mean
     x_next: Any  # mean a row later
     h: Any  # readings expected
     v: Any  # innovations, before any reading of the row
     noise: Any  # variances of the row's readings, larger beyond the gate
     beyond: Any  # 1 / variance expected where a reading is beyond it, else 0
-    Q: Any  # growth of the covariance over the row, by entry
+    Q: Any  # growth of the covariance over the row
     K: Any  # gain of one reading
     HP: Any
-    H: Any  # Sparse (m, nx)
-    F: Any  # Sparse (nx, nx)
-    A: Any  # Sparse (nx, nx): Jacobian of the drift, the upper part of AH
+    H: Any  # Sparse (m, r)
+    F: Any  # Sparse (r, r)
+    A: Any  # Sparse (r, r): Jacobian of the drift, from AH
     AA: Any
     AH: Any  # Jacobian of drift and readings (nx + m, nx)
     FP: Any
@@ -202,6 +223,7 @@ class _Filter(NamedTuple):
     base: Any  # drift and readings (nx + m,) at the mean
     probe: Any  # a mean with one state moved
     moved: Any  # drift and readings there
+    whole: Any  # a Jacobian of all states as they are (nx + m, nx)
     work: Any  # the model's scratch
     lanes: Any  # Lanes of moved states
     per_change: Any  # (width,) 1 / how far a state is moved, 0 beyond the last
@@ -217,6 +239,14 @@ class Lanes(NamedTuple):
     out: Any
 
 
+@compiled()
+def in_every_lane(values, out):
+    """Numbers (n,) into (n, SIMD_WIDTH)."""
+    rows = simd_blocks(out)
+    for i in range(np.uint64(values.size)):
+        rows[i] = values[i]
+
+
 @compiled(makes_arrays=True)
 def lanes_of(nx, nu, p, work_size, readings):
     """Lanes for so many states, inputs and readings, each with the parameters `p`.
@@ -229,18 +259,8 @@ def lanes_of(nx, nu, p, work_size, readings):
         aligned(nx, SIMD_WIDTH), aligned(nu, SIMD_WIDTH), aligned(p.size, SIMD_WIDTH),
         aligned(work_size, SIMD_WIDTH), aligned(nx + readings, SIMD_WIDTH),
     )  # fmt: skip
-    for i in range(p.size):
-        for lane in range(SIMD_WIDTH):
-            lanes.p[i, lane] = p[i]
+    in_every_lane(p, lanes.p)
     return lanes
-
-
-@compiled()
-def in_every_lane(values, out):
-    """Numbers (n,) into (n, SIMD_WIDTH)."""
-    for i in range(values.size):
-        for lane in range(SIMD_WIDTH):
-            out[i, lane] = values[i]
 
 
 MODEL = types.NamedTuple(
@@ -250,7 +270,7 @@ MODEL = types.NamedTuple(
 STRENGTH = types.NamedTuple([_N, _M], Strength)
 RUN_DATA = types.NamedTuple([_A, _M, _M, STRENGTH], RunData)
 VARIANCES = types.NamedTuple([_A, _M, _A, _A, _A], Variances)
-GAINS = types.NamedTuple([float32[:, ::1], _A, float32[:, :, ::1]], Gains)
+GAINS = types.NamedTuple([float32[:, ::1], _A, float32[:, :, ::1], _N], Gains)
 PATH = types.NamedTuple([float32[:, :, ::1], _N, _M, _N, float32[:, :, ::1], _A], Path)
 TRACE = types.NamedTuple([_M, _M, GAINS, PATH], Trace)
 COVARIANCES = types.NamedTuple([float64[:, :, ::1], _N], Covariances)
@@ -260,6 +280,15 @@ COVARIANCES = types.NamedTuple([float64[:, :, ::1], _N], Covariances)
 def _type_of_model(model: CompiledModel, context: Any) -> types.Type:
     """MODEL, whatever numba would find out: to look at the functions costs 50 us a call."""
     return MODEL
+
+
+@compiled()
+def how_many(shown):
+    """Of states that any reading shows; see Gains."""
+    count = 0
+    while count < shown.size and shown[count] >= 0:
+        count += 1
+    return count
 
 
 # --- linearise --------------------------------------------------------------------------------------
@@ -289,16 +318,18 @@ def differences(flow, x, u, dt, p, work, scale, base, probe, moved, out):
 @compiled(**REORDER)
 def _linearise_in_lanes(model, u, dt, w):
     """`_linearise` with SIMD_WIDTH states moved at once; after the last comes one that is not."""
-    nx, blocks = w.x.size, np.uint64(w.per_change.size // SIMD_WIDTH)
+    nx, blocks = np.uint64(w.x.size), np.uint64(w.per_change.size // SIMD_WIDTH)
     out, table, per_change = simd_blocks(w.lanes.out), simd_blocks(w.AH), simd_blocks(w.per_change)
     in_every_lane(u, w.lanes.u)
-    for b in range(nx // SIMD_WIDTH + 1):
+    for b in range(w.x.size // SIMD_WIDTH + 1):
         first = b * SIMD_WIDTH
         in_every_lane(w.x, w.lanes.x)
-        for j in range(first, min(first + SIMD_WIDTH, nx)):
-            w.lanes.x[j, j - first] += model.scale[j]
+        for j in range(first, min(first + SIMD_WIDTH, w.x.size)):
+            w.lanes.x[w.order[j], j - first] += model.scale[w.order[j]]
         model.drift_of_lanes(w.lanes.x, w.lanes.u, dt, w.lanes.p, w.lanes.work, w.lanes.out)
-        for i in range(np.uint64(w.base.size)):
+        for i in range(nx):
+            table[i * blocks + np.uint64(b)] = out[np.uint64(w.order[i])]
+        for i in range(nx, np.uint64(w.base.size)):
             table[i * blocks + np.uint64(b)] = out[i]
     for i in range(np.uint64(w.base.size)):
         w.base[i] = base = w.AH[i, nx]
@@ -314,18 +345,68 @@ def _linearise(model, u, dt, p, w):
         return
     model.drift_and_readings(w.x, u, dt, p, w.work, w.base)
     differences(
-        model.drift_and_readings, w.x, u, dt, p, w.work, model.scale, w.base, w.probe, w.moved, w.AH
+        model.drift_and_readings,
+        w.x,
+        u,
+        dt,
+        p,
+        w.work,
+        model.scale,
+        w.base,
+        w.probe,
+        w.moved,
+        w.whole,
     )
+    for i in range(w.base.size):
+        row = w.order[i] if i < w.x.size else i
+        for j in range(w.x.size):
+            w.AH[i, j] = w.whole[row, w.order[j]]
 
 
 @compiled()
-def _take_H(w):
-    """H, the lower part of AH."""
-    m, nx = w.H.places.shape
-    for i in range(m):
+def _take_shown(first, w, A):
+    """Into A those rows of AH from `first` on, and of them the states that any reading shows."""
+    long, wide = np.uint64(w.AH.shape[1] // SIMD_WIDTH), np.uint64(A.values.shape[1] // SIMD_WIDTH)
+    rows, taken = simd_blocks(w.AH), simd_blocks(A.values)
+    for i in range(np.uint64(A.counts.size)):
+        since = (np.uint64(first) + i) * long
+        for b in range(wide):
+            taken[i * wide + b] = rows[since + b]
+
+
+@compiled()
+def _find_shown(AH, order, channels, shown):
+    """Add to the states that any reading shows, itself or through what other states do with it.
+
+    The others do nothing to the likelihood: their covariances and gains need not be known. Of a
+    helicopter without a measured position these are north and east, and actuators without lags.
+
+    Args:
+        AH: (nx + m, nx or more) Jacobian of drift and readings. order: (nx,) of its states.
+        channels: (m,) which of them have readings. shown: (nx,) truths, in place.
+    """
+    nx, more = shown.size, True
+    while more:
+        more = False
         for j in range(nx):
-            w.H.values[i, j] = w.AH[nx + i, j]
-    find_non_zeros(w.H)
+            for i in range(AH.shape[0]):
+                counts = shown[order[i]] if i < nx else channels[i - nx]
+                if counts and AH[i, j] != 0.0 and not shown[order[j]]:
+                    shown[order[j]] = more = True
+
+
+@compiled()
+def _shows_more(w):
+    """Whether a reading shows a state that none did before."""
+    nx, r, blocks = w.x.size, w.K.size, np.uint64(w.AH.shape[1] // SIMD_WIDTH)
+    rows, found = simd_blocks(w.AH), 0
+    for b in range(r // SIMD_WIDTH, blocks):
+        there = 0
+        for i in range(w.AH.shape[0]):
+            if i < r or (i >= nx and w.channels[i - nx]):
+                there |= lanes_that(negated(rows[np.uint64(i) * blocks + np.uint64(b)] == 0.0))
+        found |= there >> max(r - SIMD_WIDTH * b, 0)
+    return found != 0
 
 
 @compiled(types.boolean(boolean[::1], SPARSE, _M, SPARSE), **REORDER)
@@ -369,11 +450,15 @@ def exponential(exact, A, AA, F):
 @compiled(**REORDER)
 def _transition(model, u, dt, p, w):
     """F of a row: by the series of the exponential, else by differences of the step itself."""
-    if not exponential(model.exact, w.A, w.AA, w.F):
+    _take_shown(0, w, w.A)
+    if not exponential(w.exact, w.A, w.AA, w.F):
         differences(
             model.step, w.x, u, dt, p, w.work, model.scale, w.x_next, w.probe, w.moved[: w.x.size],
-            w.F.values,
+            w.whole,
         )  # fmt: skip
+        for i in range(w.K.size):
+            for j in range(w.K.size):
+                w.F.values[i, j] = w.whole[w.order[i], w.order[j]]
         find_non_zeros(w.F)
 
 
@@ -391,10 +476,29 @@ def _rescaled(F, ratio):
 # --- correct ----------------------------------------------------------------------------------------
 
 
+@compiled()
+def _store_row(x, out):
+    """A vector into one of those that the pass leaves."""
+    for j in range(x.size):
+        out[j] = x[j]
+
+
+@compiled()
+def _all_finite(x):
+    """Whether all of a vector is finite."""
+    for j in range(x.size):  # noqa: SIM110, numba has no all()
+        if not math.isfinite(x[j]):
+            return False
+    return True
+
+
 @compiled(**REORDER)
-def _innovations(model, z, u, p, w):
-    """v = z - h(x) of a row's readings; whether all are finite."""
-    model.measure(w.x, u, p, w.work, w.h)
+def _innovations(model, z, u, p, fresh, w):
+    """v = z - h(x) of a row's readings; whether all are finite. `fresh`: readings are in `base`."""
+    if fresh:
+        _store_row(w.base[w.x.size :], w.h)
+    else:
+        model.measure(w.x, u, p, w.work, w.h)
     for i in range(z.size):
         if not math.isnan(z[i]):
             w.v[i] = z[i] - w.h[i]
@@ -440,33 +544,24 @@ def _gate(z, R, gate, log_likelihood, w):
 
 @compiled(forceinline=True, **REORDER)
 def _correct(i, w):
-    """Take in reading `i` of a row: x = x + K v, P = P - K H P; returns v and s^2."""
-    nx, blocks = np.uint64(w.x.size), np.uint64(w.HP.size // SIMD_WIDTH)
+    """Take in reading `i` of a row: x = x + K v, P = P - K H P; returns v, s^2 and 1 / s."""
+    r, blocks = np.uint64(w.K.size), np.uint64(w.HP.size // SIMD_WIDTH)
     P, HP = simd_blocks(w.P), simd_blocks(w.HP)
-    variance = w.noise[i]
-    residual = w.v[i]
-    for c in range(w.H.counts[i]):
-        a = w.H.places[i, c]
-        residual -= w.H.values[i, a] * (w.x[a] - w.predicted[a])
-    for b in range(blocks):
-        total = 0.0
-        for c in range(w.H.counts[i]):
-            a = np.uint64(w.H.places[i, c])
-            total += w.H.values[i, a] * P[a * blocks + b]
-        HP[b] = total
-    for c in range(w.H.counts[i]):
-        a = w.H.places[i, c]
-        variance += w.HP[a] * w.H.values[i, a]
+    residual = w.v[i] - along(w.H, i, w.correction)
+    row_of_product(w.H, i, P, blocks, HP)
+    variance = w.noise[i] + along(w.H, i, w.HP)
+    per_sigma = 0.0
     if variance > 0.0:
-        per_variance = 1.0 / variance
-        for a in range(nx):
+        per_sigma = 1.0 / math.sqrt(variance)
+        per_variance = per_sigma * per_sigma  # 1 / variance would become a division for each state
+        for a in range(r):
             w.K[a] = weight = w.HP[a] * per_variance
-            w.x[a] += weight * residual
+            w.correction[a] += weight * residual
         for b in range(blocks):
             left = HP[b]
-            for a in range(nx):
+            for a in range(r):
                 P[a * blocks + b] -= w.K[a] * left
-    return residual, variance
+    return residual, variance, per_sigma
 
 
 # --- predict ----------------------------------------------------------------------------------------
@@ -495,26 +590,32 @@ def strength_changes(strength, k, other):
 
 @compiled(**REORDER)
 def _grow(assumed, dt, strength, k, w):
-    """Growth of the covariance over row `k`, of `dt` seconds, by entry, into Q."""
-    for e in range(w.Q.size):
-        w.Q[e] = assumed.q[e] * growth(dt, assumed.decay[e])
-        if strength.block.size:
-            w.Q[e] *= strength.factor[strength.block[k], e]
+    """Growth of the covariance over row `k`, of `dt` seconds, into Q."""
+    for e in range(assumed.q.size):
+        i, j = w.places[e, 0], w.places[e, 1]
+        if i >= 0 and j >= 0:
+            w.Q[i, j] = w.Q[j, i] = 0.0
+    for e in range(assumed.q.size):
+        i, j = w.places[e, 0], w.places[e, 1]
+        if i >= 0 and j >= 0:
+            grown = assumed.q[e] * growth(dt, assumed.decay[e])
+            if strength.block.size:
+                grown *= strength.factor[strength.block[k], e]
+            w.Q[i, j] += grown
+            w.Q[j, i] = w.Q[i, j]
 
 
 @compiled(**REORDER)
-def _predict(places, w):
-    """P = F P F' + Q as F (F P)', and the mean of the step; `places` are those of Q's entries."""
+def _predict(w):
+    """P = F P F' + Q as F (F P)', and the mean of the step."""
     multiply(w.F, w.P, w.FP)
-    transpose(w.FP, w.x.size, w.PF)
+    transpose(w.FP, w.PF)
     multiply(w.F, w.PF, w.P)
+    rows, grown = simd_blocks(w.P), simd_blocks(w.Q)
+    for b in range(np.uint64(w.P.size // SIMD_WIDTH)):
+        rows[b] += grown[b]
     for i in range(w.x.size):
         w.x[i] = w.x_next[i]
-    for e in range(w.Q.size):
-        i, j = places[e, 0], places[e, 1]
-        w.P[i, j] += w.Q[e]
-        if i != j:
-            w.P[j, i] += w.Q[e]
 
 
 @compiled(**REORDER)
@@ -529,63 +630,64 @@ def _make_symmetric(P, nx):
 
 
 @compiled()
-def _store_row(x, out):
-    """A vector into one of those that the pass leaves."""
-    for j in range(x.size):
-        out[j] = x[j]
-
-
-@compiled()
-def _all_finite(x):
-    """Whether all of a vector is finite."""
-    for j in range(x.size):  # noqa: SIM110, numba has no all()
-        if not math.isfinite(x[j]):
-            return False
-    return True
-
-
-@compiled()
-def _store_matrix(A, out):
-    """The first columns of a matrix into one of those that the pass leaves."""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
+def _store_matrix(A, rows, columns, out):
+    """The first rows and columns of a matrix into one of those that the pass leaves."""
+    for i in range(rows):
+        for j in range(columns):
             out[i, j] = A[i, j]
+
+
+@compiled()
+def _store_square(A, order, out):
+    """A matrix of the states that any reading shows, in their `order`, into one of all states."""
+    for i in range(order.size):
+        for j in range(order.size):
+            out[order[i], order[j]] = A[i, j]
 
 
 @compiled(forceinline=True, **REORDER)
 def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
-    """`filter_pass` in arrays that are there."""
+    """`filter_pass` in arrays that are there; and whether a reading came to show more states."""
     n, m = run.z.shape
+    r = w.K.size
     keep, follow = trace.gains.H.shape[0] > 0, trace.path.predicted.shape[0] == n
     log_likelihood = 0.0
+    product = 1.0  # of variances whose logarithm is not yet in the likelihood: one for many
     deweighted, reading, F_slot = 0, 0, -1
     dt_of_F = dt_now = dt_of_Q = -1.0  # steps at which F and Q were computed, and F is scaled to
     for k in range(n):
         z, u, dt = run.z[k], run.u[k], run.dt[k]
         fresh = k % refresh == 0
         if fresh:
-            _make_symmetric(w.P, w.x.size)
+            _make_symmetric(w.P, r)
             _linearise(model, u, dt, p, w)
-            _take_H(w)
+            if _shows_more(w):
+                return log_likelihood, deweighted, True
+            _take_shown(w.x.size, w, w.H)
+            find_non_zeros(w.H)
             if keep:
-                _store_matrix(w.H.values, trace.gains.H[k // refresh])
-        _store_row(w.x, w.predicted)
+                _store_matrix(w.H.values, m, r, trace.gains.H[k // refresh])
         if follow:
             _store_row(w.x, trace.path.predicted[k])
-        if not _innovations(model, z, u, p, w):
-            return -np.inf, deweighted
+        if not _innovations(model, z, u, p, fresh, w):
+            return -np.inf, deweighted, False
         log_likelihood, beyond = _gate(z, assumed.R, gate, log_likelihood, w)
         deweighted += beyond
+        for a in range(r):
+            w.correction[a] = 0.0
         for i in range(m):
             trace.e[k, i] = np.nan
             if math.isnan(z[i]):
                 continue
-            residual, variance = _correct(i, w)
+            residual, variance, per_sigma = _correct(i, w)
             if not variance > 0.0:
-                return -np.inf, deweighted
-            per_sigma = 1.0 / math.sqrt(variance)
+                return -np.inf, deweighted, False
             e = residual * per_sigma
-            log_likelihood -= 0.5 * (e * e + math.log(variance) + _LOG_2PI)
+            log_likelihood -= 0.5 * (e * e + _LOG_2PI)
+            product *= variance
+            if not LEAST < product < MOST:
+                log_likelihood -= 0.5 * math.log(product)
+                product = 1.0
             trace.e[k, i] = e
             if keep:
                 _store_row(w.K, trace.gains.K[reading])
@@ -593,15 +695,18 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
             if follow:
                 trace.path.beyond[reading] = w.beyond[i]
             reading += 1
+        for a in range(r):
+            w.x[w.order[a]] += w.correction[a]
         _store_row(w.x, trace.states[k])
         if not _all_finite(w.x):
-            return -np.inf, deweighted
+            return -np.inf, deweighted, False
         if covariances.slots[k] >= 0:
-            _store_matrix(w.P, covariances.P[covariances.slots[k]])
+            _store_square(w.P, w.order, covariances.P[covariances.slots[k]])
         if follow:
             for d in range(trace.path.decaying.size):
-                for j in range(w.x.size):
-                    trace.path.P[k, d, j] = w.P[trace.path.decaying[d], j]
+                at = w.place_of[trace.path.decaying[d]]
+                for j in range(r):
+                    trace.path.P[k, d, j] = w.P[at, j] if at >= 0 else 0.0
         if k == n - 1:
             break
         model.step(w.x, u, dt, p, w.work, w.x_next)
@@ -609,6 +714,8 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
         if fresh or abs(dt - dt_of_F) > 0.5 * dt_of_F:
             if not fresh or k == 0:  # the first readings move the mean far
                 _linearise(model, u, dt, p, w)
+                if _shows_more(w):
+                    return log_likelihood, deweighted, True
             _transition(model, u, dt, p, w)
             dt_of_F = dt_now = dt
         elif abs(dt - dt_now) > SAME_STEP * dt_now:
@@ -619,13 +726,65 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
         if follow:
             if changed:
                 F_slot += 1
-                _store_matrix(w.F.values, trace.path.F[F_slot])
+                _store_matrix(w.F.values, r, r, trace.path.F[F_slot])
             trace.path.F_of[k] = F_slot
         if abs(dt - dt_of_Q) > SAME_STEP * dt or strength_changes(run.strength, k, k - 1):
             _grow(assumed, dt, run.strength, k, w)
             dt_of_Q = dt
-        _predict(model.noise_places, w)
-    return log_likelihood, deweighted
+        _predict(w)
+    return log_likelihood - 0.5 * math.log(product), deweighted, False
+
+
+@compiled(makes_arrays=True)
+def _arrays_of(model, run, assumed, p, shown, channels):
+    """The arrays of a pass, at the run's first row.
+
+    Args:
+        shown: (nx,) whether any reading shows a state. channels: (m,) whether the run has a reading.
+    """
+    nx, m = assumed.x0.size, assumed.R.size
+    order, place_of, exact = np.zeros(nx, np.int64), np.full(nx, -1), np.zeros(nx, np.bool_)
+    r = others = 0
+    for j in range(nx):
+        if shown[j]:
+            order[r], place_of[j], exact[r] = j, r, model.exact[j]
+            r += 1
+        else:
+            others += 1
+            order[nx - others] = j
+    places = np.zeros(model.noise_places.shape, np.int64)
+    for e in range(places.shape[0]):
+        places[e, 0] = place_of[model.noise_places[e, 0]]
+        places[e, 1] = place_of[model.noise_places[e, 1]]
+    long, wide = padded(nx), padded(r)
+    scratch = model.work_size if model.has_lanes else 0
+    w = _Filter(
+        order=order, place_of=place_of, places=places, exact=exact[:r],
+        channels=channels, x=assumed.x0.copy(), P=aligned(r, wide), correction=np.zeros(r),
+        x_next=np.zeros(nx), h=np.zeros(m), v=np.zeros(m), noise=np.zeros(m),
+        beyond=np.zeros(m), Q=aligned(r, wide), K=np.zeros(r), HP=aligned(1, wide)[0],
+        H=with_places(aligned(m, wide), r), F=with_places(aligned(r, wide), r),
+        A=with_places(aligned(r, wide), r), AA=aligned(r, wide), AH=aligned(nx + m, long),
+        FP=aligned(wide, wide), PF=aligned(wide, wide), base=np.zeros(nx + m), probe=np.zeros(nx),
+        moved=np.zeros(nx + m), whole=np.zeros((nx + m, nx)), work=np.zeros(model.work_size),
+        lanes=lanes_of(nx, run.u.shape[1], p, scratch, m), per_change=aligned(1, long)[0],
+    )  # fmt: skip
+    for j in range(nx):
+        w.per_change[j] = 1.0 / model.scale[order[j]]
+    for i in range(r):
+        for j in range(r):
+            w.P[i, j] = assumed.P0[order[i], order[j]]
+    return w
+
+
+@compiled(makes_arrays=True)
+def _channels_read(z):
+    """Which channels (m,) have any reading in z (n, m)."""
+    found = np.zeros(z.shape[1], np.bool_)
+    for k in range(z.shape[0]):
+        for i in range(z.shape[1]):
+            found[i] |= not math.isnan(z[k, i])
+    return found
 
 
 @compiled_when_called(
@@ -637,6 +796,10 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
 )
 def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
     """Extended Kalman filter over one run.
+
+    Covariances and gains are those of the states that any reading shows, of all where covariances are
+    asked for. Which these are the first row says; where one more comes to be shown, the pass begins
+    again.
 
     Args:
         model: a CompiledModel. run: RunData. assumed: Variances. p: (np,) the model's parameters.
@@ -650,27 +813,24 @@ def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
     Returns:
         log-likelihood (-inf where the filter diverged) and the number of readings beyond the gate.
     """
-    nx, m = assumed.x0.size, assumed.R.size
-    width = padded(nx)
-    P = aligned(nx, width)
-    _store_matrix(assumed.P0, P[:, :nx])
-    AH = aligned(nx + m, width)
-    scratch = model.work_size if model.has_lanes else 0
-    w = _Filter(
-        x=assumed.x0.copy(), P=P, predicted=np.zeros(nx), x_next=np.zeros(nx), h=np.zeros(m),
-        v=np.zeros(m), noise=np.zeros(m), beyond=np.zeros(m), Q=np.zeros(assumed.q.size),
-        K=np.zeros(nx), HP=aligned(1, width)[0],
-        H=with_places(aligned(m, width), nx), F=with_places(aligned(nx, width), nx),
-        A=with_places(AH[:nx], nx), AA=aligned(nx, width), AH=AH,
-        FP=aligned(nx, width), PF=aligned(nx, width),
-        base=np.zeros(nx + m), probe=np.zeros(nx), moved=np.zeros(nx + m),
-        work=np.zeros(model.work_size),
-        lanes=lanes_of(nx, run.u.shape[1], p, scratch, m),
-        per_change=aligned(1, width)[0],
-    )  # fmt: skip
-    for j in range(nx):
-        w.per_change[j] = 1.0 / model.scale[j]
-    return _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w)
+    nx = assumed.x0.size
+    shown = np.full(nx, True)
+    channels = _channels_read(run.z)
+    if covariances.P.shape[0] == 0:
+        w = _arrays_of(model, run, assumed, p, shown, channels)
+        _linearise(model, run.u[0], run.dt[0], p, w)
+        shown[:] = False
+        _find_shown(w.AH, w.order, channels, shown)
+    while True:
+        w = _arrays_of(model, run, assumed, p, shown, channels)
+        for j in range(nx):
+            trace.gains.shown[j] = w.order[j] if j < w.K.size else -1
+        log_likelihood, beyond, more = _filter_rows(
+            model, run, assumed, p, gate, refresh, trace, covariances, w
+        )
+        if not more:
+            return log_likelihood, beyond
+        _find_shown(w.AH, w.order, channels, shown)
 
 
 @compiled_when_called(types.void(MODEL, _M, _A, _A, _M), makes_arrays=True)

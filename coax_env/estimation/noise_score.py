@@ -14,11 +14,14 @@ from coax_env.estimation.kalman import (
     STRENGTH,
     TRACE,
     growth,
+    how_many,
     strength_changes,
 )
 from coax_env.estimation.sparse import (
+    IN_ORDER,
     REORDER,
     aligned,
+    along,
     combine,
     find_non_zeros,
     multiply,
@@ -28,9 +31,6 @@ from coax_env.estimation.sparse import (
 )
 from coax_env.kernel.compilation import compiled, compiled_when_called
 from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks, transpose
-
-FEW = 4
-"""Non-zeros of a reading's Jacobian of which each is taken by itself; ours."""
 
 
 @compiled(**REORDER)
@@ -63,19 +63,14 @@ def reading_back(b, e, per_sigma, gain, H, K, NK, r, N):
         j = H.places[b, c]
         NK[j] -= 0.5 * curve * H.values[b, j]
         r[j] += H.values[b, j] * pull
-    few = H.counts[b] < FEW
     for c in range(H.counts[b]):
         a = H.places[b, c]
         weight = H.values[b, a]
         for block in range(blocks):
             rows[np.uint64(a) * blocks + block] -= weight * product[block]
-        if few:
-            for i in range(nx):
-                N[i, a] -= weight * NK[i]
-    if not few:
-        row = simd_blocks(H.values)
-        at = np.uint64(b) * blocks
-        for block in range(blocks):
+    row, at = simd_blocks(H.values), np.uint64(b) * blocks
+    for block in range(blocks):
+        if H.seen[b, block] != 0:
             left = row[at + block]
             for i in range(np.uint64(nx)):
                 rows[i * blocks + block] -= NK[i] * left
@@ -105,7 +100,7 @@ SLOPES = types.NamedTuple([_M, _M, _A, _M, _M, _A, _A], Slopes)
 
 
 class _Backward(NamedTuple):
-    """The arrays that a pass works in."""
+    """The arrays that a pass works in, of the states that any reading shows, in their order."""
 
     r: Any  # slope in the state
     N: Any  # its variance
@@ -116,6 +111,10 @@ class _Backward(NamedTuple):
     NFP: Any  # F' N times a row of the covariance
     grown: Any  # what noise of unit intensity adds in a row, by entry
     left: Any  # and dt exp(-2 decay dt)
+    H: Any  # Sparse: Jacobian of the readings
+    K: Any  # scratch of a reading
+    NK: Any
+    place_of: Any  # of a state in these, -1 of one that no reading shows
 
 
 @compiled(**REORDER)
@@ -125,9 +124,9 @@ def turned_jacobian(path, slot, F):
     Args:
         path: kalman.Path. slot: which of its Jacobians.
     """
-    nx = path.F.shape[1]
-    for i in range(nx):
-        for j in range(nx):
+    r = F.counts.size
+    for i in range(r):
+        for j in range(r):
             F.values[j, i] = path.F[slot, i, j]
     find_non_zeros(F)
 
@@ -138,21 +137,19 @@ def row_back(F, r, N, r_next, FN, NF):
 
     Args:
         F: the row's Jacobian, Sparse, transposed. r, N: slope and its variance, in place.
-        r_next, FN: out. NF: scratch.
+        r_next, FN: out. NF: scratch. FN and NF have as many rows as they are wide.
     """
     nx = r.size
     for i in range(nx):
         r_next[i] = r[i]
     for i in range(nx):
-        r[i] = 0.0
-        for c in range(F.counts[i]):
-            r[i] += F.values[i, F.places[i, c]] * r_next[F.places[i, c]]
+        r[i] = along(F, i, r_next)
     multiply(F, N, FN)
-    transpose(FN, nx, NF)
+    transpose(FN, NF)
     multiply(F, NF, N)
 
 
-@compiled(**REORDER)
+@compiled(**IN_ORDER)
 def _decay_slope(g, x, P, dt, w):
     """Slope in the decay of state `g`, through the Jacobian of a row.
 
@@ -190,7 +187,9 @@ def _grow(decay, dt, strength, k, w):
 def _noise_slopes(places, q, decay, w, in_noise, in_decay, expected):
     """Slopes through what a row's process noise adds to the covariance."""
     for e in range(q.size):
-        i, j = places[e, 0], places[e, 1]
+        i, j = w.place_of[places[e, 0]], w.place_of[places[e, 1]]
+        if i < 0 or j < 0:
+            continue
         weight = 0.5 if i == j else 1.0
         slope = weight * (w.r[i] * w.r[j] - w.N[i, j])
         grown = w.grown[e]
@@ -198,6 +197,54 @@ def _noise_slopes(places, q, decay, w, in_noise, in_decay, expected):
         expected[e] += weight * w.N[i, j] * grown
         if decay[e] > 0.0:
             in_decay[e] += slope * q[e] * (w.left[e] - grown) / decay[e]
+
+
+@compiled(**REORDER)
+def _score_rows(dt, strength, trace, places, q, decay, gate, refresh, block, out, w):
+    """`score_pass` in arrays that are there."""
+    e, gains, path = trace.e, trace.gains, trace.path
+    n, m = e.shape
+    dt_of_growth = -1.0
+    F_slot = H_slot = -1
+    reading = gains.per_sigma.size
+    beyond = 0.5 * (gate * gate - 1.0)
+    for k in range(n - 1, -1, -1):
+        if k < n - 1:
+            other = abs(dt[k] - dt_of_growth) > SAME_STEP * dt[k]
+            if other or strength_changes(strength, k, k + 1):
+                _grow(decay, dt[k], strength, k, w)
+                dt_of_growth = dt[k]
+            _noise_slopes(
+                places, q, decay, w, out.in_noise[block[k]], out.in_decay[block[k]],
+                out.noise_expected[block[k]],
+            )  # fmt: skip
+            if path.F_of[k] != F_slot:
+                F_slot = path.F_of[k]
+                turned_jacobian(path, F_slot, w.F)
+            row_back(w.F, w.r, w.N, w.r_next, w.B, w.NF)
+            for d in range(path.decaying.size):
+                g = path.decaying[d]
+                if w.place_of[g] >= 0:
+                    out.in_decay[block[k], g] += _decay_slope(
+                        w.place_of[g], trace.states[k, g], path.P[k, d], dt[k], w
+                    )
+        if k // refresh != H_slot:
+            H_slot = k // refresh
+            unpack(gains.H, H_slot, w.H)
+        for b in range(m - 1, -1, -1):
+            if not math.isnan(e[k, b]):
+                reading -= 1
+                shown, expected = reading_back(
+                    b, e[k, b], gains.per_sigma[reading], gains.K[reading], w.H, w.K, w.NK, w.r, w.N
+                )  # fmt: skip
+                if path.beyond[reading] > 0.0:
+                    shown, expected = beyond * path.beyond[reading], 0.0
+                out.in_reading[block[k], b] += shown - expected
+                out.reading_expected[b] += expected
+    for i in range(w.r.size):
+        j = gains.shown[i]
+        out.in_start[j] = 0.5 * (w.r[i] * w.r[i] - w.N[i, i])
+        out.start_expected[j] = 0.5 * w.N[i, i]
 
 
 @compiled_when_called(
@@ -219,53 +266,16 @@ def score_pass(dt, strength, trace, places, q, decay, gate, refresh, block, out)
         gate, refresh: as in the filter pass. block: (n,) which block of time each row is in.
         out: Slopes, from zero.
     """
-    e, gains, path = trace.e, trace.gains, trace.path
-    n, m = e.shape
-    nx = out.in_start.size
+    m, place_of = trace.e.shape[1], np.full(out.in_start.size, -1)
+    nx = how_many(trace.gains.shown)
+    for i in range(nx):
+        place_of[trace.gains.shown[i]] = i
     width = padded(nx)
     w = _Backward(
-        r=np.zeros(nx), N=aligned(nx, width), r_next=np.zeros(nx), B=aligned(nx, width),
-        NF=aligned(nx, width), F=with_places(aligned(nx, width), nx),
+        r=np.zeros(nx), N=aligned(nx, width), r_next=np.zeros(nx), B=aligned(width, width),
+        NF=aligned(width, width), F=with_places(aligned(nx, width), nx),
         NFP=aligned(1, width)[0], grown=np.zeros(q.size), left=np.zeros(q.size),
+        H=with_places(aligned(m, width), nx), K=np.zeros(width), NK=aligned(1, width)[0],
+        place_of=place_of,
     )  # fmt: skip
-    dt_of_growth = -1.0
-    NK = aligned(1, width)[0]
-    K = np.zeros(width)
-    H = with_places(aligned(m, width), nx)
-    F_slot = H_slot = -1
-    reading = gains.per_sigma.size
-    beyond = 0.5 * (gate * gate - 1.0)
-    for k in range(n - 1, -1, -1):
-        if k < n - 1:
-            other = abs(dt[k] - dt_of_growth) > SAME_STEP * dt[k]
-            if other or strength_changes(strength, k, k + 1):
-                _grow(decay, dt[k], strength, k, w)
-                dt_of_growth = dt[k]
-            _noise_slopes(
-                places, q, decay, w, out.in_noise[block[k]], out.in_decay[block[k]],
-                out.noise_expected[block[k]],
-            )  # fmt: skip
-            if path.F_of[k] != F_slot:
-                F_slot = path.F_of[k]
-                turned_jacobian(path, F_slot, w.F)
-            row_back(w.F, w.r, w.N, w.r_next, w.B, w.NF)
-            for d in range(path.decaying.size):
-                g = path.decaying[d]
-                slope = _decay_slope(g, trace.states[k, g], path.P[k, d], dt[k], w)
-                out.in_decay[block[k], g] += slope
-        if k // refresh != H_slot:
-            H_slot = k // refresh
-            unpack(gains.H, H_slot, H)
-        for b in range(m - 1, -1, -1):
-            if not math.isnan(e[k, b]):
-                reading -= 1
-                shown, expected = reading_back(
-                    b, e[k, b], gains.per_sigma[reading], gains.K[reading], H, K, NK, w.r, w.N
-                )  # fmt: skip
-                if path.beyond[reading] > 0.0:
-                    shown, expected = beyond * path.beyond[reading], 0.0
-                out.in_reading[block[k], b] += shown - expected
-                out.reading_expected[b] += expected
-    for i in range(nx):
-        out.in_start[i] = 0.5 * (w.r[i] * w.r[i] - w.N[i, i])
-        out.start_expected[i] = 0.5 * w.N[i, i]
+    _score_rows(dt, strength, trace, places, q, decay, gate, refresh, block, out, w)

@@ -15,9 +15,11 @@ from coax_env.kernel.simd import SIMD_WIDTH, lanes, negated, simd_blocks
 
 REORDER: dict[str, Any] = {"fastmath": {"reassoc", "contract"}}
 """Sums may be taken in the order that is fastest."""
-ROW_MULTIPLE = 32
-"""Rows of matrices are as long as a multiple of this, zeros at the end: no loop has a rest. Four
-registers are summed side by side, since each sum by itself waits for what was added last."""
+IN_ORDER: dict[str, Any] = {"fastmath": {"contract"}}
+"""Sums are taken in their order: those of a few non-zeros, which take longer in registers."""
+AT_ONCE = 4
+"""Registers of a row that are summed side by side, since each sum by itself waits for what was added
+last; three where a row ends with so many. Rows are padded with zeros until it does."""
 ONE, TWO, THREE, FOUR = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
 """Indices without a sign: a signed one is looked at each time whether it counts from the end."""
 
@@ -41,8 +43,12 @@ SPARSE = types.NamedTuple([float64[:, ::1], int64[:, ::1], int64[::1], int64[:, 
 
 @compiled(int64(int64))
 def padded(count):
-    """The least multiple of ROW_MULTIPLE that is not less."""
-    return (count + ROW_MULTIPLE - 1) // ROW_MULTIPLE * ROW_MULTIPLE
+    """Length of a row of so many numbers: whole registers, the last ones four or three at once."""
+    registers = (count + SIMD_WIDTH - 1) // SIMD_WIDTH
+    last = registers % AT_ONCE
+    if 0 < last < AT_ONCE - 1:
+        registers += AT_ONCE - 1 - last
+    return registers * SIMD_WIDTH
 
 
 @compiled(SPARSE(float64[:, ::1], int64), makes_arrays=True)
@@ -85,6 +91,38 @@ def find_non_zeros(A):
         A.counts[i] = count
 
 
+@compiled(forceinline=True, **IN_ORDER)
+def along(A, i, vector):
+    """Row `i` of A times a vector.
+
+    Args:
+        A: Sparse, its non-zeros found. i: of its rows. vector: (columns or more,).
+    """
+    total = 0.0
+    for c in range(A.counts[i]):
+        a = A.places[i, c]
+        total += A.values[i, a] * vector[a]
+    return total
+
+
+@compiled(forceinline=True)
+def in_fours(registers):
+    """How many of so many registers are taken four at once; three are left, or none."""
+    return registers // FOUR * FOUR
+
+
+@compiled(forceinline=True)
+def _three(registers, at):
+    """Three neighbours."""
+    return registers[at], registers[at + ONE], registers[at + TWO]
+
+
+@compiled(forceinline=True)
+def _set_three(registers, at, first, second, third):
+    """Three neighbours set."""
+    registers[at], registers[at + ONE], registers[at + TWO] = first, second, third
+
+
 @compiled(forceinline=True)
 def _four(registers, at):
     """Four neighbours."""
@@ -119,6 +157,24 @@ def four_of_product(A, i, rows, at, blocks):
 
 
 @compiled(forceinline=True, **REORDER)
+def three_of_product(A, i, rows, at, blocks):
+    """As `four_of_product`, the registers `at` to `at` + 2.
+
+    Args:
+        A, i, rows, blocks: as there. at: the first of three.
+    """
+    first, second, third = 0.0, 0.0, 0.0
+    for c in range(np.uint64(A.counts[i])):
+        a = np.uint64(A.places[i, c])
+        weight = A.values[i, a]
+        row = a * blocks + at
+        first += weight * rows[row]
+        second += weight * rows[row + ONE]
+        third += weight * rows[row + TWO]
+    return first, second, third
+
+
+@compiled(forceinline=True, **REORDER)
 def combine(weights, B, count, out):
     """Sum of the first `count` rows of B, each times its weight, into `out` (padded,).
 
@@ -127,7 +183,8 @@ def combine(weights, B, count, out):
     """
     blocks = np.uint64(out.size // SIMD_WIDTH)
     rows, total = simd_blocks(B), simd_blocks(out)
-    for b in range(np.uint64(0), blocks, FOUR):
+    fours = in_fours(blocks)
+    for b in range(np.uint64(0), fours, FOUR):
         first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
         for i in range(np.uint64(count)):
             weight = float64(weights[i])
@@ -137,6 +194,32 @@ def combine(weights, B, count, out):
             third += weight * rows[row + TWO]
             fourth += weight * rows[row + THREE]
         _set_four(total, b, first, second, third, fourth)
+    if fours < blocks:
+        first, second, third = 0.0, 0.0, 0.0
+        for i in range(np.uint64(count)):
+            weight = float64(weights[i])
+            row = i * blocks + fours
+            first += weight * rows[row]
+            second += weight * rows[row + ONE]
+            third += weight * rows[row + TWO]
+        _set_three(total, fours, first, second, third)
+
+
+@compiled(forceinline=True, **REORDER)
+def row_of_product(A, i, rows, blocks, product):
+    """Row `i` of A times another matrix.
+
+    Args:
+        A: Sparse, its non-zeros found. i: of its rows. rows: registers of the other matrix.
+        blocks: registers of a row. product: those of the result, out.
+    """
+    fours = in_fours(blocks)
+    for b in range(np.uint64(0), fours, FOUR):
+        first, second, third, fourth = four_of_product(A, i, rows, b, blocks)
+        _set_four(product, b, first, second, third, fourth)
+    if fours < blocks:
+        first, second, third = three_of_product(A, i, rows, fours, blocks)
+        _set_three(product, fours, first, second, third)
 
 
 @compiled(types.void(SPARSE, float64[:, ::1], float64[:, ::1]), **REORDER)
@@ -149,9 +232,7 @@ def multiply(A, B, out):
     blocks = np.uint64(out.shape[1] // SIMD_WIDTH)
     rows, product = simd_blocks(B), simd_blocks(out)
     for i in range(np.uint64(A.counts.size)):
-        for b in range(np.uint64(0), blocks, FOUR):
-            first, second, third, fourth = four_of_product(A, i, rows, b, blocks)
-            _set_four(product, i * blocks + b, first, second, third, fourth)
+        row_of_product(A, i, rows, blocks, product[i * blocks :])
 
 
 ROWS_AT_ONCE = np.uint64(32)
@@ -170,10 +251,11 @@ def add_gram(J, count, G):
     """
     blocks, n = np.uint64(J.shape[1] // SIMD_WIDTH), np.uint64(J.shape[0])
     rows, products = simd_blocks(J), simd_blocks(G)
+    fours = in_fours(blocks)
     for since in range(np.uint64(0), n, ROWS_AT_ONCE):
         until = min(since + ROWS_AT_ONCE, n)
         for i in range(np.uint64(0), np.uint64(count), TWO):
-            for b in range(i // np.uint64(ROW_MULTIPLE) * FOUR, blocks, FOUR):
+            for b in range(in_fours(i // np.uint64(SIMD_WIDTH)), fours, FOUR):
                 at, below = i * blocks + b, (i + ONE) * blocks + b
                 p0, p1, p2, p3 = _four(products, at)
                 q0, q1, q2, q3 = _four(products, below)
@@ -186,6 +268,17 @@ def add_gram(J, count, G):
                     q2, q3 = q2 + other * r2, q3 + other * r3
                 _set_four(products, at, p0, p1, p2, p3)
                 _set_four(products, below, q0, q1, q2, q3)
+            if fours < blocks:
+                at, below = i * blocks + fours, (i + ONE) * blocks + fours
+                p0, p1, p2 = _three(products, at)
+                q0, q1, q2 = _three(products, below)
+                for k in range(since, until):
+                    weight, other = J[k, i], J[k, i + ONE]
+                    r0, r1, r2 = _three(rows, k * blocks + fours)
+                    p0, p1, p2 = p0 + weight * r0, p1 + weight * r1, p2 + weight * r2
+                    q0, q1, q2 = q0 + other * r0, q1 + other * r1, q2 + other * r2
+                _set_three(products, at, p0, p1, p2)
+                _set_three(products, below, q0, q1, q2)
 
 
 @compiled(types.void(float32[:, :, ::1], int64, SPARSE))
@@ -193,9 +286,10 @@ def unpack(stored, slot, A):
     """One of the stored matrices back into a Sparse one, with its non-zeros.
 
     Args:
-        stored: (slots, rows, columns). slot: which. A: Sparse, out.
+        stored: (slots, rows or more, columns or more). slot: which.
+        A: Sparse, out, with as many rows and columns as are to come back.
     """
-    for i in range(stored.shape[1]):
-        for j in range(stored.shape[2]):
+    for i in range(A.counts.size):
+        for j in range(A.places.shape[1]):
             A.values[i, j] = stored[slot, i, j]
     find_non_zeros(A)

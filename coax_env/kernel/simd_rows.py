@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
@@ -96,6 +97,50 @@ def _four_by_four(builder: Any, rows: list) -> list:
     ]
 
 
+def _eight_by_eight(builder: Any, rows: list) -> list:
+    """Eight vectors of eight, transposed: pairs of rows, pairs of pairs, halves."""
+
+    def mixed(a: Any, b: Any, places: list[int]) -> Any:
+        return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, 8), places))
+
+    pairs = [
+        [mixed(rows[i], rows[i + 1], [k, k + 8, k + 2, k + 10, k + 4, k + 12, k + 6, k + 14])
+         for i in range(0, 8, 2)]
+        for k in (0, 1)
+    ]  # fmt: skip
+    fours = [
+        [mixed(of[i], of[i + 1], [k, k + 1, k + 8, k + 9, k + 4, k + 5, k + 12, k + 13])
+         for i in (0, 2)]
+        for k in (0, 2)
+        for of in pairs
+    ]  # fmt: skip
+    return [
+        mixed(low, high, [k, k + 1, k + 2, k + 3, k + 8, k + 9, k + 10, k + 11])
+        for k in (0, 4)
+        for low, high in fours
+    ]
+
+
+@intrinsic
+def _transpose_registers(typingctx, source, first, step, target, to, stride):
+    """Eight registers, `step` apart from `first` on, transposed to those from `to` on."""
+    signature_ = types.void(source, first, step, target, to, stride)
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        from_, since, step, into, to, stride = args
+
+        def at(kind: Any, array: Any, start: Any, distance: Any, k: int) -> Any:
+            place = builder.add(start, builder.mul(distance, ir.Constant(distance.type, k)))
+            return builder.gep(array_data(context, builder, kind, array), [place])
+
+        found = [builder.load(at(source, from_, since, step, k), align=8) for k in range(8)]
+        for k, row in enumerate(_eight_by_eight(builder, found)):
+            builder.store(row, at(target, into, to, stride, k), align=8)
+        return context.get_dummy_value()
+
+    return signature_, emit
+
+
 @intrinsic
 def _transpose(typingctx, source, places, target, targets):
     """Four times four numbers at these places of a flat array, transposed to those of another."""
@@ -176,24 +221,16 @@ def scatter(block, which, some, rows):
 
 
 @compiled()
-def transpose(matrix, n, out):
-    """The first n rows and columns of a matrix, transposed.
+def transpose(matrix, out):
+    """A square matrix of whole registers, transposed.
 
     Args:
-        matrix: (n, at least n). n: how many. out: (n, at least n).
+        matrix: (n, n), n a multiple of SIMD_WIDTH. out: (n, n).
     """
-    if n < 4:
-        for i in range(n):
-            for j in range(n):
-                out[j, i] = matrix[i, j]
-        return
-    long, wide = matrix.shape[1], out.shape[1]
-    for row in range(0, n, 4):
-        i = min(row, n - 4)  # the last four may overlap those before
-        for column in range(0, n, 4):
-            j = min(column, n - 4)
-            since, to = i * long + j, j * wide + i
-            _transpose(
-                matrix, (since, since + long, since + 2 * long, since + 3 * long),
-                out, (to, to + wide, to + 2 * wide, to + 3 * wide),
-            )  # fmt: skip
+    rows, turned = simd_blocks(matrix), simd_blocks(out)
+    eight = np.uint64(SIMD_WIDTH)
+    blocks = np.uint64(matrix.shape[1] // SIMD_WIDTH)
+    for i in range(blocks):
+        for j in range(blocks):
+            since, to = i * eight * blocks + j, j * eight * blocks + i
+            _transpose_registers(rows, since, blocks, turned, to, blocks)
