@@ -19,10 +19,10 @@ import coax_env
 from coax_env.comparison.two_flights import read_two
 from coax_env.consistency.agreement import Agreement, agreement, refuse_disagreement
 from coax_env.consistency.checks import names
-from coax_env.consistency.even_rows import STEP, weak
+from coax_env.consistency.even_rows import STEP, even_rows, weak
 from coax_env.errors import InputError
 from coax_env.estimation.flown import flown_parts
-from coax_env.logs.flight import Flight, read_flight, write_flight
+from coax_env.logs.flight import Flight, Run, read_flight, write_flight
 from coax_env.model.sensors import log_suite
 from coax_env.model.vehicle_file import load_vehicle
 from coax_env.simulation.simulate import fly_all, log_flight
@@ -263,6 +263,20 @@ def test_a_weak_derivative_is_the_derivative():
     )
     np.testing.assert_allclose(weak(t**3, starts, 2.0, 1), 3 * (middle**2 + spread), rtol=2e-3)
     np.testing.assert_allclose(weak(t**3, starts, 2.0, 2), 6.0 * middle, rtol=2e-3)
+
+
+def test_a_clipped_peak_is_not_known():
+    """A straight line over it is below it all along; over one lost reading it is as good as any."""
+    t = np.arange(0.0, 20.0, 0.01)
+    r = 4.0 * np.sin(2.0 * np.pi * t)
+    r[np.abs(r) > 3.3] = np.nan  # holes of 0.19 s
+    r[105] = np.nan
+    flight = Flight("lama400d", (Run("spin", t, np.zeros((t.size, 4)), {"r": r}),))
+    rows = even_rows(flight)
+    found = rows.signals["r"]
+    away = np.abs(found - 4.0 * np.sin(2.0 * np.pi * STEP * np.arange(found.size)))
+    assert np.isnan(r).mean() > 0.3 and away.max() > 0.5
+    assert away[rows.known["r"]].max() < 0.2 and rows.known["r"][105]
 
 
 def test_a_column_that_was_written_in_another_unit_is_found():

@@ -19,8 +19,9 @@ from coax_env.model.layout import ANGLES, RPM_PER_RAD_S
 STEP = 0.01
 """Time between even rows [s]: the fastest logs that are read come at about that."""
 FEWEST_READINGS = 10
-LONGEST_HOLE = 0.4
-"""Time [s] without a reading over which a channel is not interpolated, and not less than..."""
+LONGEST_HOLE = 0.1
+"""Time [s] without a reading over which a channel is not interpolated: a clipped peak is none of a
+straight line (a gyro missing for 0.2 s at a time read a third of the turn); and not less than..."""
 HOLE_STEPS = 3.0
 """...so many of its usual steps: GPS comes once a second; ours."""
 
