@@ -144,3 +144,14 @@ def test_a_state_that_comes_to_be_shown_is_in_from_the_start(begins):
     assert list(few.shown) == ([0, 1] if begins < 100 else [0, -1])
     assert few.log_likelihood == pytest.approx(every.log_likelihood, abs=1e-9)
     assert_allclose(few.innovations, every.innovations, atol=1e-10)
+
+
+@pytest.mark.parametrize("row", [0, 50])
+def test_a_jacobian_that_is_not_finite_ends_the_pass(row):
+    """It would show any state, and the pass begin again and again."""
+    t = 0.02 * np.arange(100)
+    u = np.zeros((100, 1))
+    u[row : row + 8] = np.nan
+    record = Record("astray", t, u, np.zeros((100, 1)))
+    (run,) = Engine(Coupled(), [record]).filter({}, Noise({"torque": 0.5}, {"first": 1.0}))
+    assert run.log_likelihood == -np.inf

@@ -830,7 +830,12 @@ def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
         )
         if not more:
             return log_likelihood, beyond
+        if shown.all():  # a Jacobian that is not finite shows anything
+            return -np.inf, beyond
+        known = shown.sum()
         _find_shown(w.AH, w.order, channels, shown)
+        if shown.sum() == known:
+            shown[:] = True
 
 
 @compiled_when_called(types.void(MODEL, _M, _A, _A, _M), makes_arrays=True)
