@@ -265,6 +265,17 @@ def rows(results: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     ]  # fmt: skip
 
 
+NAMES_HEADER = ("machine", "hidden", "not named", "named, not there")
+
+
+def _names(result: Mapping[str, Any]) -> list[str]:
+    """What the diagnosis made of a machine in words, under NAMES_HEADER."""
+    hidden, named = result["hidden"], result["named"]
+    missed = [effect for effect in hidden if effect not in named]
+    false = [effect for effect in named if effect not in hidden]
+    return [str(result["seed"]), ", ".join(hidden), ", ".join(missed), ", ".join(false)]
+
+
 def _words(score: Mapping[str, Any]) -> str:
     lost = "" if score["success_rate"] == 1.0 else f" ({100 * score['success_rate']:.0f} % succeed)"
     return f"{score['mean_cost']:.3g}{lost}"
@@ -308,9 +319,12 @@ def machines_page(results: Sequence[Mapping[str, Any]], words: str = "") -> str:
             bullets(in_words(found)),
         ]),
         Section("Machines", [
+            table(NAMES_HEADER, [_names(r) for r in results]),
+        ]),
+        Section("Costs", [
             prose(f"Mean cost per step of {_world_in_words(results)}; the share of flights that "
                   "succeed where it is not all."),
-            table(HEADER, rows(results)),
+            table((HEADER[0], *HEADER[3:]), [[row[0], *row[3:]] for row in rows(results)]),
         ]),
     ]  # fmt: skip
     if words:
