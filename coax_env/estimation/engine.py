@@ -350,9 +350,8 @@ class Engine:
             noise: levels of process and reading noise.
             which: indices of records; None: all.
         """
-        p = self.model.vector(values, noise)
         for known in tuple(self._scored) if which is None else ():
-            if known.is_at(p, noise):
+            if known.is_at(self.model.vector(values, noise), noise):
                 return known.score.log_likelihood
         return float(sum(p.log_likelihood for p in self.filter(values, noise, which=which)))
 
