@@ -225,7 +225,7 @@ def test_with_the_held_out_runs_it_is_the_posterior_of_all(monkeypatch):
     """Two runs were fitted; two more are taken in: best and covariance of all four and the prior."""
     monkeypatch.setattr(corrected_vehicle, "Engine", Runs)
     monkeypatch.setattr(
-        corrected_vehicle, "engine_of", lambda problem, records, fit: Runs(MODEL, records)
+        corrected_vehicle, "engine_as_fitted", lambda problem, records, fit: Runs(MODEL, records)
     )
     made = problem("yaw_damping")
     free = made.free(("yaw_damping",))

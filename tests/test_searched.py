@@ -102,7 +102,7 @@ def test_strengths_of_gusts_are_fitted_beside_what_stood_them(monkeypatch, white
     monkeypatch.setattr(searched, "_searched", search)
     monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
     first = SimpleNamespace(fit=Fit(("wind",), {}, FINE), refitted=Fit((), {}, FINE))
-    problem, best = searched._in_shocks(problem_of("steady"), first, FINE)  # type: ignore[arg-type]
+    problem, best = searched._searched_in_shocks(problem_of("steady"), first, FINE)  # type: ignore[arg-type]
     assert asked == beside
     if not white:
         assert best is first and problem.name == "steady"

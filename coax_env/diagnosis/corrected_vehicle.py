@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from coax_env.diagnosis.findings import stated_std
-from coax_env.diagnosis.input_innovations import has_command_gains, with_input_innovations
+from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.shocks import engine_of
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.engine import Engine, objective
 from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step
@@ -92,9 +91,7 @@ def with_held_out(
     names = [f.name for f in free]
     if not held:
         return {name: fit.values[name] for name in names}, quadratic.covariance(names)
-    engine = engine_of(problem, held, fit)
-    if has_command_gains(problem):
-        engine = with_input_innovations(engine, fit)
+    engine = engine_as_fitted(problem, held, fit)
     passes, lin = engine.linearise(fit.values, fit.noise, free)
     taken_in = Quadratic.of(lin, free, fit.values)
     known = quadratic.index(names)

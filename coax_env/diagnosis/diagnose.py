@@ -29,10 +29,7 @@ from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
 from coax_env.diagnosis.evidence import weighed
 from coax_env.diagnosis.gain import gain_of
 from coax_env.diagnosis.hold_out import check_hold_out, split
-from coax_env.diagnosis.input_innovations import (
-    has_command_gains,
-    with_input_innovations,
-)
+from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.model_check import model_check
 from coax_env.diagnosis.onsets.moment import moments_of
 from coax_env.diagnosis.onsets.search import beside_onsets, with_onsets
@@ -349,13 +346,11 @@ def _gain(
     problem.report("flying the held-out runs")
     horizon = problem.settings.horizon
     bare, refitted, fit = fits
-    own = engine_of(problem, held, fit)
-    if has_command_gains(problem):
-        own = with_input_innovations(own, fit)
     before, own_numbers = (
         replay_runs(engine_of(problem, held, given), given.values, given.noise, horizon)
         for given in (bare, refitted)
     )
+    own = engine_as_fitted(problem, held, fit)
     after = replay_runs(own, fit.values, fit.noise, horizon, floor=True)
     flexible: list[RunReplay] = []
     if ceiling:

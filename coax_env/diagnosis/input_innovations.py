@@ -25,6 +25,7 @@ import numpy as np
 
 from coax_env.diagnosis.fits import fitted
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.shocks import engine_of
 from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.state_space import FreeParameter, Record
 from coax_env.estimation.whiteness import is_white
@@ -84,6 +85,16 @@ def with_command_gains(problem: Problem, fit: Fit, coloured: bool = False) -> tu
 def has_command_gains(problem: Problem) -> bool:
     """Whether the gains of the input innovations are fitted."""
     return any(f.name in P.COMMAND_GAINS for f in problem.added)
+
+
+def engine_as_fitted(problem: Problem, records: Sequence[Record], fit: Fit) -> Engine:
+    """An engine over other records, with all that the fitted ones have: strengths, input innovations.
+
+    Args:
+        problem: as fitted. records: that were not fitted. fit: of the model that flies them.
+    """
+    engine = engine_of(problem, records, fit)
+    return with_input_innovations(engine, fit) if has_command_gains(problem) else engine
 
 
 def with_input_innovations(engine: Engine, fit: Fit) -> Engine:

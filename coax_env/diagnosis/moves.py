@@ -197,13 +197,14 @@ def drop(problem: Problem, fit: Fit, quadratic: Quadratic, coloured: bool) -> Fi
             settled = _settled(problem, fit, quadratic, effect)
             if settled is not None:
                 return settled
-        if not math.isfinite(worth[effect]) or _is_worthless(
-            problem, fit, quadratic, effect, inflations[effect]
-        ):
-            why = f"worth {worth[effect]:.1f} nats" if math.isfinite(worth[effect]) else TOO_SMALL
-            problem.report(f"dropped {effect}: {why}")
-            rest = at_optimum(problem, fit, quadratic, fit.rest(effect), problem.off_values(effect))
-            return rest.noted(f"- {effect}", max(worth[effect], 0.0))
+            why = TOO_SMALL
+        elif _is_worthless(problem, fit, quadratic, effect, inflations[effect]):
+            why = f"worth {worth[effect]:.1f} nats"
+        else:
+            continue
+        problem.report(f"dropped {effect}: {why}")
+        rest = at_optimum(problem, fit, quadratic, fit.rest(effect), problem.off_values(effect))
+        return rest.noted(f"- {effect}", max(worth[effect], 0.0))
     return None
 
 

@@ -61,7 +61,7 @@ def searched(problem: Problem, noise: Noise) -> Searched:
     """
     best = _searched(problem, noise)
     if in_shocks(problem, best.fit):
-        problem, best = _in_shocks(problem, best, noise)
+        problem, best = _searched_in_shocks(problem, best, noise)
     found = _with_jitter(problem, best.fit)
     if found is not None:
         problem, levels = found
@@ -82,7 +82,9 @@ def searched(problem: Problem, noise: Noise) -> Searched:
     return best
 
 
-def _in_shocks(problem: Problem, first: Searched, noise: Noise) -> tuple[Problem, Searched]:
+def _searched_in_shocks(
+    problem: Problem, first: Searched, noise: Noise
+) -> tuple[Problem, Searched]:
     """The search with a strength of the gusts for each block of time.
 
     First with strengths of the model without a cause, which take what a shock may be for one; then, if

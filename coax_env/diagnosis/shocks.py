@@ -74,7 +74,7 @@ def engine_of(problem: Problem, records: Sequence[Record], fit: Fit) -> Engine:
 
 
 def _has_strengths(problem: Problem) -> bool:
-    return bool(problem.engine.records[0].strength.block.size)
+    return not problem.engine.records[0].strength.steady
 
 
 def _moving(fit: Fit) -> np.ndarray:

@@ -53,7 +53,7 @@ def with_strengths(
 
 
 def _parted(record: Record, entries: int) -> Record:
-    if record.strength.block.size:
+    if not record.strength.steady:
         return record
     block = ((record.t - record.t[0]) / BLOCK).astype(np.int64)
     return replace(record, strength=Strength(block, np.ones((int(block[-1]) + 1, entries))))

@@ -35,6 +35,15 @@ class Strength(NamedTuple):
     block: np.ndarray
     factor: np.ndarray
 
+    @property
+    def steady(self) -> bool:
+        """Whether it is one level from the first row to the last."""
+        return not self.block.size
+
+    def part(self, rows: np.ndarray) -> "Strength":
+        """That of some rows."""
+        return self if self.steady else self._replace(block=self.block[rows])
+
 
 STEADY = Strength(np.zeros(0, np.int64), np.zeros((0, 0)))
 """Process noise of one level from the first row to the last."""
@@ -81,9 +90,7 @@ def part(record: Record, rows: np.ndarray) -> Record:
         z=record.z[rows],
         input_innovations=of(record.input_innovations),
         battery=of(record.battery),
-        strength=Strength(record.strength.block[rows], record.strength.factor)
-        if record.strength.block.size
-        else STEADY,
+        strength=record.strength.part(rows),
     )
 
 
