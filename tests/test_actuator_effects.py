@@ -365,6 +365,18 @@ class Radio:
         return there[-1] if there else self.sent[0][1]
 
 
+class Cable:
+    """Commands that arrive late, all by the same time."""
+
+    def __init__(self, delay: float) -> None:
+        self.delay, self.sent = delay, []
+
+    def __call__(self, command: np.ndarray, time: float) -> np.ndarray:
+        self.sent.append((time + self.delay, command))
+        there = [c for when, c in self.sent[-80:] if when <= time + 1e-9]
+        return there[-1] if there else self.sent[0][1]
+
+
 class SoftMotors:
     """Speed controllers that push in proportion to the error, against a torque that grows as w^2."""
 
@@ -442,6 +454,17 @@ def test_a_hidden_actuator_effect_is_found_and_nothing_else(effect):
         reported = cause["parameters"][f"{effect}.{name}"]
         allowed = 3.0 * reported["std"] + 0.1 * value  # the form is another one
         assert abs(reported["value"] - value) < allowed, (name, reported)
+
+
+@pytest.mark.slow
+def test_a_delay_is_known_within_a_row_where_speeds_are_measured():
+    """A speed shows which row's command is in force, and thrust and torque when it was taken over."""
+    delay = 0.02 + 3.0 * PART
+    found = diagnose(flight_with(lambda: Cable(delay)), LAMA, hold_out=[]).findings
+    (cause,) = found["causes"]
+    value = cause["parameters"]["command_delay.time"]["value"]
+    assert value == pytest.approx(delay, abs=0.1 * ROW)
+    assert found["verdict"] == "explained"
 
 
 IN_THE_INJECTOR = {

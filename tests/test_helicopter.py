@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from coax_env import load_vehicle
-from coax_env.estimation.helicopter import HELD, MOST_USUAL_SIZES, HeliModel, record_of
+from coax_env.estimation.helicopter import HELD, MOST_USUAL_SIZES, READ, HeliModel, record_of
 from coax_env.estimation.helicopter_noise import (
     GUST_LEVELS,
     LEAST_READING_STD,
@@ -146,14 +146,15 @@ def test_what_is_not_measured_starts_anywhere_a_hover_can_be():
 def test_inputs_are_commands_time_and_innovations():
     one = record()
     u = MODEL.inputs(one, LAMA.vector)
-    assert np.array_equal(u[:, :4], one.command)
-    np.testing.assert_allclose(u[:, 4], one.t - 4.0)
-    assert not u[:, 5].any()
+    step, read = u[:, :N_INPUTS], u[:, READ]
+    assert u.shape == (one.t.size, 2 * N_INPUTS) and np.array_equal(step, read)
+    assert np.array_equal(step[:, :4], one.command)
+    np.testing.assert_allclose(step[:, 4], one.t - 4.0)
+    assert not step[:, 5].any()
     charged = replace(one, battery=12.0 - 0.01 * one.t)
     at = {"battery_voltage.per_volt": 0.05, "battery_voltage.nominal": 11.5}
-    np.testing.assert_allclose(
-        MODEL.inputs(charged, MODEL.vector(at)), np.column_stack([u[:, :5], 0.5 - 0.01 * one.t])
-    )
+    half = np.column_stack([step[:, :5], 0.5 - 0.01 * one.t])
+    np.testing.assert_allclose(MODEL.inputs(charged, MODEL.vector(at)), np.hstack([half, half]))
     innovations = np.random.default_rng(0).standard_normal((one.t.size, 4))
     with_innovations = Record(one.name, one.t, one.command, one.z, one.origin, innovations)
     assert np.array_equal(MODEL.inputs(with_innovations, LAMA.vector), np.hstack([u, innovations]))
@@ -174,6 +175,55 @@ def test_late_commands_are_their_mean_over_the_row(common, of_servos):
         for columns, delay in ((slice(0, 2), common), (slice(2, 4), common + of_servos)):
             row = np.maximum(np.searchsorted(t, fine - delay, side="right") - 1, 0)
             assert u[k, columns] == pytest.approx(command[row, columns].mean(axis=0), abs=2e-4), k
+
+
+@pytest.mark.parametrize(("rows", "per_row"), [(1, 2.0), (2, 1.0), (5, 1.0)])
+def test_a_reading_sees_the_command_in_force_as_its_row_begins(rows, per_row):
+    """Taken over in the middle between two rows, that of `rows` ago; before, on the line to the next.
+
+    From no delay on, where it is the row's own, the line is twice as steep.
+    """
+    one = record(seconds=1.0)
+    n, step = one.t.size, one.t[1] - one.t[0]
+    changing = replace(one, command=np.random.default_rng(3).standard_normal((n, 4)))
+
+    def read(late: float) -> np.ndarray:
+        vector = MODEL.vector({"command_delay.time": late * step})
+        return MODEL.inputs(changing, vector)[rows:-1, READ][:, :4]
+
+    in_force, later = changing.command[: n - 1 - rows], changing.command[1 : n - rows]
+    np.testing.assert_allclose(read(rows - 0.5), in_force, atol=1e-9)
+    towards = in_force + 0.3 * per_row * (later - in_force)
+    np.testing.assert_allclose(read(rows - 0.8), towards, atol=1e-9)
+
+
+def test_readings_may_see_commands_later_than_steps_do():
+    """That in force so long ago, by counting rows; and none is late where nothing is."""
+    one = record(seconds=1.0)
+    step = one.t[1] - one.t[0]
+    changing = replace(one, command=np.random.default_rng(4).standard_normal((one.t.size, 4)))
+    model = MODEL.reading_after(2.7 * step)
+    late = model.vector({"command_delay.time": 2.2 * step})
+    u = model.inputs(changing, late)
+    assert np.array_equal(u[3:, READ][:, :4], changing.command[:-3])
+    assert np.array_equal(u[:, :N_INPUTS], MODEL.inputs(changing, late)[:, :N_INPUTS])
+    assert np.array_equal(model.inputs(changing, LAMA.vector), MODEL.inputs(changing, LAMA.vector))
+
+
+def test_drift_is_that_of_the_step_and_readings_are_those_of_their_own_input():
+    """With effects that use the rotors' acceleration and the tilt."""
+    vector = LAMA.with_effect("spin_up_reaction", gain=1.0).with_effect("hub_stiffness", lower=0.2)
+    p, rng = vector.vector, np.random.default_rng(7)
+    x = 0.05 * rng.standard_normal(N_FULL)
+    x[16:18] = 205.0, 215.0
+    step = dynamics.kernel_input(np.array([210.0, 220.0, 0.02, -0.01]))
+    read = dynamics.kernel_input(np.array([214.0, 217.0, -0.03, 0.02]))
+    work, both = np.zeros(MODEL.work_size), np.zeros(N_FULL + len(CHANNELS))
+    flown, shown = np.zeros_like(both), np.zeros(len(CHANNELS))
+    MODEL.drift_and_readings.__wrapped__(x, np.append(step, read), 0.01, p, work, both)
+    dynamics.drift_and_readings(x, step, 0.01, p, work, flown)
+    dynamics.measure(x, read, p, work, shown)
+    assert np.array_equal(both, np.append(flown[:N_FULL], shown))
 
 
 def test_a_command_that_has_long_been_held_is_itself_however_late():
@@ -209,7 +259,8 @@ def test_an_input_innovation_corrects_its_states(gain):
         corrected[X[state]] += 0.01 * np.dot(weights, innovations)
     expected = np.zeros(N_FULL)
     dynamics.step(corrected, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
-    u_with_innovations = np.append(dynamics.kernel_input(command), innovations)
+    both_halves = np.tile(dynamics.kernel_input(command), 2)
+    u_with_innovations = np.append(both_halves, innovations)
     MODEL.step.__wrapped__(x, u_with_innovations, 0.01, vector, work, out)
     np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-14)
     # the drift is the same to first order: the correction comes on top of what is flown
@@ -220,7 +271,7 @@ def test_an_input_innovation_corrects_its_states(gain):
     np.testing.assert_allclose(drift[:N_FULL], corrected - x, rtol=1e-9, atol=1e-13)
     assert not drift[N_FULL:].any()
     # and who hears nothing flies the kernel's own step
-    MODEL.step.__wrapped__(x, u_with_innovations[:N_INPUTS].copy(), 0.01, vector, work, out)
+    MODEL.step.__wrapped__(x, both_halves, 0.01, vector, work, out)
     dynamics.step(x, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
     assert np.array_equal(out, expected)
 

@@ -51,13 +51,13 @@ def state(upper: float, lower: float) -> np.ndarray:
 
 def read(model: HeliModel, x: np.ndarray, command: np.ndarray, p: np.ndarray) -> np.ndarray:
     out, work = np.zeros(N_CHANNELS), np.zeros(model.work_size)
-    model.measure.__wrapped__(x, dynamics.kernel_input(command), p, work, out)
+    model.measure.__wrapped__(x, np.tile(dynamics.kernel_input(command), 2), p, work, out)
     return out
 
 
 def stepped(model: HeliModel, x: np.ndarray, command: np.ndarray, p: np.ndarray) -> np.ndarray:
     out, work = np.zeros(x.size), np.zeros(model.work_size)
-    model.step.__wrapped__(x, dynamics.kernel_input(command), DT, p, work, out)
+    model.step.__wrapped__(x, np.tile(dynamics.kernel_input(command), 2), DT, p, work, out)
     return out
 
 
@@ -105,7 +105,7 @@ def test_without_jitter_it_is_the_helicopters_own_model_to_the_last_digit():
 def test_the_drift_is_what_the_step_adds_to_first_order():
     x, p = state(1.5, -0.8), vector()
     out, work = np.zeros(N_JITTERY + N_CHANNELS), np.zeros(MODEL.work_size)
-    u = dynamics.kernel_input(COMMAND)
+    u = np.tile(dynamics.kernel_input(COMMAND), 2)
     MODEL.drift_and_readings.__wrapped__(x, u, 1e-4, p, work, out)
     later = np.zeros(N_JITTERY)
     MODEL.step.__wrapped__(x, u, 1e-4, p, work, later)

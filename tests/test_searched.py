@@ -57,7 +57,7 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
     def one(problem: Any, noise: Noise, coarse: bool = False) -> Any:
         asked.append(noise.reading["phi"])
         fit = Fit((), {}, noise)
-        return SimpleNamespace(fit=fit, coarse=coarse)
+        return SimpleNamespace(problem=problem, fit=fit, coarse=coarse)
 
     monkeypatch.setattr(searched, "_searched", one)
     monkeypatch.setattr(searched, "_with_jitter", lambda problem, fit: None)
@@ -96,15 +96,17 @@ def test_strengths_of_gusts_are_fitted_beside_what_stood_them(monkeypatch, white
         return SimpleNamespace(name=name, engine=engine, model=model, report=lambda text: None)
 
     def search(problem: Any, noise: Noise) -> Any:
-        return SimpleNamespace(fit=Fit(found, {}, noise), of=problem.name)
+        return SimpleNamespace(problem=problem, fit=Fit(found, {}, noise))
 
     monkeypatch.setattr(searched, "with_shocks", shaken)
     monkeypatch.setattr(searched, "_searched", search)
     monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
-    first = SimpleNamespace(fit=Fit(("wind",), {}, FINE), refitted=Fit((), {}, FINE))
-    problem, best = searched._searched_in_shocks(problem_of("steady"), first, FINE)  # type: ignore[arg-type]
+    first = SimpleNamespace(
+        problem=problem_of("steady"), fit=Fit(("wind",), {}, FINE), refitted=Fit((), {}, FINE)
+    )
+    best: Any = searched._searched_in_shocks(first, FINE)  # type: ignore[arg-type]
     assert asked == beside
     if not white:
-        assert best is first and problem.name == "steady"
+        assert best is first
     else:
-        assert best.of == problem.name == f"strengths {len(beside)}"
+        assert best.problem.name == f"strengths {len(beside)}"

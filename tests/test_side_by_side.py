@@ -22,6 +22,9 @@ ACTIVE = {"motor_lag.upper": 0.07, "motor_lag.lower": 0.06, "servo_rate.limit": 
           "wind.north": -1.0, "rotor_drag.coefficient": 3e-4, "gyro_bias.y": -0.01}  # fmt: skip
 
 
+LATE = {"command_delay.time": 0.023, "hub_stiffness.lower": 0.2, "accel_bias.x": 0.05}
+
+
 class OneByOne(HeliModel):
     """The same helicopter, its derivatives taken one after the other."""
 
@@ -44,7 +47,7 @@ def flown():
     return vehicle, record, starting_noise(flight, vehicle), free, values
 
 
-@pytest.mark.parametrize("active", [{}, ACTIVE], ids=["bare", "six effects"])
+@pytest.mark.parametrize("active", [{}, ACTIVE, LATE], ids=["bare", "six effects", "late commands"])
 def test_derivatives_in_lanes_are_those_one_by_one(flown, active):
     """Likelihood and signatures to the rounding of their differences, effects on or off."""
     vehicle, record, noise, free, values = flown

@@ -17,6 +17,7 @@ from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.fast_rows import decimated
 from coax_env.logs.flight import Flight, read_flight
+from coax_env.model.layout import N_INPUTS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 
@@ -41,7 +42,8 @@ class MachineModel(HeliModel):
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """As `HeliModel.inputs`, rotor commands times 1 + that number."""
         u = super().inputs(record, vector)
-        u[:, list(ROTORS)] *= 1.0 + vector[-1]
+        for half in (0, N_INPUTS):
+            u[:, [half + rotor for rotor in ROTORS]] *= 1.0 + vector[-1]
         return u
 
 

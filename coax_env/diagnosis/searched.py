@@ -11,6 +11,9 @@ J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Ident
 And where innovations that rotors' jitter would colour stay so, it is done again with that noise in the
 filter (estimation/rotor_jitter.py), if its levels are worth more than a tie: after a search, since a
 motor's lag colours them too and must be found as what it is.
+
+Commands that were found to be late are read as late as that from then on (estimation/helicopter.py),
+where that is likelier, and the search goes on.
 """
 
 from dataclasses import dataclass, replace
@@ -60,14 +63,16 @@ def searched(problem: Problem, noise: Noise) -> Searched:
         problem: what may be free. noise: levels to start from.
     """
     best = _searched(problem, noise)
-    if in_shocks(problem, best.fit):
-        problem, best = _searched_in_shocks(problem, best, noise)
+    if in_shocks(best.problem, best.fit):
+        best = _searched_in_shocks(best, noise)
+    problem = best.problem
     found = _with_jitter(problem, best.fit)
     if found is not None:
         problem, levels = found
         problem.report("searching again with rotor speeds that jitter")
         noise = with_jitter(noise, problem.model).with_levels(levels)
         best = _searched(problem, noise)
+        problem = best.problem
     coarser = _coarser(best.fit.noise)
     passes = problem.engine.filter(best.fit.values, best.fit.noise)
     if not coarser or is_white(passes, problem.model.channels):
@@ -82,28 +87,27 @@ def searched(problem: Problem, noise: Noise) -> Searched:
     return best
 
 
-def _searched_in_shocks(
-    problem: Problem, first: Searched, noise: Noise
-) -> tuple[Problem, Searched]:
+def _searched_in_shocks(first: Searched, noise: Noise) -> Searched:
     """The search with a strength of the gusts for each block of time.
 
     First with strengths of the model without a cause, which take what a shock may be for one; then, if
     causes stand that, with strengths beside these. What a model lacks looks like shocks too, and
     strengths would believe it less just there: they must make its innovations white, or none are used.
     """
+    problem = first.problem
     trial, with_causes = with_shocks(problem, first.fit)
     if not is_white(
         trial.engine.filter(with_causes.values, with_causes.noise), problem.model.channels
     ):
-        return problem, first
+        return first
     problem.report("gusts come in single shocks: searching again with a strength for each")
     problem, _ = with_shocks(problem, first.refitted)
     best = _searched(problem, noise)
     if best.fit.active:
         problem.report("searching again with strengths beside what was found")
-        problem, _ = with_shocks(problem, best.fit)
+        problem, _ = with_shocks(best.problem, best.fit)
         best = _searched(problem, noise)
-    return problem, best
+    return best
 
 
 def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
@@ -117,7 +121,22 @@ def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
     if steady.objective < fit.objective - problem.settings.tie:
         problem.report("searching on from steadier noise")
         fit, quadratic = search(problem, steady)
+    late = _with_late_readings(problem, fit)
+    if late is not None:
+        problem, fit = late
+        problem.report("searching on with readings of the commands in force")
+        fit, quadratic = search(problem, fit)
     return Searched(problem, bare, refitted, fit, quadratic, coarse)
+
+
+def _with_late_readings(problem: Problem, fit: Fit) -> tuple[Problem, Fit] | None:
+    """The problem whose readings see late commands at the delay of a fit, where that is likelier."""
+    delay = fit.values.get("command_delay.time", 0.0)
+    if delay <= 0.0 or problem.model.read_delay is not None:
+        return None
+    late = problem.with_model(problem.model.reading_after(delay))
+    trial = fitted(late, noise_fitted(late, fitted(late, fit)))
+    return (late, trial) if trial.objective < fit.objective - problem.settings.tie else None
 
 
 def _with_jitter(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] | None:

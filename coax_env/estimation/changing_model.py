@@ -19,13 +19,14 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from coax_env.estimation import helicopter
-from coax_env.estimation.helicopter import MEASURE, STEP, HeliModel, Moment, Motion
+from coax_env.estimation.helicopter import MEASURE, READ, STEP, HeliModel, Moment, Motion
 from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
 from coax_env.kernel.simd import SIMD_WIDTH, select, simd_view
 from coax_env.kernel.variants import under_names
 from coax_env.model import effects
+from coax_env.model.layout import N_FULL
 
 BEFORE = "before"
 """The part of the flight before an effect's moment, as in ``swash_offset.lon@before``."""
@@ -135,13 +136,15 @@ def _step_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> No
 def _measure_of_lanes(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     """`_measure` of as many."""
     u_, p_ = simd_view(u)[: u.shape[0] - 1], _own_of_lanes(u, p, work)
-    _measure_of_registers(simd_view(x), u_, p_, simd_view(work), simd_view(out))
+    _measure_of_registers(simd_view(x), u_[READ], p_, simd_view(work), simd_view(out))
 
 
 def _drift_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """`_drift_and_readings` of as many."""
     u_, p_, out_ = simd_view(u)[: u.shape[0] - 1], _own_of_lanes(u, p, work), simd_view(out)
     _drift_of_registers(simd_view(x), u_, dt, p_, simd_view(work), out_)
+    if _lanes_read_another(u):
+        _measure_of_registers(simd_view(x), u_[READ], p_, simd_view(work), out_[N_FULL:])
     _take_in_innovations(u_, p_, out_)
 
 
@@ -150,6 +153,7 @@ _measure_of_registers: Any = None
 _drift_of_registers: Any = None
 _take_in_innovations = helicopter._take_in_innovations
 _start_of_step = helicopter._start_of_step
+_lanes_read_another = helicopter._lanes_read_another
 
 
 @cache

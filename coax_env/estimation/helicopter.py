@@ -3,9 +3,16 @@
 Delays of the commands enter here: with command_delay, and for the swash plate servo_delay on top, they
 are looked up late and, where a row's interval holds two of them, replaced by their mean over it (the
 step is split to second order).
+
+A reading is taken as the row begins: it sees the one command that is in force then, and so an input of
+the model has two halves, that of the step and that of the readings. With a delay between k and k + 1
+rows that is the command of k + 1 rows ago, wherever in between the delay is: a likelihood with steps.
+It is searched along the line through their middles, off by half a row at most; where a delay was found
+so, that of the readings is held (`reading_after`), and that of the step fitted by itself.
 """
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
@@ -18,7 +25,7 @@ from coax_env.estimation import helicopter_noise
 from coax_env.estimation.kalman import LANES_MEASURE, LANES_STEP
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
-from coax_env.kernel.simd import simd_view
+from coax_env.kernel.simd import SIMD_WIDTH, simd_view
 from coax_env.kernel.variants import under_names
 from coax_env.logs.flight import Run
 from coax_env.logs.held_signal import integral_of_held
@@ -60,6 +67,11 @@ HELD = (
 )  # fmt: skip
 """Base parameters that are never fitted: exact, or one column with others that are."""
 
+READ = slice(N_INPUTS, 2 * N_INPUTS)
+"""Columns of the input that the readings see."""
+_INNOVATIONS = READ.stop
+"""Column of the input at which input innovations begin, where it has them."""
+
 _A = float64[::1]
 STEP = types.void(_A, _A, float64, _A, _A, _A)
 MEASURE = types.void(_A, _A, _A, _A, _A)
@@ -68,10 +80,10 @@ MEASURE = types.void(_A, _A, _A, _A, _A)
 @compiled()
 def _take_in_innovations(u: Any, p: Any, x: Any) -> None:
     """Correct a state (29,) in place by the innovations after the input; see input_innovations.py."""
-    if u.size == N_INPUTS:
+    if u.size == _INNOVATIONS:
         return
-    upper, lower = u[N_INPUTS + U.OMEGA_U], u[N_INPUTS + U.OMEGA_L]
-    lon, lat = u[N_INPUTS + U.DELTA_LON], u[N_INPUTS + U.DELTA_LAT]
+    upper, lower = u[_INNOVATIONS + U.OMEGA_U], u[_INNOVATIONS + U.OMEGA_L]
+    lon, lat = u[_INNOVATIONS + U.DELTA_LON], u[_INNOVATIONS + U.DELTA_LAT]
     turn, lift = upper - lower, upper + lower
     x[S.P] += p[P.COMMAND_GAIN_RATE_XY] * lat
     x[S.Q] += p[P.COMMAND_GAIN_RATE_XY] * lon
@@ -83,6 +95,24 @@ def _take_in_innovations(u: Any, p: Any, x: Any) -> None:
     x[S.GUST_N] += p[P.COMMAND_GAIN_MOMENT_Z] * turn
     x[S.W] += p[P.COMMAND_GAIN_SPEED_Z] * lift
     x[S.GUST_Z] += p[P.COMMAND_GAIN_FORCE_Z] * lift
+
+
+@compiled()
+def _reads_another(u: Any) -> bool:
+    """Whether the readings see another input than the step."""
+    for i in range(N_INPUTS):  # noqa: SIM110, numba has no any()
+        if u[i] != u[N_INPUTS + i]:
+            return True
+    return False
+
+
+@compiled()
+def _lanes_read_another(u: Any) -> bool:
+    """Whether they do in any lane of an input (nu, SIMD_WIDTH)."""
+    for lane in range(SIMD_WIDTH):  # noqa: SIM110
+        if _reads_another(u[:, lane]):
+            return True
+    return False
 
 
 @compiled()
@@ -101,12 +131,14 @@ def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
 
 def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     """`dynamics.measure`, in the form in which the engine takes a model."""
-    dynamics.measure(x, u, p, work, out)
+    dynamics.measure(x, u[READ], p, work, out)
 
 
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """`dynamics.drift_and_readings` and the input innovations, in the engine's form."""
     dynamics.drift_and_readings(x, u, dt, p, work, out)
+    if _reads_another(u):
+        dynamics.measure(x, u[READ], p, work, out[N_FULL:])
     _take_in_innovations(u, p, out)
 
 
@@ -151,12 +183,16 @@ def _drift_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> N
     """`_drift_and_readings` of as many."""
     u_, p_, out_ = simd_view(u), simd_view(p), simd_view(out)
     _drift_of_registers(simd_view(x), u_, dt, p_, simd_view(work), out_)
+    if _lanes_read_another(u):
+        _measure_of_registers(simd_view(x), u_[READ], p_, simd_view(work), out_[N_FULL:])
     _take_in_innovations(u_, p_, out_)
 
 
 def _measure_of_lanes(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     """`_measure` of as many."""
-    _measure_of_registers(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
+    _measure_of_registers(
+        simd_view(x), simd_view(u)[READ], simd_view(p), simd_view(work), simd_view(out)
+    )
 
 
 def lanes_of_registers(motion: Motion, kind: str) -> Any:
@@ -209,6 +245,7 @@ class HeliModel:
     wraps = np.array([c in ANGLES for c in CHANNELS])
     motion = Motion(_step, _measure, _drift_and_readings)
     step, measure, drift_and_readings = motion.pointers()
+    read_delay: float | None = None  # [s] of commands to the readings; None: follows the steps'
     moments: Mapping[str, Moment] = {}  # when effects begin or change; see changing_model.py
     exact = np.arange(N_FULL) >= N_STATES
     work_size = dynamics.WORK_SIZE
@@ -255,20 +292,39 @@ class HeliModel:
         return np.array([_COMMAND_DELAY, _SERVO_DELAY, _NOMINAL_VOLTAGE])
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
-        """The kernel's inputs, inputs.py, (n, 6), or with input innovations, (n, 10)."""
-        u = np.zeros((record.t.size, N_INPUTS))
-        u[:, :TIME] = record.command
-        u[:, U.TIME] = record.t - record.origin
+        """The kernel's inputs (inputs.py) of steps and of readings, (n, 12), input innovations behind.
+
+        A late command is its mean over the row to the step, that in force as it begins to the readings.
+        """
+        u = np.zeros((record.t.size, 2, N_INPUTS))
+        u[:, :, :TIME] = record.command[:, None]
+        u[:, :, U.TIME] = (record.t - record.origin)[:, None]
         if record.battery is not None:
-            u[:, U.BATTERY] = record.battery - vector[_NOMINAL_VOLTAGE]
+            u[:, :, U.BATTERY] = (record.battery - vector[_NOMINAL_VOLTAGE])[:, None]
         late, swash_later = max(vector[_COMMAND_DELAY], 0.0), max(vector[_SERVO_DELAY], 0.0)
         for columns, delay in ((ROTORS, late), (SWASH_PLATE, late + swash_later)):
             if delay > 0.0:
                 for column in columns:
-                    u[:, column] = _delayed_mean(record.t, record.command[:, column], delay)
+                    command = record.command[:, column]
+                    u[:, 0, column] = _delayed_mean(record.t, command, delay)
+                    u[:, 1, column] = self._read(record.t, command, delay)
+        both = u.reshape(record.t.size, -1)
         if record.input_innovations is None:
-            return u
-        return np.hstack([u, record.input_innovations])
+            return both
+        return np.hstack([both, record.input_innovations])
+
+    def _read(self, t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
+        """A late command (n,) as readings at the rows' times `t` see it."""
+        if self.read_delay is None:
+            return _delayed_mean(t, command, _to_the_middle(t, delay))
+        rows = np.searchsorted(t, t - self.read_delay, side="right") - 1
+        return command[np.maximum(rows, 0)]
+
+    def reading_after(self, delay: float) -> "HeliModel":
+        """The same, whose readings see commands this much later [s], once any delay is there."""
+        model = copy(self)
+        model.read_delay = delay
+        return model
 
     def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """First state from the medians of the first half second, with a wide covariance."""
@@ -349,13 +405,25 @@ ROTORS, SWASH_PLATE = (U.OMEGA_U, U.OMEGA_L), (U.DELTA_LON, U.DELTA_LAT)
 """Columns of the input that command_delay alone and that servo_delay too make late."""
 
 
-def _delayed_mean(t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
-    """Mean over each row's interval of a held command that arrives late."""
+def _delayed_mean(t: np.ndarray, command: np.ndarray, delay: float | np.ndarray) -> np.ndarray:
+    """Mean over each row's interval of a held command that arrives late, by one delay or each row's."""
     integral = integral_of_held(t, command)
     end = np.append(t[1:], t[-1] + (t[-1] - t[-2]))
     start = t - delay
     stop = np.minimum(end - delay, t[-1])
     return (integral(stop) - integral(start)) / np.maximum(stop - start, 1e-9)
+
+
+def _to_the_middle(t: np.ndarray, delay: float) -> np.ndarray:
+    """Delay (n,) [s] whose mean over a row is what readings see where a delay is k + 1/2 rows.
+
+    That is half a row more; the line to no delay, where they see the row's own, is twice as steep.
+
+    Args:
+        t: (n,) times of the rows [s]. delay: of the command [s].
+    """
+    rows = np.diff(t, prepend=2.0 * t[0] - t[1])
+    return delay + np.minimum(delay, 0.5 * rows)
 
 
 def record_of(run: Run) -> Record:

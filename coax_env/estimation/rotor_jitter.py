@@ -17,7 +17,13 @@ from typing import Any
 import numpy as np
 
 from coax_env.estimation import helicopter_noise
-from coax_env.estimation.helicopter import HeliModel, Motion, _take_in_innovations
+from coax_env.estimation.helicopter import (
+    READ,
+    HeliModel,
+    Motion,
+    _reads_another,
+    _take_in_innovations,
+)
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled
@@ -66,7 +72,11 @@ def _taken_up(x, p):
 
 @compiled()
 def _shaken(x, u, p, work):
-    """State and input as the helicopter's own model takes them, into the scratch; what is taken up."""
+    """State and input as the helicopter's own model takes them, into the scratch; what is taken up.
+
+    Args:
+        x: (31,) state. u: (6,) the step's or the readings' part of the input. p, work: as everywhere.
+    """
     taken = _taken_up(x, p)
     for i in range(N_FULL):
         work[_STATE + i] = x[i]
@@ -96,15 +106,18 @@ def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
 
 def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     """The helicopter's readings."""
-    _shaken(x, u, p, work)
+    _shaken(x, u[READ], p, work)
     dynamics.measure(work[_STATE:_INPUT], work[_INPUT:_OUT], p, work, out)
 
 
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """The helicopter's; jitter fades exactly."""
-    _shaken(x, u, p, work)
     own = work[_OUT:_WORK_SIZE]
+    _shaken(x, u, p, work)
     dynamics.drift_and_readings(work[_STATE:_INPUT], work[_INPUT:_OUT], dt, p, work, own)
+    if _reads_another(u):
+        _shaken(x, u[READ], p, work)
+        dynamics.measure(work[_STATE:_INPUT], work[_INPUT:_OUT], p, work, own[N_FULL:])
     _take_in_innovations(u, p, own)
     faded = math.expm1(-dt / p[p.size + _MEMORY])
     for i in range(N_FULL):
@@ -127,8 +140,10 @@ class JitteryModel(HeliModel):
 
     @classmethod
     def like(cls, model: HeliModel) -> "JitteryModel":
-        """Of the same vehicle."""
-        return cls(model.vehicle, model.bare_values)
+        """Of the same vehicle, whose readings see the same commands."""
+        jittery = cls(model.vehicle, model.bare_values)
+        jittery.read_delay = model.read_delay
+        return jittery
 
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """The helicopter's parameter vector, and behind it the jitter's memory and reaction."""
