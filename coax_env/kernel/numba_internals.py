@@ -236,7 +236,7 @@ def _make_machine_code_of_what_is_called() -> None:
         if self._engine.get_global_value_address(name):  # it is in machine code
             set_environment(self, name, environment)
 
-    NativeLowering.run_pass = run_pass  # type: ignore[method-assign]
+    NativeLowering.run_pass = run_pass
     JITCPUCodegen.set_env = set_env
 
 
