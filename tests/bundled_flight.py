@@ -1,11 +1,19 @@
 """The flight that the package brings along, or some of its runs, as a folder to be changed."""
 
 import shutil
+from functools import cache
 from pathlib import Path
 
 import coax_env
+from coax_env.logs.flight import Flight, read_flight
 
 BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
+
+
+@cache
+def bundled() -> Flight:
+    """As read: once, for all tests of a process."""
+    return read_flight(BUNDLED)
 
 
 def copied(folder: Path, *runs: str, sound: Path = BUNDLED) -> Path:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from bundled_flight import BUNDLED, copied
 from scipy.interpolate import Akima1DInterpolator, CubicSpline, PchipInterpolator
-from shared_flights import shared_flight
+from shared_flights import read
 
 import coax_env
 from coax_env.diagnosis.diagnose import diagnose
@@ -131,7 +131,7 @@ def test_40_ms_of_nonsense_are_found_at_any_rate(rate, channel, nonsense):
 @pytest.mark.needs_shared_flights
 @pytest.mark.parametrize("name", ["open_none", "open_near_ground", "open_rigging", "open_outside"])
 def test_no_sound_flight_is_repaired(name):
-    flight = read_flight(shared_flight(name))
+    flight = read(name)
     assert flight.counts == {}
     assert parts(flight) is flight
 
@@ -481,7 +481,7 @@ def test_the_causes_are_those_of_the_sound_flight(tmp_path):
 @pytest.mark.needs_shared_flights
 def test_the_second_coax_is_read_cut_and_diagnosed():
     """25 Hz, 21 gaps, one of 1.3 s, which cuts its run in two; two of its four runs, for time."""
-    flight = read_flight(shared_flight("skybotix_second")).select(("4x5ft_1", "15ft_1"))
+    flight = read("skybotix_second").select(("4x5ft_1", "15ft_1"))
     result = diagnose(flight, hold_out=["4x5ft_1"])
     assert result.findings["gain"]["held_out"] == ["4x5ft_1"]
     assert [run.name for run in result.flight.runs] == ["4x5ft_1", "4x5ft_1 (2)", "15ft_1"]

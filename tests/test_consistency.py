@@ -12,8 +12,8 @@ from pathlib import Path
 import injector
 import numpy as np
 import pytest
-from bundled_flight import BUNDLED, copied
-from shared_flights import shared_flight
+from bundled_flight import BUNDLED, bundled, copied
+from shared_flights import read
 
 from coax_env.comparison.two_flights import read_two
 from coax_env.consistency.agreement import Agreement, agreement, refuse_disagreement
@@ -42,11 +42,6 @@ MANEUVERS = ("lon_3211", "lat_3211", "heading_turn", "climb_descend")
 def checked(flight: Flight, waive: tuple[str, ...] = ()) -> Agreement:
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     return agreement(flown_parts(flight, vehicle), vehicle, waive)
-
-
-@cache
-def bundled() -> Flight:
-    return read_flight(BUNDLED)
 
 
 @cache
@@ -169,7 +164,7 @@ def test_a_log_of_another_world_gets_all_its_lines_at_once(tmp_path):
     found = checked(flight)
     assert found.advice is not None and not found.advice.left
     said = "\n".join(found.advice.lines)
-    mended, sound = planted(BUNDLED, tmp_path / "g", said), read_flight(BUNDLED).select(RUNS)
+    mended, sound = planted(BUNDLED, tmp_path / "g", said), bundled().select(RUNS)
     assert checked(mended).faults == ()
     for run, expected in zip(mended.runs, sound.runs, strict=True):
         for c in turned:
@@ -212,7 +207,7 @@ def test_the_bundled_flight_is_sound():
     ],
 )
 def test_no_shared_flight_is_refused(name):
-    assert checked(read_flight(shared_flight(name))).faults == ()
+    assert checked(read(name)).faults == ()
 
 
 FAULTS_OF_MACHINES = {

@@ -98,7 +98,9 @@ def test_hands_tremble_with_their_std_and_memory():
         x = np.zeros(N_FULL)
         x[:N_FLOWN] = one.trim_state
         asked = np.array([2.0, 0.0, 0.0, 0.0])
-        hands = np.array([one.correction(x, asked, STILL, dt, rng) for _ in range(round(lasts / dt))])
+        hands = np.array(
+            [one.correction(x, asked, STILL, dt, rng) for _ in range(round(lasts / dt))]
+        )
         hands = hands[round(2.0 / dt) :]
         np.testing.assert_allclose(hands.std(axis=0), 2.0 * TREMOR, rtol=0.06)
         lag = round(TREMOR_MEMORY / dt)
