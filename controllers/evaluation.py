@@ -240,8 +240,8 @@ class _Totals:
         self.flown += finite.sum(axis=0)
         self.reached = np.maximum(self.reached, np.where(finite, reached, 0).max(axis=0))
         if settled.any():
-            moving = None if rates is None else rates[settled]
-            self._judge(finite[settled], states[settled], targets[settled], moving)
+            judged = (finite[settled], states[settled], targets[settled])
+            self._judge(*judged, rates=None if rates is None else rates[settled])
 
     def _judge(
         self,
