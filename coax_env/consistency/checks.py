@@ -344,7 +344,8 @@ def _speed(channel: str, values: np.ndarray, hover: float) -> Fault | None:
     if usual <= 0.0:
         words = f"{channel} is 0 most of the time: nothing flies"
     elif not low < usual < high:
-        words = f"{channel} is {usual:.4g} rev/min most of the time, and the vehicle hovers at {hover:.4g}"
+        usually = f"{channel} is {usual:.4g} rev/min most of the time"
+        words = f"{usually}, and the vehicle hovers at {hover:.4g}"
     else:
         return None
     return Fault(f"{channel}-range", words, frozenset([channel]), _pulse_hint(channel, usual))

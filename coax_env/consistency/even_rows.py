@@ -159,8 +159,12 @@ def weak(values: np.ndarray, starts: np.ndarray, length: float, order: int) -> n
         order: of the derivative, 0 to 2.
     """
     n = _rows(length)
-    windows = np.lib.stride_tricks.sliding_window_view(values, n)[starts]
-    found: np.ndarray = windows @ _weights(n, order)
+    values = np.ascontiguousarray(values, dtype=float)
+    # as sliding_window_view, which takes longer than the rest
+    every: np.ndarray = np.ndarray(
+        (values.size - n + 1, n), float, values, strides=2 * values.strides
+    )
+    found: np.ndarray = every[starts] @ _weights(n, order)
     return found
 
 

@@ -212,12 +212,13 @@ def _flapping(machine: Machine, forced: np.ndarray, edges: tuple[int, ...]) -> n
     modes = np.linalg.inv(vectors) @ forced
     first, rows = np.array(edges[:-1]), np.diff(edges)
     modes -= np.repeat(np.add.reduceat(modes, first, axis=1) / rows, rows, axis=1)
-    since = np.arange(1, edges[-1] + 1) - np.repeat(first, rows)
+    since = np.arange(edges[-1]) - np.repeat(first, rows)
     for k, value in enumerate(values):
         stays = np.exp(value * STEP)
+        left = stays ** np.arange(1, rows.max() + 1)
         through = lfilter([STEP], [1.0, -stays], modes[k])  # all runs as one...
         before = np.where(first > 0, through[first - 1], 0.0)
-        modes[k] = through - np.repeat(before, rows) * stays**since  # ...less what came over
+        modes[k] = through - np.repeat(before, rows) * left[since]  # ...less what came over
     found: np.ndarray = np.real(vectors @ modes)
     return found
 
