@@ -379,27 +379,28 @@ def _gains(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Kalman gains over the sensors' cycle, the first gain, and the steady error's std."""
     cycle = round(BASE_RATE / math.gcd(*(round(s.rate) for s in sensors)))
-    Q, R = np.diag(process**2), np.diag(noise**2)
+    new = [np.array([bool(is_new(row, s.rate)) for s in sensors]) for row in range(cycle)]
+    seen = [(C[rows], np.diag(noise[rows] ** 2)) for rows in new]
+    Q, eye = np.diag(process**2), np.eye(len(A))
     P = np.diag(first**2)
-    first_gain = _gain(P, C, R, np.ones(len(sensors), dtype=bool))
+    first_gain = _gain(P, C, np.diag(noise**2))
     gains = np.zeros((cycle, *first_gain.shape))
     rounds = round(20.0 / DT / cycle)
     for row in range(rounds * cycle + 1):
-        new = np.array([bool(is_new(row, s.rate)) for s in sensors])
-        K = _gain(P, C, R, new)
-        gains[row % cycle] = K
-        joseph = np.eye(len(A)) - K @ C
+        C_new, R = seen[row % cycle]
+        K = _gain(P, C_new, R)
+        joseph = eye - K @ C_new
         P = joseph @ P @ joseph.T + K @ R @ K.T
-        spread = np.sqrt(np.diag(P))
+        if row >= (rounds - 1) * cycle:  # the last of each
+            gains[row % cycle][:, new[row % cycle]] = K
+            spread = np.sqrt(np.diag(P))
         P = A @ P @ A.T + Q
     return gains, first_gain, spread
 
 
-def _gain(P: np.ndarray, C: np.ndarray, R: np.ndarray, new: np.ndarray) -> np.ndarray:
-    K = np.zeros((len(P), len(C)))
-    C_new = C[new]
-    innovation = C_new @ P @ C_new.T + R[np.ix_(new, new)]
-    K[:, new] = np.linalg.solve(innovation, C_new @ P).T
+def _gain(P: np.ndarray, C: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Of a filter with the error's covariance P, readings C x, and their noise R."""
+    K: np.ndarray = np.linalg.solve(C @ P @ C.T + R, C @ P).T
     return K
 
 
@@ -412,4 +413,4 @@ def _single_rate_gain(
     rate = np.array([s.rate for s in sensors])
     R = np.diag(noise**2 * (BASE_RATE / rate))
     _, P, _ = control.dlqe(A, np.eye(len(A)), C, np.diag(process**2), R, method="scipy")
-    return _gain(np.asarray(P), C, R, np.ones(len(C), dtype=bool))
+    return _gain(np.asarray(P), C, R)

@@ -81,6 +81,7 @@ def evaluate(
         totals.alive &= ~terminated
         if progress:
             progress(1)
+    totals.add_up()
     own = {"flight_costs": (totals.cost / steps).tolist()} if each_flight else {}
     return (
         totals.score(steps)
@@ -173,8 +174,12 @@ _POOLED = ("height", "speed", "heading", "distance")
 """Errors whose squares are summed, see `hover.squared_errors`; ``distance``: to the target."""
 
 
+AT_ONCE = 100
+"""Periods that are summed at once: of a few flights, NumPy's calls cost more than the sums."""
+
+
 class _Totals:
-    """Sums over every flight, updated every period."""
+    """Sums over every flight."""
 
     def __init__(self, count: int, task: str, course: Any) -> None:
         self.count, self.task = count, task
@@ -186,6 +191,8 @@ class _Totals:
         self.squares = {name: np.zeros(count) for name in _POOLED}
         self.drift, self.reached = np.zeros(count), np.zeros(count)
         self.place: np.ndarray | None = None
+        self._waiting: list[tuple[np.ndarray, ...]] = []
+        self._settled: list[bool] = []
 
     def add(
         self,
@@ -196,7 +203,7 @@ class _Totals:
         settled: bool,
         rates: np.ndarray | None = None,
     ) -> None:
-        """Add one period.
+        """Add one period; it is in the sums after `add_up`.
 
         Args:
             info: of the env after the period; ``state`` is (count, n).
@@ -206,27 +213,54 @@ class _Totals:
             settled: whether errors count already.
             rates: of the targets before it, (count, 4), where they move.
         """
-        states = info["state"]
-        finite = self.alive & np.isfinite(states).all(axis=1)
-        states = np.where(finite[:, None], states, 0.0)
-        cost = hover.cost(states, actions, targets, rates=rates)
-        self.cost += np.where(finite, cost, hover.CRASHED_COST)
-        self.reward += np.where(finite, rewards, 0.0)
-        self.effort += np.where(finite, (actions.astype(float) ** 2).sum(axis=1), 0.0)
-        self.flown += finite
-        self.reached = np.where(finite, info.get("reached", 0), self.reached)
-        if not settled:
+        reached = np.broadcast_to(info.get("reached", 0), self.count)
+        period = (info["state"], targets, actions, rewards, reached, self.alive.copy())
+        self._waiting.append(period if rates is None else (*period, rates))
+        self._settled.append(settled)
+        if len(self._waiting) == AT_ONCE:
+            self.add_up()
+
+    def add_up(self) -> None:
+        """Take the periods into the sums that are not yet there."""
+        if not self._waiting:
             return
+        states, targets, actions, rewards, reached, alive, *moving = (
+            np.stack(values) for values in zip(*self._waiting, strict=True)
+        )
+        settled = np.array(self._settled)
+        self._waiting.clear()
+        self._settled.clear()
+        rates = moving[0] if moving else None
+        finite = alive & np.isfinite(states).all(axis=-1)
+        states = np.where(finite[..., None], states, 0.0)
+        cost = hover.cost(states, actions, targets, rates=rates)
+        self.cost += np.where(finite, cost, hover.CRASHED_COST).sum(axis=0)
+        self.reward += np.where(finite, rewards, 0.0).sum(axis=0)
+        self.effort += np.where(finite, (actions.astype(float) ** 2).sum(axis=-1), 0.0).sum(axis=0)
+        self.flown += finite.sum(axis=0)
+        self.reached = np.maximum(self.reached, np.where(finite, reached, 0).max(axis=0))
+        if settled.any():
+            judged = (finite[settled], states[settled], targets[settled])
+            self._judge(*judged, rates=None if rates is None else rates[settled])
+
+    def _judge(
+        self,
+        finite: np.ndarray,
+        states: np.ndarray,
+        targets: np.ndarray,
+        rates: np.ndarray | None,
+    ) -> None:
+        """Add the errors of some periods, each (periods, count, ...)."""
         if self.place is None:
-            self.place = states[:, PLACE].copy()
-        place = self.place if self.task == "hover" else targets[:, hover.HORIZONTAL]
+            self.place = states[0, :, PLACE].copy()
+        place = self.place if self.task == "hover" else targets[..., hover.HORIZONTAL]
         errors = hover.squared_errors(states, targets, rates)
         errors["distance"] = errors["position"] + errors["height"]
         for name, total in self.squares.items():
-            total += np.where(finite, errors[name], 0.0)
-        self.judged += finite
-        away = np.linalg.norm(states[:, PLACE] - place, axis=1)
-        self.drift = np.maximum(self.drift, np.where(finite, away, 0.0))
+            total += np.where(finite, errors[name], 0.0).sum(axis=0)
+        self.judged += finite.sum(axis=0)
+        away = np.linalg.norm(states[..., PLACE] - place, axis=-1)
+        self.drift = np.maximum(self.drift, np.where(finite, away, 0.0).max(axis=0))
 
     def score(self, steps: int) -> dict[str, Any]:
         """The figures of score.json; `steps` is the length of a whole flight."""

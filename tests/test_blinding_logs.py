@@ -1,16 +1,17 @@
 """Faults of real logs: each is planted into a sound flight, and what is left must be that flight's."""
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from bundled_flight import BUNDLED, copied
 from scipy.interpolate import Akima1DInterpolator, CubicSpline, PchipInterpolator
-from shared_flights import shared_flight
+from shared_flights import read
 
 import coax_env
 from coax_env.diagnosis.diagnose import diagnose
@@ -26,8 +27,8 @@ from coax_env.logs.held import interpolated, repeats
 from coax_env.logs.outliers import find_leaps
 from coax_env.model.vehicle_file import load_vehicle
 
-BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
 RUN = "hover"
+RUNS = (RUN, "lon_doublet")
 FIRST, RATE = 400, 100
 """First row at fault, and rows per second of the bundled flight."""
 
@@ -36,9 +37,9 @@ Table = dict[str, list[str]]
 
 
 def edited(folder: Path, change: Callable[[Table], None], run: str = RUN) -> Flight:
-    """The bundled flight, or the one that is in the folder, with a run's CSV changed cell by cell."""
+    """RUNS of the bundled flight, or the one in the folder, with a run's CSV changed cell by cell."""
     if not folder.exists():
-        shutil.copytree(BUNDLED, folder)
+        copied(folder, *RUNS)
     file = folder / f"{run}.csv"
     header, *lines = (line.split(",") for line in file.read_text().splitlines())
     table = {name: [line[k] for line in lines] for k, name in enumerate(header)}
@@ -50,7 +51,9 @@ def edited(folder: Path, change: Callable[[Table], None], run: str = RUN) -> Fli
 
 @cache
 def sound() -> Flight:
-    return read_flight(BUNDLED)
+    """RUNS as they are."""
+    with TemporaryDirectory() as folder:
+        return read_flight(copied(Path(folder) / "f", *RUNS))
 
 
 def parts(flight: Flight) -> Flight:
@@ -128,7 +131,7 @@ def test_40_ms_of_nonsense_are_found_at_any_rate(rate, channel, nonsense):
 @pytest.mark.needs_shared_flights
 @pytest.mark.parametrize("name", ["open_none", "open_near_ground", "open_rigging", "open_outside"])
 def test_no_sound_flight_is_repaired(name):
-    flight = read_flight(shared_flight(name))
+    flight = read(name)
     assert flight.counts == {}
     assert parts(flight) is flight
 
@@ -346,8 +349,7 @@ def test_a_sensor_that_froze_for_a_while_reads_nothing_there():
 
 
 def test_the_card_says_hold(tmp_path):
-    shutil.copytree(BUNDLED, tmp_path / "f")
-    card = tmp_path / "f" / "card.toml"
+    card = copied(tmp_path / "f", RUN) / "card.toml"
     text = card.read_text()
     card.write_text(text.replace("[[run]]", '[columns]\np = { hold = "yes" }\n[[run]]', 1))
     with pytest.raises(coax_env.errors.InputError, match=r"p hold should be true or false"):
@@ -468,6 +470,7 @@ def test_the_causes_are_those_of_the_sound_flight(tmp_path):
             if table["vn"][k]:
                 table["vn"][k] = f"{float(table['vn'][k]) + 3.0 * np.sin(0.01 * k):.4f}"
 
+    copied(tmp_path / "f")
     edited(tmp_path / "f", packet, "lat_3211")
     flight = edited(tmp_path / "f", carried, "side_run")
     hidden = json.loads((BUNDLED / "truth.json").read_text())["hidden"]
@@ -478,7 +481,7 @@ def test_the_causes_are_those_of_the_sound_flight(tmp_path):
 @pytest.mark.needs_shared_flights
 def test_the_second_coax_is_read_cut_and_diagnosed():
     """25 Hz, 21 gaps, one of 1.3 s, which cuts its run in two; two of its four runs, for time."""
-    flight = read_flight(shared_flight("skybotix_second")).select(("4x5ft_1", "15ft_1"))
+    flight = read("skybotix_second").select(("4x5ft_1", "15ft_1"))
     result = diagnose(flight, hold_out=["4x5ft_1"])
     assert result.findings["gain"]["held_out"] == ["4x5ft_1"]
     assert [run.name for run in result.flight.runs] == ["4x5ft_1", "4x5ft_1 (2)", "15ft_1"]

@@ -2,16 +2,15 @@
 
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from shared_flights import shared_flight
+from bundled_flight import bundled
+from shared_flights import read
 from study import pairs
 
-import coax_env
 from coax_env.comparison import search
 from coax_env.comparison.candidates import Score, scored
 from coax_env.comparison.compare import compare
@@ -34,18 +33,16 @@ from coax_env.logs.flight import Flight, Run, read_flight, write_flight
 from coax_env.model.vehicle_file import load_vehicle
 from coax_env.report import change_headline
 
-BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
-
 
 @cache
 def flight() -> Flight:
     """Two runs, four seconds each."""
     runs = []
-    for run in read_flight(BUNDLED).select(("lon_3211", "yaw_3211")).runs:
+    for run in bundled().select(("lon_3211", "yaw_3211")).runs:
         rows = run.t < run.t[0] + 4.0
         measured = {c: values[rows] for c, values in run.measured.items()}
         runs.append(replace(run, t=run.t[rows], command=run.command[rows], measured=measured))
-    return replace(read_flight(BUNDLED), runs=tuple(runs))
+    return replace(bundled(), runs=tuple(runs))
 
 
 # --- two logs of one flight -------------------------------------------------------------------------
@@ -64,7 +61,7 @@ def test_two_logs_of_one_flight_are_told_from_two_flights():
 @pytest.mark.slow
 def test_what_one_log_says_differently_is_found_from_its_row_on(tmp_path):
     """Too little for two flights with noise of their own: 0.01 rad, in half of a run."""
-    log = read_flight(BUNDLED).select(("lon_3211", "lat_3211"))
+    log = bundled().select(("lon_3211", "lat_3211"))
     logs = (log, edited(log, {"theta": 0.01}, ("lat_3211", 6.0)))
     folders = [write_flight(one, tmp_path / name) for one, name in zip(logs, "ab", strict=True)]
     found = compare(*folders).changes
@@ -332,7 +329,7 @@ def test_a_logbook_grows_by_one_comparison(tmp_path):
 @pytest.mark.needs_shared_flights
 def test_halves_of_a_real_flight_are_the_same():
     """The second CoaX, 20 s against the next 20 s: coloured innovations, and no change."""
-    log = read_flight(shared_flight("skybotix_second")).select(["4x5ft_2"])
+    log = read("skybotix_second").select(["4x5ft_2"])
     a, b = (replace(log, runs=tuple(_half(run, late) for run in log.runs)) for late in (0, 1))
     assert compare(a, b).changes["changes"] == []
 

@@ -32,6 +32,7 @@ def test_what_only_python_calls_is_compiled_when_it_is_called(tmp_path, monkeypa
 
 
 def test_what_compiled_code_alone_calls_has_no_wrapper_until_python_calls_it(tmp_path, monkeypatch):
+    """And no machine code: what calls it has its own copy."""
     monkeypatch.setattr(compilation, "CACHE_DIR", tmp_path)
 
     def a_new_process():
@@ -48,10 +49,14 @@ def test_what_compiled_code_alone_calls_has_no_wrapper_until_python_calls_it(tmp
     def compiled_now(*functions):
         return [sum(f.stats.cache_misses.values()) for f in functions]
 
+    def has_machine_code(name):
+        return any(b"\x7fELF" in path.read_bytes() for path in tmp_path.rglob(f"*.{name}-*.nbc"))
+
     doubled, and_one = a_new_process()
     assert and_one(1.5) == 4.0 and compiled_now(doubled, and_one) == [1, 1]
+    assert has_machine_code("and_one") and not has_machine_code("doubled")
     assert doubled(1.5) == 3.0 and and_one(2.5) == 6.0
-    assert compiled_now(doubled, and_one) == [2, 1]
+    assert compiled_now(doubled, and_one) == [2, 1] and has_machine_code("doubled")
     stored, another = a_new_process()
     assert another(1.5) == 4.0 and stored(1.5) == 3.0
     assert compiled_now(stored) == [0], "with a wrapper it serves both"

@@ -4,7 +4,6 @@ Errors are planted through the card of a sound log, so that the right line is kn
 without the error.
 """
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -13,9 +12,9 @@ from pathlib import Path
 import injector
 import numpy as np
 import pytest
-from shared_flights import shared_flight
+from bundled_flight import BUNDLED, bundled, copied
+from shared_flights import read
 
-import coax_env
 from coax_env.comparison.two_flights import read_two
 from coax_env.consistency.agreement import Agreement, agreement, refuse_disagreement
 from coax_env.consistency.checks import names
@@ -27,7 +26,6 @@ from coax_env.model.sensors import log_suite
 from coax_env.model.vehicle_file import load_vehicle
 from coax_env.simulation.simulate import fly_all, log_flight
 
-BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
 RUNS = (
     "lon_3211",
     "lat_3211",
@@ -47,11 +45,6 @@ def checked(flight: Flight, waive: tuple[str, ...] = ()) -> Agreement:
 
 
 @cache
-def bundled() -> Flight:
-    return read_flight(BUNDLED)
-
-
-@cache
 def with_positions(folder: Path) -> Path:
     """A simulated flight with motion capture beside the default sensors."""
     lama = load_vehicle("lama400d")
@@ -62,11 +55,8 @@ def with_positions(folder: Path) -> Path:
 
 def planted(sound: Path, folder: Path, columns: str) -> Flight:
     """The flight with these lines under [columns] of its card."""
-    shutil.copytree(sound, folder)
-    card = folder / "card.toml"
-    head, *runs = card.read_text().split("[[run]]")
-    asked = [run for run in runs if any(f'"{name}"' in run for name in RUNS)]
-    card.write_text("[[run]]".join([f"{head}\n[columns]\n{columns}\n", *asked]))
+    card = copied(folder, *RUNS, sound=sound) / "card.toml"
+    card.write_text(card.read_text().replace("[[run]]", f"[columns]\n{columns}\n[[run]]", 1))
     return read_flight(folder)
 
 
@@ -174,7 +164,7 @@ def test_a_log_of_another_world_gets_all_its_lines_at_once(tmp_path):
     found = checked(flight)
     assert found.advice is not None and not found.advice.left
     said = "\n".join(found.advice.lines)
-    mended, sound = planted(BUNDLED, tmp_path / "g", said), read_flight(BUNDLED).select(RUNS)
+    mended, sound = planted(BUNDLED, tmp_path / "g", said), bundled().select(RUNS)
     assert checked(mended).faults == ()
     for run, expected in zip(mended.runs, sound.runs, strict=True):
         for c in turned:
@@ -217,7 +207,7 @@ def test_the_bundled_flight_is_sound():
     ],
 )
 def test_no_shared_flight_is_refused(name):
-    assert checked(read_flight(shared_flight(name))).faults == ()
+    assert checked(read(name)).faults == ()
 
 
 FAULTS_OF_MACHINES = {
@@ -315,8 +305,7 @@ def test_every_fault_can_be_waived_by_its_name(tmp_path):
 
 
 def test_air_of_another_planet_and_unlogged_swash_are_refused(tmp_path):
-    shutil.copytree(BUNDLED, tmp_path / "f")
-    card = tmp_path / "f" / "card.toml"
+    card = copied(tmp_path / "f", *RUNS, "hover") / "card.toml"
     card.write_text(card.read_text().replace("density = 1.14", "density = 1140"))
     assert [f.check for f in checked(read_flight(tmp_path / "f")).faults] == ["density-range"]
     card.write_text(card.read_text().replace("density = 1140", "density = 1.14"))

@@ -825,9 +825,10 @@ def test_ratios_and_their_intervals_are_those_of_paired_flights():
 def test_machines_are_flown_once(tmp_path):
     from controllers import machines
 
-    first = list(machines.fly_machines([2], LAMA, tmp_path, 2, truth=True))
+    short = {"episodes": 2, "truth": True, "seconds": 5.0}
+    first = list(machines.fly_machines([2], LAMA, tmp_path, **short))
     said: list[str] = []
-    again = list(machines.fly_machines([2], LAMA, tmp_path, 2, truth=True, progress=said.append))
+    again = list(machines.fly_machines([2], LAMA, tmp_path, progress=said.append, **short))
     assert again == first and not said
     assert (
         machines.rows(first)[0][0] == "2"
@@ -835,7 +836,7 @@ def test_machines_are_flown_once(tmp_path):
     )
     assert "machine 2" in machines.machines_page(first)
     with pytest.raises(InputError, match="another world"):
-        list(machines.fly_machines([2], LAMA, tmp_path, 2, truth=True, wind=2.0))
+        list(machines.fly_machines([2], LAMA, tmp_path, wind=2.0, **short))
 
 
 def test_a_machine_whose_flight_is_refused_flies_the_bare_model_on_both_sides(
@@ -847,7 +848,7 @@ def test_a_machine_whose_flight_is_refused_flies_the_bare_model_on_both_sides(
         raise InputError("the log contradicts itself")
 
     monkeypatch.setattr(machines, "diagnose", refuse)
-    found = machines.fly_machine(2, LAMA, tmp_path, 2)
+    found = machines.fly_machine(2, LAMA, tmp_path, 2, seconds=5.0)
     assert found["named"] == [] and "contradicts itself" in found["verdict"]
     assert found["scores"]["lqg"]["bare"] == found["scores"]["lqg"]["corrected"]
 

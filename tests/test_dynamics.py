@@ -523,7 +523,7 @@ def test_effects_at_their_off_value_change_no_bit(seed):
     results = []
     for vector in (LAMA.vector, all_stages_on(LAMA)):
         rates, out, flown = np.zeros(N_FULL), np.empty(N_CHANNELS), np.empty(N_FULL)
-        dynamics._full_derivative(x, u, vector, work, rates)
+        dynamics._derivative(x, u, vector, work, rates)
         dynamics.measure(x, u, vector, work, out)
         dynamics.step(x, u, 0.01, vector, work, flown)
         results.append(np.concatenate([rates, out, flown]))

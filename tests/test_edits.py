@@ -3,13 +3,12 @@
 import importlib
 import math
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-from shared_flights import shared_flight
+from bundled_flight import bundled
+from shared_flights import read
 
-import coax_env
 from coax_env.comparison.two_logs.before import Before
 from coax_env.comparison.two_logs.changes import changes, first_difference
 from coax_env.comparison.two_logs.coordinates import coordinates, effective, moved
@@ -23,13 +22,11 @@ from coax_env.logs.edits import EDITS, LAT, LON, edited
 from coax_env.logs.flight import Flight, read_flight, write_flight
 from coax_env.model.vehicle_file import load_vehicle
 
-BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
 RUNS = ("lon_3211", "lat_3211")
 
 
-@cache
 def flight() -> Flight:
-    return read_flight(BUNDLED).select(RUNS)
+    return bundled().select(RUNS)
 
 
 # --- what an edit does to a log -------------------------------------------------------------------
@@ -222,7 +219,7 @@ def test_edits_of_real_logs(name, runs, run):
     Of the first set one run, for time; `scripts/check_edits.py` takes them all.
     """
     script = importlib.import_module("check_edits")
-    log = read_flight(shared_flight(name))
+    log = read(name)
     log = log.select(runs or log.run_names)
     flight, model = script.before_edits(log, None, lambda text: None)
     for since in (None, (run, 20.0)):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from shared_flights import shared_flight
+from shared_flights import read
 
 from coax_env.errors import InputError
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
@@ -219,14 +219,14 @@ def test_real_motion_stays() -> None:
 @pytest.mark.needs_shared_flights
 def test_open_flights_lose_nothing_genuine() -> None:
     for name in ("open_none", "open_near_ground", "open_rigging", "open_outside"):
-        flight = read_flight(shared_flight(name))
+        flight = read(name)
         assert flight.notes == (), name
         assert len(flight.runs) == 12
 
 
 @pytest.mark.needs_shared_flights
 def test_windy_flight_loses_its_lost_echoes_and_nothing_else() -> None:
-    flight = read_flight(shared_flight("open_windy"))
+    flight = read("open_windy")
     assert flight.counts == {
         "gaps of more than 0.1 s without any reading": 21,
         "outliers in h removed": 15,
@@ -235,7 +235,7 @@ def test_windy_flight_loses_its_lost_echoes_and_nothing_else() -> None:
 
 @pytest.mark.needs_shared_flights
 def test_the_real_helicopter_is_read() -> None:
-    flight = read_flight(shared_flight("skybotix_coax"))
+    flight = read("skybotix_coax")
     assert flight.run_names == ("hover", "vertical_sine", "circles")
     assert flight.channels == ("phi", "theta", "psi", "h", "pn", "pe")
     assert flight.counts["negative rpm_lower_cmd clipped at 0"] == 1

@@ -7,13 +7,13 @@ The files are written here, with their own names, units, frames and clocks, as t
 import json
 import sys
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from autopilot_files import dataflash_binary, ulog
+from bundled_flight import bundled
 
 import coax_env
 from coax_env.consistency.agreement import agreement
@@ -29,7 +29,6 @@ from coax_env.logs.tables import import_table
 from coax_env.model.layout import RPM_PER_RAD_S
 from coax_env.model.vehicle_file import load_vehicle
 
-BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
 DEGREE = np.pi / 180.0
 PULSE = (1500.0, 2000.0)
 """Servo pulses [us]: at rest, and per radian of the plate."""
@@ -37,9 +36,8 @@ PULSE = (1500.0, 2000.0)
 Columns = dict[str, np.ndarray]
 
 
-@cache
 def original() -> Run:
-    return read_flight(BUNDLED).run("lat_3211")
+    return bundled().run("lat_3211")
 
 
 def filled(channel: str) -> np.ndarray:

@@ -41,6 +41,7 @@ def modules() -> dict[str, Path]:
     return {module_name(p): p for package in PACKAGES for p in (ROOT / package).rglob("*.py")}
 
 
+@cache
 def imported(path: Path) -> set[str]:
     """Names that a file imports: also inside functions, and for type checkers only."""
     found: set[str] = set()

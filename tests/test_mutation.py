@@ -3,6 +3,7 @@
 import ast
 import json
 import sys
+from functools import cache
 from pathlib import Path
 
 import mutate
@@ -28,6 +29,12 @@ def force(x, u, tilt: float = 2.0):
     pull *= 2.0
     return -pull * math.sin(tilt) + x[0] / 4.0
 '''
+
+
+@cache
+def all_sites() -> tuple:
+    """Of the code."""
+    return tuple(draw.all_sites(ROOT))
 
 
 def broken(kind: str) -> set[str]:
@@ -62,7 +69,7 @@ def test_axes_are_swapped_by_name():
 
 @pytest.mark.slow
 def test_every_mutation_of_the_code_is_another_program_with_a_name_of_its_own():
-    found = draw.all_sites(ROOT)
+    found = all_sites()
     assert len({m.name for m in found}) == len(found) > 2000
     for file in {m.file for m in found}:
         assert any((ROOT / name).exists() for name in trial.own_tests(file)), file
@@ -73,7 +80,7 @@ def test_every_mutation_of_the_code_is_another_program_with_a_name_of_its_own():
 
 
 def test_a_draw_takes_every_part_in_turn_and_does_not_depend_on_other_code():
-    found = draw.all_sites(ROOT)
+    found = all_sites()
     drawn = draw.draw(found, 60, seed=3)
     for part in draw.PARTS:
         assert sum(draw.part_of(m.file) == part for m in drawn) == 60 / len(draw.PARTS)
@@ -114,7 +121,7 @@ def test_every_pattern_fits_a_file():
 
 
 def test_equivalent_mutations_are_mutations_and_have_a_reason():
-    found = {(m.file, m.before, m.after) for m in draw.all_sites(ROOT)}
+    found = {(m.file, m.before, m.after) for m in all_sites()}
     for change, reason in draw.equivalents().items():
         assert change in found, change
         assert len(reason) > 20, change

@@ -93,6 +93,7 @@ def test_a_function_is_scored_as_the_controller_that_it_calls(design):
     assert evaluate(pid, LAMA, **SHORT)["controller"] == "pid"
 
 
+@pytest.mark.slow  # imports torch
 def test_a_model_of_stable_baselines_from_its_zip(tmp_path):
     sb3 = pytest.importorskip("stable_baselines3")
     env = gymnasium.make("CoaxHeli-v0")

@@ -1,15 +1,14 @@
 """Covariances of the states that any reading shows alone, against those of all states."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
+from bundled_flight import bundled
 from numba import types
 from numpy.testing import assert_allclose
 from test_estimation import Pendulum
 
-import coax_env
 from coax_env.estimation import frozen_gains, noise_score
 from coax_env.estimation.engine import GATE, Engine, _Buffers, _trace
 from coax_env.estimation.helicopter import HeliModel, record_of
@@ -17,18 +16,16 @@ from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.sparse import aligned, padded
 from coax_env.estimation.state_space import STEADY, Noise, Record, part
 from coax_env.kernel.compilation import pointer
-from coax_env.logs.flight import read_flight
 from coax_env.model.layout import N_FULL, POSITION, SWASH
 from coax_env.model.vehicle_file import load_vehicle
 
-WINDY = Path(coax_env.__file__).parent / "logs/flights/windy"
 _A = types.float64[::1]
 
 
 @pytest.fixture(scope="module")
 def passes():
     """A pass of three seconds of a flight without and with covariances asked for, with its engine."""
-    flight = read_flight(WINDY)
+    flight = bundled()
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     record = record_of(flight.runs[0])
     engine = Engine(HeliModel(vehicle), [part(record, record.t < record.t[0] + 3.0)])

@@ -1,23 +1,19 @@
 """Derivatives by SIMD lanes, in portions of a run, against one move after the other."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from bundled_flight import bundled
 from numpy.testing import assert_allclose
 
-import coax_env
 from coax_env.estimation import engine as engines
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.sparse import add_gram, find_non_zeros, padded, with_places
 from coax_env.estimation.state_space import part
-from coax_env.logs.flight import read_flight
 from coax_env.model import effects
 from coax_env.model.vehicle_file import load_vehicle
 
-WINDY = Path(coax_env.__file__).parent / "logs/flights/windy"
 ACTIVE = {"motor_lag.upper": 0.07, "motor_lag.lower": 0.06, "servo_rate.limit": 3.0,
           "wind.north": -1.0, "rotor_drag.coefficient": 3e-4, "gyro_bias.y": -0.01}  # fmt: skip
 
@@ -34,7 +30,7 @@ class OneByOne(HeliModel):
 @pytest.fixture(scope="module")
 def flown():
     """A vehicle, three seconds of a flight, its noise, and every parameter that may be free."""
-    flight = read_flight(WINDY)
+    flight = bundled()
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     record = record_of(flight.runs[0])
     record = part(record, record.t < record.t[0] + 3.0)

@@ -1,6 +1,7 @@
 """The batch as Stable-Baselines3 wants it."""
 
 import warnings
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ from gymnasium.vector import AutoresetMode
 
 from coax_env.env.vector_env import CoaxVectorEnv
 
-pytestmark = pytest.mark.slow  # imports torch
-pytest.importorskip("stable_baselines3")
+pytestmark = [  # imports torch, but not before it is run
+    pytest.mark.slow,
+    pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="no stable_baselines3"),
+]
 
 
 def fleet(count: int, **arguments):

@@ -112,12 +112,12 @@ def advice(flight: Flight, checker: Checker, found: Found) -> Advice:
         others.append(_others(tried, columns) if not done else ())
         done.append(best)
         new = best.line(columns)
-        changed |= {c: new[c] for c in best.channels}
+        changed |= {c: new[c] for c in sorted(best.channels)}
         columns, found = {**columns, **changed}, after
     if done and not found.faults:
         done, found = _turned(original, checker, done)
         columns = _all_lines(done, original)
-        changed = {c: columns[c] for one in done for c in one.channels}
+        changed = {c: columns[c] for one in done for c in sorted(one.channels)}
     lines = tuple(columns[c].entry(c) for c in changed)
     alternatives = tuple(o for o in others if o) if len(done) == 1 else ()
     return Advice(lines, alternatives, found.faults)

@@ -63,6 +63,8 @@ DENSITIES = (0.6, 1.5)
 
 PULSES = (800.0, 2200.0)
 """Widths of a servo's pulse [us]."""
+RANGED = (*ROTOR_COMMANDS, *SWASH_COMMANDS, *LARGEST, "az", "h", BATTERY)
+"""Channels whose readings themselves are asked, in the order in which their faults are told."""
 
 
 @dataclass(frozen=True)
@@ -124,11 +126,9 @@ def names() -> tuple[str, ...]:
     everything = frozenset((*CHANNELS, *LOG_UNITS))
     pairs = []
     for left in (everything, everything - {"vn", "ve", "vd"}, everything - {"p", "q", "r"}):
-        for relation in relations(left):
+        for relation in relations(left, (0, BLANK.size)):
             pairs += [f"{relation.left}-{part}" for part in _parts_of(relation)]
-    ranges = [
-        f"{c}-range" for c in (*ROTOR_COMMANDS, *SWASH_COMMANDS, BATTERY, *LARGEST, "az", "h")
-    ]
+    ranges = [f"{c}-range" for c in RANGED]
     swaps = [f"{a}-{b}-swapped" for a, b in PAIRS]
     return tuple(dict.fromkeys([*pairs, *ranges, *swaps, *AIR_CHECKS, "swash-logged"]))
 
@@ -136,9 +136,12 @@ def names() -> tuple[str, ...]:
 AIR_CHECKS = ("gravity-range", "density-range")
 
 
+BLANK = np.zeros(100)
+"""A signal in which nothing happens."""
+
+
 def _parts_of(relation: Relation) -> list[str]:
-    some = np.zeros(100)
-    signals = dict.fromkeys(relation.channels, some)
+    signals = dict.fromkeys(relation.channels, BLANK)
     blank = Machine(
         9.81, (1.0, 1.0), (1.0, 1.0), -np.diag([1.0, 2.0, 3.0, 4.0]), np.zeros((4, 2)),
         np.zeros((4, 2)), np.zeros((2, 4)), np.zeros((2, 2)),
@@ -157,12 +160,13 @@ class Checker:
         self._relations = relations(self.channels, rows.edges)
         self._known = [coefficients(one, rows, machine) for one in self._relations]
         self._windows = [tuple({c.window for c in known}) for known in self._known]
+        self._ranges = {c: _range_fault(c, rows, machine) for c in RANGED}
 
     def found(self) -> Found:
         """What the checks say of the log as it is."""
         each = tuple(c for known in self._known for c in known)
         swaps = self._swapped(self.rows, self._known)
-        return self._without_waived([*self._faults(self.rows, each), *swaps], each)
+        return self._without_waived([*self._faults(each, self._ranges), *swaps], each)
 
     def after(
         self, change: Callable[[Signals], Signals], changed: frozenset[str], swaps: bool = False
@@ -177,7 +181,8 @@ class Checker:
         rows = replace(self.rows, signals=change(self.rows.signals))
         known = self._anew(rows, changed)
         each = tuple(c for few in known for c in few)
-        faults = self._faults(rows, each)
+        beyond = {c: _range_fault(c, rows, self.machine) for c in changed & self._ranges.keys()}
+        faults = self._faults(each, self._ranges | beyond)
         if swaps:
             faults += self._swapped(rows, known)
         return self._without_waived(faults, each)
@@ -198,14 +203,16 @@ class Checker:
             for one, known, windows in zip(self._relations, self._known, self._windows, strict=True)
         ]
 
-    def _faults(self, rows: EvenRows, each: Sequence[Coefficient]) -> list[Fault]:
+    def _faults(
+        self, each: Sequence[Coefficient], ranges: Mapping[str, Fault | None]
+    ) -> list[Fault]:
         felt = {"vn": "ax", "ve": "ay", "pn": "ax", "pe": "ay"}
         faults = [
             fault
             for c in each
             if (fault := _fault_of(c, felt.get(c.left, c.left) in self.channels))
         ]
-        return [*faults, *_ranges(rows, self.machine)]
+        return [*faults, *filter(None, ranges.values())]
 
     def of_runs(self, names: Sequence[str]) -> list[Fault]:
         """Faults of single runs: a file that was written otherwise than the others; names: of the
@@ -217,7 +224,8 @@ class Checker:
             each = [c for one in alone for c in coefficients(one, rows, self.machine)]
             against = [c for c in each if _speaks_against_a_run(c)]
             faults = [f for c in against if (f := _fault_of(c, True))]
-            for fault in (*faults, *_ranges(rows, self.machine)):
+            ranges = (_range_fault(c, rows, self.machine) for c in RANGED)
+            for fault in (*faults, *filter(None, ranges)):
                 words = f"in run {name} {fault.words}"
                 found.setdefault(fault.check, replace(fault, words=words, hint=HINT_FOR_A_RUN))
         return [fault for check, fault in found.items() if check not in self.waived]
@@ -316,66 +324,75 @@ def _fault_of(c: Coefficient, gusts_felt: bool) -> Fault | None:
 # --- ranges ---------------------------------------------------------------------------------------
 
 
-def _ranges(rows: EvenRows, machine: Machine) -> list[Fault]:
-    found = []
-    for k, channel in enumerate(ROTOR_COMMANDS):
-        usual = float(np.median(_all(rows, channel)))
-        low, high = (share * machine.hover[k] for share in HOVER_SPEEDS)
-        if usual <= 0.0:
-            words = f"{channel} is 0 most of the time: nothing flies"
-        elif not low < usual < high:
-            words = (
-                f"{channel} is {usual:.4g} rev/min most of the time, and the vehicle hovers at"
-                f" {machine.hover[k]:.4g}"
-            )
-        else:
-            continue
-        found.append(
-            Fault(f"{channel}-range", words, frozenset([channel]), _pulse_hint(channel, usual))
-        )
-    for channel in SWASH_COMMANDS:
-        values = _all(rows, channel)
-        most = float(np.quantile(np.abs(values), 0.99))
-        if most > MOST_SWASH:
-            words = f"{channel} reaches {most:.3g} rad, which no swash plate does"
-            hint = _pulse_hint(channel, float(np.median(values)))
-            found.append(Fault(f"{channel}-range", words, frozenset([channel]), hint))
-    for channel, most in LARGEST.items():
-        values = np.abs(_all(rows, channel))
-        if values.size and float(np.quantile(values, 0.99)) > most:
-            words = f"{channel} reaches {np.quantile(values, 0.99):.3g} {LOG_UNITS[channel]}"
-            found.append(Fault(f"{channel}-range", words, frozenset([channel])))
-    return found + _gravity(rows, machine) + _height(rows) + _battery(rows)
+def _range_fault(channel: str, rows: EvenRows, machine: Machine) -> Fault | None:
+    """What is said of a channel whose readings nothing that flies has."""
+    values = _all(rows, channel)
+    if channel in ROTOR_COMMANDS:
+        return _speed(channel, values, machine.hover[ROTOR_COMMANDS.index(channel)])
+    if channel in SWASH_COMMANDS:
+        return _tilt(channel, values)
+    if not values.size:
+        return None
+    if channel in LARGEST:
+        return _size(channel, values)
+    return {"az": _gravity, "h": _height, BATTERY: _battery}[channel](values, machine)
 
 
-def _gravity(rows: EvenRows, machine: Machine) -> list[Fault]:
-    felt = _all(rows, "az")
-    if not felt.size:
-        return []
+def _speed(channel: str, values: np.ndarray, hover: float) -> Fault | None:
+    usual = float(np.median(values))
+    low, high = (share * hover for share in HOVER_SPEEDS)
+    if usual <= 0.0:
+        words = f"{channel} is 0 most of the time: nothing flies"
+    elif not low < usual < high:
+        usually = f"{channel} is {usual:.4g} rev/min most of the time"
+        words = f"{usually}, and the vehicle hovers at {hover:.4g}"
+    else:
+        return None
+    return Fault(f"{channel}-range", words, frozenset([channel]), _pulse_hint(channel, usual))
+
+
+def _tilt(channel: str, values: np.ndarray) -> Fault | None:
+    most = float(np.quantile(np.abs(values), 0.99))
+    if most <= MOST_SWASH:
+        return None
+    words = f"{channel} reaches {most:.3g} rad, which no swash plate does"
+    hint = _pulse_hint(channel, float(np.median(values)))
+    return Fault(f"{channel}-range", words, frozenset([channel]), hint)
+
+
+def _size(channel: str, values: np.ndarray) -> Fault | None:
+    most = float(np.quantile(np.abs(values), 0.99))
+    if most <= LARGEST[channel]:
+        return None
+    words = f"{channel} reaches {most:.3g} {LOG_UNITS[channel]}"
+    return Fault(f"{channel}-range", words, frozenset([channel]))
+
+
+def _gravity(felt: np.ndarray, machine: Machine) -> Fault | None:
     usual, g = float(np.median(felt)), machine.gravity
     if FELT_GRAVITY[0] < -usual / g < FELT_GRAVITY[1]:
-        return []
+        return None
     words = (
         f"az is {usual:.3g} m/s2 most of the time, and -{g:.3g} in hover (specific force, z down)"
     )
     hint = "gravity has been taken out of it, and is needed" if abs(usual) < 0.05 * g else ""
-    return [Fault("az-range", words, frozenset(["az"]), hint)]
+    return Fault("az-range", words, frozenset(["az"]), hint)
 
 
-def _height(rows: EvenRows) -> list[Fault]:
-    height = _all(rows, "h")
-    if not height.size or float(np.median(height)) >= 0.0:
-        return []
-    words = f"h is {np.median(height):.3g} m most of the time: it is height, up"
-    return [Fault("h-range", words, frozenset(["h"]))]
+def _height(height: np.ndarray, machine: Machine) -> Fault | None:
+    usual = float(np.median(height))
+    if usual >= 0.0:
+        return None
+    words = f"h is {usual:.3g} m most of the time: it is height, up"
+    return Fault("h-range", words, frozenset(["h"]))
 
 
-def _battery(rows: EvenRows) -> list[Fault]:
-    voltage = _all(rows, BATTERY)
-    if not voltage.size or BATTERIES[0] < float(np.median(voltage)) < BATTERIES[1]:
-        return []
-    words = f"{BATTERY} is {np.median(voltage):.3g} V most of the time"
-    return [Fault(f"{BATTERY}-range", words, frozenset([BATTERY]))]
+def _battery(voltage: np.ndarray, machine: Machine) -> Fault | None:
+    usual = float(np.median(voltage))
+    if BATTERIES[0] < usual < BATTERIES[1]:
+        return None
+    words = f"{BATTERY} is {usual:.3g} V most of the time"
+    return Fault(f"{BATTERY}-range", words, frozenset([BATTERY]))
 
 
 def _pulse_hint(channel: str, usual: float) -> str:

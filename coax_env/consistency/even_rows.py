@@ -6,7 +6,7 @@ and not amplified.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import pairwise
 
@@ -40,6 +40,25 @@ class EvenRows:
     edges: tuple[int, ...]
     signals: Mapping[str, np.ndarray]
     known: Mapping[str, np.ndarray]
+    _windows: dict[tuple[frozenset[str], float], "Windows"] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def windows(self, channels: frozenset[str], length: float) -> "Windows":
+        """Those in which channels are known throughout; looked for once, also for other signals.
+
+        Args:
+            channels: names, of which those that are not there count as known.
+            length: of a window [s].
+        """
+        asked = channels.intersection(self.known), length
+        if asked not in self._windows:
+            starts, run = window_starts(self.edges, length)
+            sound = np.ones(starts.size, bool)
+            for channel in asked[0]:
+                sound &= all_known(self.known[channel], starts, length)
+            self._windows[asked] = Windows(starts[sound], run[sound], len(self.edges) - 1)
+        return self._windows[asked]
 
     def run(self, number: int) -> "EvenRows":
         """One run of them, with the channels that it has."""
@@ -50,6 +69,30 @@ class EvenRows:
             {name: self.signals[name][rows] for name in there},
             {name: self.known[name][rows] for name in there},
         )
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of one length that follow each other at half of it.
+
+    Attributes:
+        starts: their first rows, (k,).
+        run: the number of the run of each, (k,).
+        runs: how many runs there are.
+    """
+
+    starts: np.ndarray
+    run: np.ndarray
+    runs: int
+
+    def without_means(self, values: np.ndarray) -> np.ndarray:
+        """Values (k, m) of the windows, less the mean of each run's own."""
+        count = np.maximum(np.bincount(self.run, minlength=self.runs), 1)
+        sums = np.stack(
+            [np.bincount(self.run, column, minlength=self.runs) for column in values.T], axis=1
+        )
+        found: np.ndarray = values - (sums / count[:, None])[self.run]
+        return found
 
 
 def even_rows(flight: Flight) -> EvenRows:
@@ -116,8 +159,12 @@ def weak(values: np.ndarray, starts: np.ndarray, length: float, order: int) -> n
         order: of the derivative, 0 to 2.
     """
     n = _rows(length)
-    windows = np.lib.stride_tricks.sliding_window_view(values, n)[starts]
-    found: np.ndarray = windows @ _weights(n, order)
+    values = np.ascontiguousarray(values, dtype=float)
+    # as sliding_window_view, which takes longer than the rest
+    every: np.ndarray = np.ndarray(
+        (values.size - n + 1, n), float, values, strides=2 * values.strides
+    )
+    found: np.ndarray = every[starts] @ _weights(n, order)
     return found
 
 

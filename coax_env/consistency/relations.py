@@ -8,12 +8,11 @@ their commands; of them only the sign is asked, and the size within a factor.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy.signal import lfilter
 
-from coax_env.consistency.even_rows import STEP, EvenRows, all_known, weak, window_starts
+from coax_env.consistency.even_rows import STEP, EvenRows, weak
 from coax_env.model.layout import RPM_PER_RAD_S
 
 LONGEST_ANGLE = 0.6
@@ -211,11 +210,15 @@ def _flapping(machine: Machine, forced: np.ndarray, edges: tuple[int, ...]) -> n
     """Response (4, n) of the flaps and the bar to what forces them, (4, n) [rad/s], run by run."""
     values, vectors = (np.real_if_close(x) for x in np.linalg.eig(machine.flap))
     modes = np.linalg.inv(vectors) @ forced
-    for first, behind in pairwise(edges):
-        part = modes[:, first:behind]
-        part -= part.mean(axis=1, keepdims=True)
-        for k, value in enumerate(values):
-            part[k] = lfilter([STEP], [1.0, -np.exp(value * STEP)], part[k])
+    first, rows = np.array(edges[:-1]), np.diff(edges)
+    modes -= np.repeat(np.add.reduceat(modes, first, axis=1) / rows, rows, axis=1)
+    since = np.arange(edges[-1]) - np.repeat(first, rows)
+    for k, value in enumerate(values):
+        stays = np.exp(value * STEP)
+        left = stays ** np.arange(1, rows.max() + 1)
+        through = lfilter([STEP], [1.0, -stays], modes[k])  # all runs as one...
+        before = np.where(first > 0, through[first - 1], 0.0)
+        modes[k] = through - np.repeat(before, rows) * left[since]  # ...less what came over
     found: np.ndarray = np.real(vectors @ modes)
     return found
 
@@ -353,19 +356,13 @@ def _projected(
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Windows in which all is known, without each run's own mean: (k,) of the left side, (k, parts);
     and how many runs they are of."""
-    starts, run = window_starts(rows.edges, length)
-    sound = np.ones(starts.size, bool)
-    for channel in relation.channels & rows.known.keys():
-        sound &= all_known(rows.known[channel], starts, length)
-    starts, run = starts[sound], run[sound]
-    if not starts.size:
+    windows = rows.windows(relation.channels, length)
+    if not windows.starts.size:
         return np.empty(0), np.empty((0, len(parts))), 0
-    y = weak(rows.signals[relation.left], starts, length, relation.order)
-    X = np.stack([weak(values, starts, length, 0) for values in parts.values()], axis=1)
-    own = np.zeros((len(rows.edges) - 1, X.shape[1] + 1))
-    np.add.at(own, run, np.column_stack([y, X]))
-    own /= np.maximum(np.bincount(run, minlength=len(own)), 1)[:, None]
-    return y - own[run, 0], X - own[run, 1:], np.unique(run).size
+    means = [weak(rows.signals[relation.left], windows.starts, length, relation.order)]
+    means += [weak(values, windows.starts, length, 0) for values in parts.values()]
+    own = windows.without_means(np.stack(means, axis=1))
+    return own[:, 0], own[:, 1:], np.unique(windows.run).size
 
 
 def rev_per_min(speeds: np.ndarray) -> tuple[float, float]:

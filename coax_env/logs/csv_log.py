@@ -129,9 +129,10 @@ def _split(path: Path, text: str) -> _Cells:
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
     header: list[str] = []
     rows, lines = [], []
+    blanks = re.search(r"[^\S\r\n]", text) is not None
     try:
         for row in reader:
-            cells = [cell.strip() for cell in row]
+            cells = [cell.strip() for cell in row] if blanks else row
             if not any(cells):
                 continue
             if not header:

@@ -46,9 +46,10 @@ def repeats(values: np.ndarray, hold: bool | None = None) -> np.ndarray:
         found[present[again]] = True
     elif np.mean(inner > 1) <= MOST_REPEATED:
         # the last value too, and the first: interpolation beyond the ends repeats them
-        for first, times in zip(starts, np.diff([*starts, y.size]), strict=True):
-            if times >= FROZEN:
-                found[present[first + 1 : first + times]] = True
+        times = np.diff(starts, append=y.size)
+        for frozen in np.flatnonzero(times >= FROZEN):
+            first = starts[frozen]
+            found[present[first + 1 : first + times[frozen]]] = True
     return found
 
 
@@ -88,6 +89,7 @@ interpolated..."""
 LEAST_KINK = 3.0
 """...if the others are off it by so many roundings; ours."""
 MOST_DIGITS = 9  # behind the point, in which a rounding is looked for
+A_FEW = 32  # numbers that are asked first: where they have more decimals, so have all
 
 
 def interpolated(t: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -161,8 +163,14 @@ def _inside_cubics(t: np.ndarray, y: np.ndarray, rounding: float) -> np.ndarray:
 
 def _rounding(y: np.ndarray) -> float:
     """Unit of the last decimal that any number has; 0 where there are too many."""
+    largest = float(np.abs(y).max())
     for digits in range(MOST_DIGITS + 1):
-        scaled = y * 10.0**digits
-        if np.abs(scaled - np.round(scaled)).max() < 1e-6 * max(1.0, np.abs(scaled).max() * 1e-6):
+        most = 1e-6 * max(1.0, largest * 10.0**digits * 1e-6)
+        if all(_off_whole(some * 10.0**digits) < most for some in (y[:A_FEW], y)):
             return float(10.0**-digits)
     return 0.0
+
+
+def _off_whole(scaled: np.ndarray) -> float:
+    """Largest distance of numbers from whole ones."""
+    return float(np.abs(scaled - np.round(scaled)).max())

@@ -620,7 +620,7 @@ def step_and_measure_with(used: Collection[str], kind: str) -> tuple[Any, Any]:
     return step_with, measure_with
 
 
-@with_effects
+@bare_and_with_effects(lazily=True)
 def _full_derivative(x, u, p, work, dx):
     """Rates of the full state at held input, lags as first-order states.
 
@@ -628,26 +628,40 @@ def _full_derivative(x, u, p, work, dx):
     """
     f, now = work[:_STATE], work[_STATE:_SLOPE]
     _properties(x, u, p, f)
-    upper, lower = _speeds_asked_for(u, f)
-    targets = (upper, lower, u[U.DELTA_LON], u[U.DELTA_LAT])
-    lags = (f[F.MOTOR_LAG_U], f[F.MOTOR_LAG_L], f[F.SERVO_LAG], f[F.SERVO_LAG])
     _copy(x, now)
-    for i in range(N_COMMANDS):
-        actuator = S.OMEGA_U + i
-        if lags[i] > SHORTEST_LAG:
-            dx[actuator] = (targets[i] - x[actuator]) / lags[i]
-        else:
-            now[actuator] = targets[i]
-            dx[actuator] = 0.0
-    f[F.OMEGA_U_DOT] = dx[S.OMEGA_U]
-    f[F.OMEGA_L_DOT] = dx[S.OMEGA_L]
-    dx[S.TRIM_Z :] = 0.0
-    if f[F.INFLOW_TIME] > 0.0:
-        speed = 0.5 * (now[S.OMEGA_U] / f[F.HOVER_U] + now[S.OMEGA_L] / f[F.HOVER_L])
-        dx[S.INFLOW] = (speed - 1.0 - x[S.INFLOW]) / f[F.INFLOW_TIME]
+    dx[N_STATES:] = 0.0
+    if WITH_EFFECTS:
+        upper, lower = _speeds_asked_for(u, f)
+        targets = (upper, lower, u[U.DELTA_LON], u[U.DELTA_LAT])
+        lags = (f[F.MOTOR_LAG_U], f[F.MOTOR_LAG_L], f[F.SERVO_LAG], f[F.SERVO_LAG])
+        for i in range(N_COMMANDS):
+            actuator = S.OMEGA_U + i
+            if lags[i] > SHORTEST_LAG:
+                dx[actuator] = (targets[i] - x[actuator]) / lags[i]
+            else:
+                now[actuator] = targets[i]
+        f[F.OMEGA_U_DOT] = dx[S.OMEGA_U]
+        f[F.OMEGA_L_DOT] = dx[S.OMEGA_L]
+        if f[F.INFLOW_TIME] > 0.0:
+            speed = 0.5 * (now[S.OMEGA_U] / f[F.HOVER_U] + now[S.OMEGA_L] / f[F.HOVER_L])
+            dx[S.INFLOW] = (speed - 1.0 - x[S.INFLOW]) / f[F.INFLOW_TIME]
+    else:
+        _actuate(x, u, 0.0, f, now)
     for i, memory in enumerate(_GUST_MEMORY):
         dx[S.GUST_X + i] = -x[S.GUST_X + i] / p[memory]
     _rates(now, p, f, dx)
+
+
+_derivative_bare, _derivative_with_effects, _ = _full_derivative
+
+
+@compiled()
+def _derivative(x, u, p, work, dx):
+    """`_full_derivative`, with the effects if any is on."""
+    if _switched_on(p) + p[effects.PROPERTY] != 0.0:
+        _derivative_with_effects(x, u, p, work, dx)
+    else:
+        _derivative_bare(x, u, p, work, dx)
 
 
 def full_state(state: np.ndarray, command: np.ndarray, vehicle: Vehicle) -> np.ndarray:
@@ -680,7 +694,7 @@ def full_derivative(x: np.ndarray, u: np.ndarray, vehicle: Vehicle) -> np.ndarra
         x: full state (29,). u: commands, time and battery (6,). vehicle: its numbers and effects.
     """
     dx = np.zeros(N_FULL)
-    _full_derivative(
+    _derivative(
         np.ascontiguousarray(x, float), np.ascontiguousarray(u, float), vehicle.vector,
         np.zeros(WORK_SIZE), dx,
     )  # fmt: skip
@@ -710,7 +724,7 @@ def derivative(state: Any, command: Any, vehicle: Vehicle | str) -> np.ndarray:
         entry = effects.CATALOGUE[lag]
         values[entry.index : entry.index + len(entry.parameters)] = 0.0
     dx = np.zeros(N_FULL)
-    _full_derivative(
+    _derivative(
         full_state(state, command, vehicle), kernel_input(command), values, np.zeros(WORK_SIZE), dx
     )
     return dx[:N_STATES]
