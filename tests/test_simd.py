@@ -76,6 +76,21 @@ def _seldom_needed(x, power, tangent, sine, angle):
 
 
 @compiled(makes_arrays=True)
+def _of_two_angles(x, sine, cosine, other_sine, other_cosine):
+    for i in range(len(x)):
+        (
+            (simd_view(sine)[i], simd_view(cosine)[i]),
+            (simd_view(other_sine)[i], simd_view(other_cosine)[i]),
+        ) = simd.sines_and_cosines(simd_view(x)[i], -0.5 * simd_view(x)[i])
+
+
+@compiled(makes_arrays=True)
+def _over_root(y, out):
+    for i in range(len(y)):
+        simd_view(out)[i] = simd.over_root(3.0 * simd_view(y)[i], simd_view(y)[i])
+
+
+@compiled(makes_arrays=True)
 def _sine_and_cosine(x, sine, cosine):
     for i in range(len(x)):
         simd_view(sine)[i], simd_view(cosine)[i] = simd.sine_and_cosine(simd_view(x)[i])
@@ -126,6 +141,22 @@ def test_sine_and_cosine_are_right_to_the_last_bits(size):
     _sine_and_cosine_of_numbers(x, sine, cosine)
     assert np.abs(sine - np.sin(x)).max() < 4e-16
     assert np.abs(cosine - np.cos(x)).max() < 4e-16
+
+
+@pytest.mark.parametrize("size", [0.01, 0.25, 0.3, math.pi, 100.0])
+def test_sines_and_cosines_of_two_angles_are_right_to_the_last_bits(size):
+    x = np.sort(np.random.default_rng(5).uniform(-size, size, 8000))
+    found = applied(_of_two_angles, x, 4)
+    expected = np.sin(x), np.cos(x), np.sin(-0.5 * x), np.cos(-0.5 * x)
+    assert np.abs(np.array(found) - expected).max() < 4e-16
+
+
+@pytest.mark.parametrize("far", [1e-6, 1e-3, 1.1e-3, 0.9])
+def test_a_number_over_a_root_is_right_to_the_last_bits_near_one_and_far_from_it(far):
+    y = np.random.default_rng(7).uniform(1.0 - far, 1.0 + far, 8000)
+    assert np.abs(applied(_over_root, y)[0] / (3.0 * np.sqrt(y)) - 1.0).max() < 7e-16
+    y[2] = math.nan
+    assert np.flatnonzero(np.isnan(applied(_over_root, y)[0])).tolist() == [2]
 
 
 def test_sine_and_cosine_at_the_quarter_turns_and_of_what_is_not_finite():

@@ -276,12 +276,13 @@ class Fleet:
         """One control period; `x` is a new array then, and the one before stays as it was.
 
         Args:
-            actions: (count, 4); whether they are clipped in place is left open.
+            actions: (count, 4), numbers of any type; whether they are clipped in place is left open.
             active: which rows fly, (count,). anew: which of the others start a new flight, (count,).
         """
         n = self.count
+        simd = self._side_by_side
         # the loops are looked up once: from here on no type and no order in memory is checked
-        actions = np.ascontiguousarray(actions, dtype=np.float64)
+        commands = np.empty((n, 4)) if simd else np.ascontiguousarray(actions, dtype=np.float64)
         active = np.ascontiguousarray(active, dtype=np.bool_)
         heli, world, mission = self.helicopters, self.world, self.mission
         outcome = Outcome(
@@ -292,7 +293,6 @@ class Fleet:
         )
         if anew is not None:
             self._draw(anew)
-        simd = self._side_by_side
         before = self.x
         self.x = x = np.empty_like(before) if simd else before.copy()
 
@@ -300,11 +300,12 @@ class Fleet:
 
         def rows(first: int, last: int) -> None:
             if fly:
-                fly(first, last, active, actions, before, x, heli, world, mission, outcome)
+                commands[first:last] = actions[first:last]
+                fly(first, last, active, commands, before, x, heli, world, mission, outcome)
             else:
                 if self._disturbed:
                     _disturb_rows(first, last, active, x, heli, world)
-                _fly_rows(first, last, active, actions, x, heli, world, mission, outcome)
+                _fly_rows(first, last, active, commands, x, heli, world, mission, outcome)
             if mission.dwell:
                 _pay_waypoints(first, last, active, x, heli, mission, outcome)
             if self.task.follows_path:

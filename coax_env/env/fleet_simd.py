@@ -79,8 +79,8 @@ def fly_of(makeup: Makeup) -> Any:
     """`simd_loops.fly` for what a batch has: compiled, or found on disk, when it is first called."""
     kind = "bare" if not any(makeup) else _name_of(makeup)
     names: dict[str, Any] = {
-        "EFFECTS": bool(makeup.used), "OWN": makeup.own, "TURBULENT": makeup.turbulent,
-        "DELAYED": makeup.delayed, "LATE": makeup.late,
+        "OWN": makeup.own, "TURBULENT": makeup.turbulent, "DELAYED": makeup.delayed,
+        "LATE": makeup.late,
         "SHAKES": any(name.startswith("vibration.") for name in makeup.used),
     }  # fmt: skip
     if makeup.used:
@@ -97,7 +97,7 @@ def fly_of(makeup: Makeup) -> Any:
     def of(function: Any) -> Any:
         return compiled(makes_arrays=True)(under_names(function, names, kind))
 
-    names["step_rows"], names["sense_rows"] = of(simd_loops.step_rows), of(simd_loops.sense_rows)
+    names["fly_rows"] = of(simd_loops.fly_rows)
     return looked_up_once(of(simd_loops.fly))
 
 

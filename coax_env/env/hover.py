@@ -146,6 +146,16 @@ def reward(x, action, target, weights, scales, terms):
 @compiled()
 def is_over(x):
     """Whether the flight has ended: ground, tilt, too fast, too far, too high, or not a number."""
+    return is_over_at_tilt(x, math.cos(x[S.PHI]) * math.cos(x[S.THETA]))
+
+
+@compiled()
+def is_over_at_tilt(x, upright):
+    """`is_over`, where the cosine of the tilt is known.
+
+    Args:
+        x: full state, (29,). upright: cosine of the rotor axis's angle to the vertical.
+    """
     nought = 0.0 * x[S.U]
     for i in range(S.V, N_FULL):
         nought += 0.0 * x[i]  # NaN where a state is not finite
@@ -153,7 +163,7 @@ def is_over(x):
         (nought == 0.0)
         & (-x[S.Z] > LOWEST)
         & (-x[S.Z] < HIGHEST)
-        & (math.cos(x[S.PHI]) * math.cos(x[S.THETA]) > _COS_STEEPEST)
+        & (upright > _COS_STEEPEST)
         & (x[S.X] * x[S.X] + x[S.Y] * x[S.Y] < FARTHEST * FARTHEST)
         & (x[S.U] * x[S.U] + x[S.V] * x[S.V] + x[S.W] * x[S.W] < FASTEST * FASTEST)
     )

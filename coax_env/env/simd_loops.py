@@ -2,7 +2,8 @@
 
 The same control period as flight_loop.py's for one row, made of the same parts (period.py); here each
 part is compiled for SIMD_WIDTH helicopters side by side. Any active rows make a group; the last group
-is filled up with copies, whose results are dropped.
+is filled up with copies, whose results are dropped. A group goes through the whole period at once, so
+that its numbers stay in registers and in the nearest cache.
 
 Where they ask one of the names in capitals, numba drops the branch that a variant does not have.
 """
@@ -25,6 +26,7 @@ from coax_env.env.period import (
 )
 from coax_env.env.turbulence import N_FILTERS
 from coax_env.kernel.compilation import compiled
+from coax_env.kernel.random_streams import COUNTER, KEY
 from coax_env.kernel.simd import (
     SIMD_WIDTH,
     gather,
@@ -36,20 +38,15 @@ from coax_env.kernel.simd import (
 )
 from coax_env.model import effects
 from coax_env.model import state as S
+from coax_env.model import workspace as F
 from coax_env.model.actuators import limit
 from coax_env.model.dynamics import WORK_SIZE, measure_bare, step_bare
-from coax_env.model.layout import N_CHANNELS, N_COMMANDS, N_FULL, N_INPUTS, N_STATES, TIME
+from coax_env.model.layout import N_CHANNELS, N_COMMANDS, N_FULL, N_INPUTS, TIME
 from coax_env.model.sampling import BIAS, BIAS_STD, DELAY, delayed, measured_quantities
 
-CHUNK = 512
-"""Rows that are flown, and then sense: as many as the second-level cache can hold."""
-
-PHASES = 10
-"""Rows after which the shipped sensors' rates, 10 to 100 Hz, come round again."""
-
-EFFECTS = OWN = TURBULENT = DELAYED = SHAKES = LATE = False
-"""What a variant has: effects; parameters of each row's own; turbulence; delayed commands; vibration;
-late readings. These, and the kernel's functions after them, are the bare one's."""
+OWN = TURBULENT = DELAYED = SHAKES = LATE = False
+"""What a variant has: parameters of each row's own; turbulence; delayed commands; vibration; late
+readings. These, and the kernel's functions after them, are the bare one's."""
 
 _step, _measure, _fly_delayed = step_bare, measure_bare, period.fly_period
 
@@ -77,25 +74,6 @@ def next_group(i, last, active, which):
     return n, i
 
 
-@compiled(makes_arrays=True)
-def _by_phase(first, last, active, rows, order):
-    """The active rows first..last-1 into `order`, those together whose sensors are due together; how
-    many they are. What no row of a group has due, none of them draws noise for.
-    """
-    places = np.zeros(PHASES + 1, np.int64)
-    for i in range(first, last):
-        if active[i]:
-            places[rows[i] % PHASES + 1] += 1
-    for phase in range(PHASES):
-        places[phase + 1] += places[phase]
-    for i in range(first, last):
-        if active[i]:
-            phase = rows[i] % PHASES
-            order[places[phase]] = i
-            places[phase] += 1
-    return places[PHASES]
-
-
 # --- parameters -----------------------------------------------------------------------------------
 
 
@@ -118,67 +96,118 @@ def _gather_own(own, which, block, own_, world, p):
         p[world.own[k]] = own_[k]
 
 
+# --- numbers that are one a row -------------------------------------------------------------------
+
+
+@compiled(forceinline=True)
+def _gather_singles(which, rows, azimuth, streams, block, stream_block):
+    """Periods flown and azimuth into `block` (_N_SINGLES, SIMD_WIDTH), streams into theirs (2, ...)."""
+    for j in range(SIMD_WIDTH):
+        i = which[j]
+        block[_ROW, j] = rows[i]
+        block[_AZIMUTH, j] = azimuth[i]
+        stream_block[KEY, j] = streams[i, KEY]
+        stream_block[COUNTER, j] = streams[i, COUNTER]
+
+
+@compiled(forceinline=True)
+def _scatter_singles(which, some, block, stream_block, heli, outcome):
+    """What `_gather_singles` took back to the first lanes' rows, one period on; reward and end."""
+    rows, azimuth, streams = heli.rows, heli.azimuth, heli.streams
+    rewards, over = outcome.rewards, outcome.over
+    for j in range(some):
+        i = which[j]
+        rows[i] += 1
+        azimuth[i] = block[_AZIMUTH, j]
+        streams[i, COUNTER] = stream_block[COUNTER, j]
+        rewards[i] = block[_REWARD, j]
+        over[i] = block[_OVER, j] != 0.0
+
+
+@compiled()
+def _delay_readings(which, some, rows, past, sensors, block):
+    """What late sensors show of what they measure, (n_sensors, SIMD_WIDTH), in place."""
+    for j in range(some):
+        i = which[j]
+        for k in range(len(sensors)):
+            block[k, j] = delayed(block[k, j], past[i], rows[i] + 1, k, sensors[k, DELAY])
+
+
 # --- loops ----------------------------------------------------------------------------------------
 
 
-def step_rows(kind, first, last, active, actions, x, flown, heli, world, mission, outcome):
-    """Command, flight and judgement of the active rows first..last-1; arguments as `fly`."""
+def fly_rows(kind, first, last, active, actions, x, flown, heli, world, mission, outcome):
+    """One control period of the active rows first..last-1 of one kind; arguments as `fly`."""
     # names outside the loop: numba counts a reference each time it takes an array from a tuple
-    u, rows, azimuth, streams, own = heli[:5]
-    last_commands, targets, ring = heli.last_commands, heli.targets, heli.command_ring
+    rows, streams, own, held = heli.rows, heli.streams, heli.own, heli.held
+    last_commands, targets, ring, bias = (
+        heli.last_commands, heli.targets, heli.command_ring, heli.bias
+    )  # fmt: skip
     trim, scale, gust, limits = world.trim, world.scale, world.gust, world.limits[kind]
+    sensors, flags = world.sensors[kind], world.flags
     weights, scales = mission.weights, mission.scales
-    rewards, terms, over = outcome.rewards, outcome.terms, outcome.over
-    which = np.empty(SIMD_WIDTH, np.int64)
+    terms, observations, width = outcome.terms, outcome.observations.reshape(-1), held.shape[1]
+    readings_held = held.reshape(-1)
+    count = len(sensors)
+    which = np.empty(SIMD_WIDTH, np.uint64)  # no place is counted from the end
     x_block, u_block = np.empty((N_FULL, SIMD_WIDTH)), np.zeros((N_INPUTS, SIMD_WIDTH))
     action_block, last_block = np.empty((4, SIMD_WIDTH)), np.empty((4, SIMD_WIDTH))
     target_block = np.empty((4, SIMD_WIDTH))
     term_block = np.zeros((len(weights), SIMD_WIDTH))
     stream_block = np.empty((2, SIMD_WIDTH), np.uint64)
     single_block = np.empty((_N_SINGLES, SIMD_WIDTH))
+    held_block, bias_block = np.empty((held.shape[1], SIMD_WIDTH)), np.zeros((count, SIMD_WIDTH))
+    value_block, reading_block = np.empty((count, SIMD_WIDTH)), np.empty((N_CHANNELS, SIMD_WIDTH))
     x_, u_, action_ = simd_view(x_block), simd_view(u_block), simd_view(action_block)
     last_, target_, terms_ = simd_view(last_block), simd_view(target_block), simd_view(term_block)
     single_, stream_ = simd_view(single_block), simd_view_uint64(stream_block)
-    work, flown_ = simd_scratch(WORK_SIZE), simd_scratch(N_FULL)
+    held_, bias_ = simd_view(held_block), simd_view(bias_block)
+    values_, readings_ = simd_view(value_block), simd_view(reading_block)
+    # the readings' own scratch: their rates of change, which nobody asks for, are not computed then
+    work, sensed, flown_ = simd_scratch(WORK_SIZE), simd_scratch(WORK_SIZE), simd_scratch(N_FULL)
     if OWN:
         p_block, own_block = _own_blocks(world, own)
         p, own_ = simd_view(p_block), simd_view(own_block)
+        numbers = p
     else:
-        p = world.params
+        # on the stack, and in no call but those inlined: what follows from it is then done once
+        p, numbers = simd_scratch(_N_PARAMETERS), world.params
+        for k in world.read:
+            p[k] = numbers[k]
     if TURBULENT:
         filter_block, steady_block = np.empty((N_FILTERS, SIMD_WIDTH)), np.empty((2, SIMD_WIDTH))
         filter_, steady_ = simd_view(filter_block), simd_view(steady_block)
         air = simd_scratch(3)
     gusty = gust[FORCE] > 0.0 or gust[MOMENT] > 0.0
     limited = np.isfinite(limits).any()
+    biased = False
+    for k in range(count):
+        biased = biased or sensors[k, BIAS] != 0.0 or sensors[k, BIAS_STD] != 0.0
+    shown = sensed_to = first * width
     n, after = next_group(first, last, active, which)
     while n > 0:
+        _gather_singles(which, rows, heli.azimuth, streams, single_block, stream_block)
         gather(x, which, x_block)
         gather(actions, which, action_block)
         gather(targets, which, target_block)
+        gather(held, which, held_block)
         if OWN:
             _gather_own(own, which, own_block, own_, world, p)
-        for j in range(SIMD_WIDTH):
-            single_block[_ROW, j] = rows[which[j]]
-            single_block[_AZIMUTH, j] = azimuth[which[j]]
         command(action_, trim, scale, u_)
         if limited:
             gather(last_commands, which, last_block)
             limit(u_, last_, limits, DT)
             scatter(last_block, which, n, last_commands)
-        if gusty or TURBULENT:
-            gather(streams, which, stream_block)
-            if gusty:
-                add_gusts(x_, p, gust, stream_)
-            if TURBULENT:
-                gather(heli.filters, which, filter_block)
-                gather(heli.steady_wind, which, steady_block)
-                move_air(x_, own_, stream_, filter_, steady_, world.turbulence, air)
-                for k in range(AIR_DOWN + 1):
-                    p[world.own[k]] = own_[k]
-                scatter(filter_block, which, n, heli.filters)
-                scatter(own_block[: AIR_DOWN + 1], which, n, own)
-            scatter(stream_block, which, n, streams)
+        if gusty:
+            add_gusts(x_, numbers, gust, stream_)
+        if TURBULENT:
+            gather(heli.filters, which, filter_block)
+            gather(heli.steady_wind, which, steady_block)
+            move_air(x_, own_, stream_, filter_, steady_, world.turbulence, air)
+            for k in range(AIR_DOWN + 1):
+                p[world.own[k]] = own_[k]
+            scatter(filter_block, which, n, heli.filters)
+            scatter(own_block[: AIR_DOWN + 1], which, n, own)
         u_[TIME] = single_[_ROW] * DT
         if DELAYED:
             for j in range(n):
@@ -192,87 +221,30 @@ def step_rows(kind, first, last, active, actions, x, flown, heli, world, mission
             _step(x_, u_, DT, p, work, flown_)
         for k in range(N_FULL):
             x_[k] = flown_[k]
-        u_[TIME] = (single_[_ROW] + 1.0) * DT
+        single_[_ROW] += 1.0
+        u_[TIME] = single_[_ROW] * DT
         single_[_AZIMUTH] = next_azimuth(single_[_AZIMUTH], x_[S.OMEGA_U], DT)
         single_[_REWARD] = hover.reward(x_, action_, target_, weights, scales, terms_)
-        single_[_OVER] = select(hover.is_over(x_), 1.0, 0.0)
         scatter(x_block, which, n, flown)
-        scatter(u_block, which, n, u)
         scatter(term_block, which, n, terms)
-        for j in range(n):
-            i = which[j]
-            rows[i] += 1
-            azimuth[i] = single_block[_AZIMUTH, j]
-            rewards[i] = single_block[_REWARD, j]
-            over[i] = single_block[_OVER, j] != 0.0
-        n, after = next_group(after, last, active, which)
-
-
-def sense_rows(kind, first, last, active, x, heli, world, observations):
-    """New readings of the active rows first..last-1 of one kind, at the states `x` (n, 29);
-    arguments as `sense`.
-    """
-    rows, streams, own, past = heli.rows, heli.streams, heli.own, heli.past
-    bias, held, sensors, flags = heli.bias, heli.held, world.sensors[kind], world.flags
-    which, order = np.empty(SIMD_WIDTH, np.int64), np.empty(last - first, np.int64)
-    count = len(sensors)
-    x_block, reading_block = np.empty((N_FULL, SIMD_WIDTH)), np.empty((N_CHANNELS, SIMD_WIDTH))
-    held_block = np.empty((held.shape[1], SIMD_WIDTH))
-    row_block = np.empty((1, SIMD_WIDTH))
-    bias_block, value_block = np.zeros((count, SIMD_WIDTH)), np.empty((count, SIMD_WIDTH))
-    stream_block, work = np.empty((2, SIMD_WIDTH), np.uint64), simd_scratch(WORK_SIZE)
-    x_, held_, row_ = simd_view(x_block), simd_view(held_block), simd_view(row_block)
-    bias_, values_, readings_ = (
-        simd_view(bias_block), simd_view(value_block), simd_view(reading_block)
-    )  # fmt: skip
-    stream_ = simd_view_uint64(stream_block)
-    if OWN:
-        p_block, own_block = _own_blocks(world, own)
-        p, own_ = simd_view(p_block), simd_view(own_block)
-    else:
-        p = world.params
-    if EFFECTS:
-        u_block, azimuth_block = np.empty((N_INPUTS, SIMD_WIDTH)), np.empty((1, SIMD_WIDTH))
-        u_, azimuth_ = simd_view(u_block), simd_view(azimuth_block)
-    biased = False
-    for k in range(count):
-        biased = biased or sensors[k, BIAS] != 0.0 or sensors[k, BIAS_STD] != 0.0
-    active_rows = _by_phase(first, last, active, rows, order)
-    for at in range(0, active_rows, SIMD_WIDTH):
-        n = min(SIMD_WIDTH, active_rows - at)
-        for j in range(SIMD_WIDTH):
-            which[j] = order[at + j if j < n else at]
-        gather(x, which, x_block)
-        gather(held, which, held_block)
-        gather(streams, which, stream_block)
-        if biased:
-            gather(bias, which, bias_block)
-        if OWN:
-            _gather_own(own, which, own_block, own_, world, p)
-        for j in range(SIMD_WIDTH):
-            row_block[0, j] = rows[which[j]]
-        if EFFECTS:
-            gather(heli.u, which, u_block)
-            _measure(x_, u_, p, work, readings_)
-        else:
-            # the actuators are where they were sent, and time has no part
-            _measure(x_, x_[N_STATES:], p, work, readings_)
+        _measure(x_, u_, p, sensed, readings_)
+        upright = sensed[F.COS_PHI] * sensed[F.COS_THETA]
+        single_[_OVER] = select(hover.is_over_at_tilt(x_, upright), 1.0, 0.0)
         if SHAKES:
-            for j in range(SIMD_WIDTH):
-                azimuth_block[0, j] = heli.azimuth[which[j]]
-            shake(readings_, azimuth_[0], p)
+            shake(readings_, single_[_AZIMUTH], numbers)
         measured_quantities(x_, readings_, sensors, values_)
         if LATE:
-            for j in range(n):
-                i = which[j]
-                for k in range(count):
-                    value_block[k, j] = delayed(
-                        value_block[k, j], past[i], rows[i], k, sensors[k, DELAY]
-                    )
-        take_samples(values_, row_[0], sensors, bias_, stream_, flags, held_)
+            _delay_readings(which, n, rows, heli.past, sensors, value_block)
+        if biased:
+            gather(bias, which, bias_block)
+        take_samples(values_, single_[_ROW], sensors, bias_, stream_, flags, held_)
         scatter(held_block, which, n, held)
-        scatter(held_block, which, n, observations)
-        scatter(stream_block, which, n, streams)
+        _scatter_singles(which, n, single_block, stream_block, heli, outcome)
+        # a group later: by then, what was written in parts can be read as a whole
+        copy_row(readings_held[shown:sensed_to], observations[shown:sensed_to])
+        shown, sensed_to = sensed_to, after * width
+        n, after = next_group(after, last, active, which)
+    copy_row(readings_held[shown : last * width], observations[shown : last * width])
 
 
 def fly(first, last, active, actions, x, flown, heli, world, mission, outcome):
@@ -283,21 +255,17 @@ def fly(first, last, active, actions, x, flown, heli, world, mission, outcome):
         actions: (n, 4). x: full states, (n, 29). flown: where those after the period are put.
         heli, world, mission, outcome: the batch's arrays, arrays.py.
     """
-    observations, kinds = outcome.observations, len(world.sensors)
+    kinds = len(world.sensors)
     mine = active.copy() if kinds > 1 else active
-    for start in range(first, last, CHUNK):
-        end = min(start + CHUNK, last)
-        for kind in range(kinds):
-            if kinds > 1:
-                for i in range(start, end):
-                    mine[i] = active[i] and heli.kinds[i] == kind
-            step_rows(kind, start, end, mine, actions, x, flown, heli, world, mission, outcome)
-            sense_rows(kind, start, end, mine, flown, heli, world, observations)
-        for i in range(start, end):
-            if not active[i]:
-                copy_row(x[i], flown[i])
-                copy_row(heli.held[i], observations[i])
-                for k in range(outcome.terms.shape[1]):
-                    outcome.terms[i, k] = 0.0
-                outcome.rewards[i] = 0.0
-                outcome.over[i] = False
+    for kind in range(kinds):
+        if kinds > 1:
+            for i in range(first, last):
+                mine[i] = active[i] and heli.kinds[i] == kind
+        fly_rows(kind, first, last, mine, actions, x, flown, heli, world, mission, outcome)
+    for i in range(first, last):
+        if not active[i]:
+            copy_row(x[i], flown[i])
+            for k in range(outcome.terms.shape[1]):
+                outcome.terms[i, k] = 0.0
+            outcome.rewards[i] = 0.0
+            outcome.over[i] = False

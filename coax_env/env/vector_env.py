@@ -73,6 +73,8 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_names = tuple(entry.name for entry in entries)
         self.observation_units = tuple(entry.unit for entry in entries)
+        terms = self.fleet.task.terms
+        self._of_terms = (*terms, *(f"_{name}" for name in terms))
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._every = np.ones(num_envs, dtype=np.bool_)
         self._seeded = False
@@ -122,8 +124,8 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         waiting = ended.any()
         active = ~ended if waiting else self._every
         anew = ended if waiting and self.autoreset_mode == AutoresetMode.NEXT_STEP else None
-        commands = np.array(actions, dtype=np.float64).reshape(self.num_envs, 4)
-        outcome = fleet.fly_held(commands, active, anew)
+        own = np.array(actions).reshape(self.num_envs, 4)
+        outcome = fleet.fly_held(own, active, anew)
         terminated = outcome.over
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         if self.max_episode_steps is not None:
@@ -159,9 +161,9 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._screen.close()
 
     def _step_info(self, terms: np.ndarray) -> dict[str, Any]:
-        named = {name: terms[:, k] for k, name in enumerate(self.fleet.task.terms)}
         every = self._every.copy()
-        return self._info(every) | {"reward_terms": _masked(named, every), "_reward_terms": every}
+        by_name = dict(zip(self._of_terms, (*terms.T, *[every] * terms.shape[1]), strict=True))
+        return self._info(every) | {"reward_terms": by_name, "_reward_terms": every}
 
     def _info(self, which: np.ndarray) -> dict[str, Any]:
         fleet = self.fleet

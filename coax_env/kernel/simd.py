@@ -14,7 +14,7 @@ whether an effect is on.
 Products and sums may be fused, so lanes agree with the scalar kernel to rounding, not to the bit.
 """
 
-from coax_env.kernel.simd_math import sine_and_cosine, sines_and_cosines
+from coax_env.kernel.simd_math import over_root, sine_and_cosine, sines_and_cosines
 from coax_env.kernel.simd_operators import (
     any_lane,
     bits_of,
@@ -50,6 +50,7 @@ __all__ = [
     "lane",
     "lanes",
     "negated",
+    "over_root",
     "scatter",
     "select",
     "simd_blocks",

@@ -28,10 +28,15 @@ from coax_env.kernel.simd_types import SIMD_FLOAT64, SIMD_UINT64, SIMD_WIDTH
 _PI_1 = float.fromhex("0x1.921fb54400000p+0")
 _PI_2 = float.fromhex("0x1.0b4611a600000p-34")
 _PI_3 = float.fromhex("0x1.3198a2e037073p-69")
+_ROUNDING = 1.5 * 2.0**52  # added to a number, leaves it whole in the last bits
+_TO_SIGN, _TO_SIGN_2 = np.uint64(63), np.uint64(62)  # from the last bit, and from the one before
+_SIGN, _ONE = np.uint64(0x8000000000000000), np.uint64(1)
+_HALF = np.uint64(0x3FE0000000000000)  # the exponent of [0.5, 1)
 _FARTHEST = 1e6  # [quarter turns]; beyond it, n times the parts is not exact
 
 
 _EIGHTH = 0.25 * math.pi
+_SMALL = 0.25  # [rad]: attitude and tilts in most flights
 
 
 def sine_and_cosine(x):
@@ -58,9 +63,12 @@ def _sine_and_cosine_of(x):
 @by_type(sines_and_cosines)
 def _sines_and_cosines_of(x, y):
     def of_registers(x, y):
-        if any_lane(max(abs(x), abs(y)) > _EIGHTH):
-            return _wound(x), _wound(y)
-        return _within_an_eighth(x), _within_an_eighth(y)
+        farther = max(abs(x), abs(y))
+        if any_lane(farther > _SMALL):
+            if any_lane(farther > _EIGHTH):
+                return _wound(x), _wound(y)
+            return _within_an_eighth(x), _within_an_eighth(y)
+        return _of_small(x), _of_small(y)
 
     return (
         of_registers if x == SIMD_FLOAT64 else lambda x, y: (sine_and_cosine(x), sine_and_cosine(y))
@@ -85,17 +93,30 @@ def _within_an_eighth(r):
 
 
 @numba.njit(error_model="numpy", **INLINE)
+def _of_small(r):
+    """Sine and cosine to 1e-15 up to _SMALL: polynomials of least largest error (Remez)."""
+    z = r * r
+    s = 2.7519573458930775e-06 * z - 0.00019841250320814258
+    s = s * z + 0.008333333329390031
+    s = s * z - 0.16666666666664243
+    c = 2.4801570239861958e-05 - 2.752506954858584e-07 * z
+    c = c * z - 0.0013888888885418402
+    c = c * z + 0.04166666666666469
+    return s * z * r + r, c * z * z - 0.5 * z + 1.0
+
+
+@numba.njit(error_model="numpy", **INLINE)
 def _wound(x):
     """Sine and cosine to 1e-15 of angles however many turns; NaN beyond a million quarter turns."""
-    n = math.floor(x * (2.0 / math.pi) + 0.5)
+    rounded = x * (2.0 / math.pi) + _ROUNDING
+    n = rounded - _ROUNDING
     n = select(abs(n) < _FARTHEST, n, math.nan)
     s, c = _within_an_eighth(((x - n * _PI_1) - n * _PI_2) - n * _PI_3)
-    half = math.floor(0.5 * n)
-    odd = n - 2.0 * half  # 0 or 1: quarter turns
-    back = half - 2.0 * math.floor(0.5 * half)  # 0 or 1: half turns
-    sign = 1.0 - 2.0 * back
-    swapped = odd > 0.5
-    return select(swapped, c, s) * sign, select(swapped, s, c) * (sign - 2.0 * sign * odd)
+    quarters = bits_of(rounded)
+    swapped = from_bits((quarters << _TO_SIGN) | _HALF) < 0.0  # after an odd number of quarters
+    s, c = select(swapped, c, s), select(swapped, s, c)
+    s = from_bits(bits_of(s) ^ ((quarters << _TO_SIGN_2) & _SIGN))
+    return s, from_bits(bits_of(c) ^ (((quarters + _ONE) << _TO_SIGN_2) & _SIGN))
 
 
 @by_type(math.sin)
@@ -108,11 +129,35 @@ def _cosine(x):
     return (lambda x: sine_and_cosine(x)[1]) if x == SIMD_FLOAT64 else None
 
 
+# --- roots ---------------------------------------------------------------------------------------
+
+_NEAR_ONE = 2.0**-10
+"""Up to here five terms of 1/sqrt(1 - d) are right to 3e-16."""
+
+
+def over_root(x, y):
+    """x / sqrt(y), of numbers or of each lane; where all lanes' y are near one, without dividing."""
+    return x / math.sqrt(y)
+
+
+@by_type(over_root)
+def _over_root_of(x, y):
+    def of_registers(x, y):
+        d = 1.0 - y
+        if any_lane(abs(d) > _NEAR_ONE):
+            return x / math.sqrt(y)
+        root = 0.2734375 * d + 0.3125
+        root = root * d + 0.375
+        root = root * d + 0.5
+        return x * d * root + x
+
+    return of_registers if is_register(y) else lambda x, y: x / math.sqrt(y)
+
+
 # --- exponential and logarithm -------------------------------------------------------------------
 
 _WHOLE = np.uint64(0x4330000000000000)  # the bits of 2^52: under them a whole number fits
 _MANTISSA = np.uint64(0x000FFFFFFFFFFFFF)
-_HALF = np.uint64(0x3FE0000000000000)  # the exponent of [0.5, 1)
 _EXPONENT = np.uint64(52)
 _LN2_HIGH, _LN2_LOW = 0.693145751953125, 1.42860682030941723212e-6
 

@@ -1,6 +1,6 @@
 """Arrays of SIMD registers: over the memory of others, on the stack; and rows in and out of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -82,40 +82,56 @@ def simd_scratch(typingctx, n):
     return row(types.literal(n.literal_value)), emit
 
 
-def _four_by_four(builder: Any, rows: list) -> list:
-    """Four vectors of four, transposed."""
+def _mixed(builder: Any, a: Any, b: Any, places: Sequence[int]) -> Any:
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(places)), list(places)))
 
-    def mixed(a: Any, b: Any, places: list[int]) -> Any:
-        return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, 4), places))
 
-    low = [mixed(rows[i], rows[i + 1], [0, 4, 2, 6]) for i in (0, 2)]
-    high = [mixed(rows[i], rows[i + 1], [1, 5, 3, 7]) for i in (0, 2)]
+_EVEN, _ODD = (0, 8, 2, 10, 4, 12, 6, 14), (1, 9, 3, 11, 5, 13, 7, 15)
+"""Of two registers, in turns, the numbers at even places, and those at odd ones."""
+
+
+def _lanes_of_rows(builder: Any, rows: list) -> list:
+    """Eight rows of four numbers as four registers: a row in each lane."""
+    pairs = [_mixed(builder, rows[i], rows[i + 2], range(8)) for i in (0, 1, 4, 5)]
     return [
-        mixed(pair[0], pair[1], half)
-        for half in ([0, 1, 4, 5], [2, 3, 6, 7])
-        for pair in (low, high)
+        _mixed(
+            builder,
+            _mixed(builder, pairs[0], pairs[1], turns),
+            _mixed(builder, pairs[2], pairs[3], turns),
+            [k, k + 1, k + 4, k + 5, k + 8, k + 9, k + 12, k + 13],
+        )
+        for k in (0, 2)
+        for turns in (_EVEN, _ODD)
+    ]
+
+
+def _rows_of_lanes(builder: Any, registers: list) -> list:
+    """Four registers as eight rows of four numbers: `_lanes_of_rows` backwards."""
+    even, odd = (
+        [_mixed(builder, registers[i], registers[i + 1], turns) for i in (0, 2)]
+        for turns in (_EVEN, _ODD)
+    )
+    return [
+        _mixed(builder, low, high, [k, k + 1, k + 8, k + 9])
+        for k in (0, 2, 4, 6)
+        for low, high in (even, odd)
     ]
 
 
 def _eight_by_eight(builder: Any, rows: list) -> list:
     """Eight vectors of eight, transposed: pairs of rows, pairs of pairs, halves."""
-
-    def mixed(a: Any, b: Any, places: list[int]) -> Any:
-        return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, 8), places))
-
     pairs = [
-        [mixed(rows[i], rows[i + 1], [k, k + 8, k + 2, k + 10, k + 4, k + 12, k + 6, k + 14])
-         for i in range(0, 8, 2)]
-        for k in (0, 1)
-    ]  # fmt: skip
+        [_mixed(builder, rows[i], rows[i + 1], turns) for i in range(0, 8, 2)]
+        for turns in (_EVEN, _ODD)
+    ]
     fours = [
-        [mixed(of[i], of[i + 1], [k, k + 1, k + 8, k + 9, k + 4, k + 5, k + 12, k + 13])
+        [_mixed(builder, of[i], of[i + 1], [k, k + 1, k + 8, k + 9, k + 4, k + 5, k + 12, k + 13])
          for i in (0, 2)]
         for k in (0, 2)
         for of in pairs
     ]  # fmt: skip
     return [
-        mixed(low, high, [k, k + 1, k + 2, k + 3, k + 8, k + 9, k + 10, k + 11])
+        _mixed(builder, low, high, [k, k + 1, k + 2, k + 3, k + 8, k + 9, k + 10, k + 11])
         for k in (0, 4)
         for low, high in fours
     ]
@@ -141,34 +157,74 @@ def _transpose_registers(typingctx, source, first, step, target, to, stride):
     return signature_, emit
 
 
+def _four_columns(builder: Any, data: Any, starts: list, column: Any) -> list:
+    """Pointers to four neighbours from a column on, in the rows that start at these places."""
+    four = ir.VectorType(data.type.pointee, 4).as_pointer()
+    first = builder.gep(data, [column])
+    return [builder.bitcast(builder.gep(first, [start]), four) for start in starts]
+
+
 @intrinsic
-def _transpose(typingctx, source, places, target, targets):
-    """Four times four numbers at these places of a flat array, transposed to those of another."""
-    signature_ = types.void(source, places, target, targets)
+def _gather_columns(typingctx, rows, starts, column, block):
+    """Four columns of eight rows, which start at these places of a flat array, into a block."""
+    signature_ = types.void(rows, starts, column, block)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        def at(array: Any, kind: Any, place: Any) -> Any:
-            pointer = builder.gep(array_data(context, builder, kind, array), [place])
-            element = context.get_value_type(kind.dtype)
-            return builder.bitcast(pointer, ir.VectorType(element, 4).as_pointer())
-
-        size = {t: t.bitwidth // 8 for t in (source.dtype, target.dtype)}
+        data = array_data(context, builder, rows, args[0])
+        places = unpack_tuple(builder, args[1], SIMD_WIDTH)
         found = [
-            builder.load(at(args[0], source, place), align=size[source.dtype])
-            for place in unpack_tuple(builder, args[1], 4)
+            builder.load(place, align=8) for place in _four_columns(builder, data, places, args[2])
         ]
-        found = _four_by_four(builder, found)
-        if target.dtype != source.dtype:
-            narrow = ir.VectorType(context.get_value_type(target.dtype), 4)
-            found = [builder.fptrunc(row, narrow) for row in found]
-        for row, place in zip(found, unpack_tuple(builder, args[3], 4), strict=True):
-            builder.store(row, at(args[2], target, place), align=size[target.dtype])
+        to = _registers_of(context, builder, block, args[3], args[2])
+        for register, place in zip(_lanes_of_rows(builder, found), to, strict=True):
+            builder.store(register, place, align=8)
         return context.get_dummy_value()
 
     return signature_, emit
 
 
+@intrinsic
+def _scatter_columns(typingctx, block, column, rows, starts):
+    """Four registers of a block into four columns of eight rows: `_gather_columns` backwards."""
+    signature_ = types.void(block, column, rows, starts)
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        found = [
+            builder.load(place, align=8)
+            for place in _registers_of(context, builder, block, args[0], args[1])
+        ]
+        data = array_data(context, builder, rows, args[2])
+        to = _four_columns(builder, data, unpack_tuple(builder, args[3], SIMD_WIDTH), args[1])
+        for numbers, place in zip(_rows_of_lanes(builder, found), to, strict=True):
+            if rows.dtype != types.float64:
+                numbers = builder.fptrunc(numbers, place.type.pointee)
+            builder.store(numbers, place, align=rows.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return signature_, emit
+
+
+def _registers_of(context: Any, builder: Any, kind: types.Array, block: Any, column: Any) -> list:
+    """Pointers to four registers of a block (n, SIMD_WIDTH) from this one on."""
+    data = array_data(context, builder, kind, block)
+    first = builder.bitcast(data, SIMD_FLOAT64.vector.as_pointer())
+    return [
+        builder.gep(first, [builder.add(column, ir.Constant(column.type, k))]) for k in range(4)
+    ]
+
+
 @compiled()
+def _starts(which, stride):
+    """Where the eight rows of a group start in a flat array of rows of this length."""
+    length = np.uint64(stride)
+    a, b, c, d = (np.uint64(which[0]) * length, np.uint64(which[1]) * length,
+                  np.uint64(which[2]) * length, np.uint64(which[3]) * length)  # fmt: skip
+    e, f, g, h = (np.uint64(which[4]) * length, np.uint64(which[5]) * length,
+                  np.uint64(which[6]) * length, np.uint64(which[7]) * length)  # fmt: skip
+    return a, b, c, d, e, f, g, h
+
+
+@compiled(forceinline=True)
 def gather(rows, which, block):
     """A group's rows into a SIMD block, one row a lane.
 
@@ -176,25 +232,19 @@ def gather(rows, which, block):
         rows: (count, at least n). which: the group's rows (SIMD_WIDTH,).
         block: (n, SIMD_WIDTH), out.
     """
-    n, stride = len(block), rows.shape[1]
+    n = len(block)
     if n < 4:
         for j in range(SIMD_WIDTH):
             for k in range(n):
                 block[k, j] = rows[which[j], k]
         return
-    for j in range(0, SIMD_WIDTH, 4):
-        a, b, c, d = (which[j] * stride, which[j + 1] * stride, which[j + 2] * stride,
-                      which[j + 3] * stride)  # fmt: skip
-        for i in range(0, n, 4):
-            k = min(i, n - 4)  # the last four columns may overlap those before
-            to = k * SIMD_WIDTH + j
-            _transpose(
-                rows, (a + k, b + k, c + k, d + k),
-                block, (to, to + SIMD_WIDTH, to + 2 * SIMD_WIDTH, to + 3 * SIMD_WIDTH),
-            )  # fmt: skip
+    starts = _starts(which, rows.shape[1])
+    for k in range(0, n - 4, 4):
+        _gather_columns(rows, starts, k, block)
+    _gather_columns(rows, starts, n - 4, block)  # may overlap those before
 
 
-@compiled()
+@compiled(forceinline=True)
 def scatter(block, which, some, rows):
     """The first lanes of a SIMD block back into their rows.
 
@@ -202,22 +252,16 @@ def scatter(block, which, some, rows):
         block: (n, SIMD_WIDTH). which: the group's rows (SIMD_WIDTH,).
         some: how many of the lanes count. rows: (count, at least n), out.
     """
-    n, stride = len(block), rows.shape[1]
+    n = len(block)
     if some < SIMD_WIDTH or n < 4:
         for j in range(some):
             for k in range(n):
                 rows[which[j], k] = block[k, j]
         return
-    for j in range(0, SIMD_WIDTH, 4):
-        a, b, c, d = (which[j] * stride, which[j + 1] * stride, which[j + 2] * stride,
-                      which[j + 3] * stride)  # fmt: skip
-        for i in range(0, n, 4):
-            k = min(i, n - 4)
-            to = k * SIMD_WIDTH + j
-            _transpose(
-                block, (to, to + SIMD_WIDTH, to + 2 * SIMD_WIDTH, to + 3 * SIMD_WIDTH),
-                rows, (a + k, b + k, c + k, d + k),
-            )  # fmt: skip
+    starts = _starts(which, rows.shape[1])
+    for k in range(0, n - 4, 4):
+        _scatter_columns(block, k, rows, starts)
+    _scatter_columns(block, n - 4, rows, starts)
 
 
 @compiled()

@@ -29,6 +29,7 @@ from coax_env.kernel.simd import (
     any_lane,
     by_type,
     is_register,
+    over_root,
     select,
     sine_and_cosine,
     sines_and_cosines,
@@ -255,7 +256,7 @@ def _thrust_vector(thrust, alpha, beta):
     """A rotor's thrust [N] in body axes: along [-tan a, tan b, -1], normalised. (13)-(14)."""
     (sin_a, cos_a), (sin_b, cos_b) = sines_and_cosines(alpha, beta)
     across = cos_a * sin_b  # all times cos a cos b
-    along = thrust / math.sqrt(cos_b * cos_b + across * across)
+    along = over_root(thrust, cos_b * cos_b + across * across)
     return -sin_a * cos_b * along, across * along, -cos_a * cos_b * along
 
 
@@ -400,6 +401,19 @@ def _fade(time, p):
     )
 
 
+_STAYS = (1.0, 1.0, 1.0, 1.0)
+"""What `_fade` is where nothing fades."""
+
+
+@compiled(forceinline=True)
+def _gusty(x):
+    """Whether a full state has a gust."""
+    return (
+        x[S.GUST_X] != 0.0 or x[S.GUST_Y] != 0.0 or x[S.GUST_Z] != 0.0
+        or x[S.GUST_L] != 0.0 or x[S.GUST_M] != 0.0 or x[S.GUST_N] != 0.0
+    )  # fmt: skip
+
+
 @compiled(forceinline=True)
 def _fade_gusts(fade, x):
     """Let the gusts of a full state fade, in place."""
@@ -441,17 +455,18 @@ def _step(x, u, dt, p, work, out):
     h = dt / parts
     _copy(x, out)
     _properties(out, u, p, f)
+    gusty = _gusty(out)  # without one, nothing fades
     for _ in range(parts):
         if WITH_EFFECTS:
             _mean_rotor_accelerations(out, u, h, f)
-        half_fade = _fade(0.5 * h, p)
+        half_fade = _fade(0.5 * h, p) if gusty else _STAYS
         for i in range(S.GUST_X, N_FULL):
             stage[i] = out[i]
         for k in range(4):
             time = 0.0 if k == 0 else (h if k == 3 else 0.5 * h)
             for i in range(N_STATES):
                 stage[i] = out[i] if k == 0 else out[i] + time * slope[i]
-            if k == 1 or k == 3:
+            if gusty and (k == 1 or k == 3):
                 _fade_gusts(half_fade, stage)
             _actuate(out, u, time + READING_DELAY, f, stage)
             _rates(stage, p, f, slope)
