@@ -58,8 +58,8 @@ as the score does. ``threads``: torch's; two only help on an otherwise idle mach
 """
 
 START_RATE = 0.1
-"""Of the learning rate, where training begins from a policy: with the whole rate it loses in a million
-periods what it had (cost 0.60 instead of 0.42), with a third of it some."""
+"""Of the learning rate, where training begins from a policy: with the whole rate it loses in two
+million periods what it had (cost 0.60 instead of 0.42), with three tenths of it some."""
 
 
 def train(

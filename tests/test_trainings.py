@@ -54,7 +54,6 @@ def flown(one, vehicle, steps=50):
 
 
 def test_a_policy_on_its_own_model_is_the_same(tmp_path):
-    pytest.importorskip("stable_baselines3")
     from controllers import trainings
 
     again = trainings.transfer(policy.SHIPPED, LAMA, tmp_path)
