@@ -27,11 +27,11 @@ from coax_env.model.vehicle_file import load_vehicle, vehicle_toml
 from coax_env.report import figures
 from coax_env.report.page import Section, bullets, command, figure, page, prose, table
 from coax_env.simulation.simulate import simulate
-from controllers import lqr, pid, ppo
+from controllers import lqr, pid
 from controllers.comparison import TARGET_SENSORS
 from controllers.evaluation import evaluate
-from controllers.loading import Controller, load_controller
-from controllers.model_comparison import FIRST_TEST_SEED, MANEUVERS, MODELS
+from controllers.loading import Controller
+from controllers.model_comparison import FIRST_TEST_SEED, MANEUVERS, MODELS, train_policy
 
 EITHER_SIGN = (
     "thrust_scale", "torque_balance", "yaw_inertia", "swash_gain", "flybar_time_constant",
@@ -166,21 +166,21 @@ def _designs(
         "pid": lambda model, _: pid.design(model, bare, sensors),
     }
     if ppo_steps:
-        training = {"steps": ppo_steps, "nominal": bare, "sensors": sensors, **world}
-        found["ppo"] = lambda model, name: _policy(model, name, seed, out, training)
+        training = {"steps": ppo_steps, "sensors": sensors, **_learnt_in(world)}
+        found["ppo"] = lambda model, name: train_policy(
+            model,
+            bare,
+            out / "policies",
+            name if name == MODELS[0] else f"{name}_{seed}",
+            **training,
+        )
     return found
 
 
-def _policy(
-    model: Vehicle, name: str, seed: int, out: Path, training: Mapping[str, Any]
-) -> Controller:
-    """A policy trained on a model; the bare model's is shared."""
-    folder = out / "policies" / (name if name == MODELS[0] else f"{name}_{seed}")
-    path = folder / "policy.zip"
-    if not (folder / "done").exists():
-        path = ppo.train(model, folder, **training)
-        (folder / "done").touch()
-    return load_controller(path)
+def _learnt_in(world: Mapping[str, Any]) -> dict[str, Any]:
+    """Task and world as arguments of `trainings.train_best`."""
+    air = dict(world)
+    return {"task": air.pop("task", "hover"), "world": air}
 
 
 def fly_machines(
@@ -206,6 +206,12 @@ def result_path(out: Path, seed: int, truth: bool = False) -> Path:
         out: folder of all results. seed: the machine's. truth: whether its model was the truth.
     """
     return out / ("truth" if truth else "machines") / f"{seed:06d}.json"
+
+
+def stored_results(out: Path, seeds: Sequence[int], truth: bool = False) -> list[dict[str, Any]]:
+    """Those of these machines whose results lie there; arguments as of `result_path`."""
+    found = [_stored(result_path(out, seed, truth)) for seed in seeds]
+    return [one for one in found if one]
 
 
 def _stored(path: Path) -> dict[str, Any] | None:

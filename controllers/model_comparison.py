@@ -3,7 +3,8 @@
 A machine with hidden effects flies maneuvers; the flights are diagnosed; an LQG is designed and a
 policy trained on the bare model and on the corrected one; all fly the machine itself, from the same
 seeds. Designs differ in their model only: the same cost, integrals and disturbance estimator, and
-actions centred on the bare model's trim for all.
+actions centred on the bare model's trim for all. The policies begin from the same one, are trained for
+as long and chosen in simulation, each on its own model.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,7 +20,7 @@ from coax_env.report import ControllerScores, figures
 from coax_env.report.page import Section, bullets, command, figure, page, table
 from coax_env.report.plot_style import AFTER, BEFORE, Figure
 from coax_env.simulation.simulate import simulate
-from controllers import lqr, ppo
+from controllers import lqr, trainings
 from controllers.comparison import HEADER, ratio, score_words
 from controllers.design_report import step_response
 from controllers.evaluation import evaluate
@@ -43,6 +44,8 @@ MANEUVERS = (
 MODELS = ("bare", "corrected")
 COLOURS = (BEFORE, AFTER)
 ROW_HEADER = HEADER[1:]
+FIRST_TRAININGS = 3
+"""Of a policy on the bare model, the best of which every model's begins from."""
 FIRST_TEST_SEED = 1_000_000
 """Seeds of the flights that are scored begin so far above the one given: none was trained on."""
 
@@ -93,8 +96,9 @@ def compare_models(
         controllers[f"lqg {name}"] = lqr.design(model, bare)
         if ppo_steps:
             report_progress(f"training on the {name} model")
-            path = ppo.train(model, Path(out) / f"ppo_{name}", ppo_steps, seed, bare)
-            controllers[f"ppo {name}"] = load_controller(path)
+            controllers[f"ppo {name}"] = train_policy(
+                model, bare, Path(out) / "policies", name, seed, steps=ppo_steps
+            )
     scores = {}
     for name, controller in controllers.items():
         report_progress(f"evaluating {name}")
@@ -109,6 +113,29 @@ def compare_models(
         "cost_ratio": _cost_ratios(scores),
     }
     return content, result, controllers
+
+
+def train_policy(
+    model: Vehicle, bare: Vehicle, out: Path, name: str, seed: int = 0, **training: Any
+) -> Controller:
+    """The policy of one model, which begins as that of every other model of the machine does.
+
+    Both sides begin from the best of FIRST_TRAININGS on the bare model, and each keeps what is best on
+    its own model: see `trainings.train_best`, which does nothing again that lies there.
+
+    Args:
+        model: what it is for.
+        bare: the vehicle as given, whose trim centres the actions.
+        out: folder of the policies, those of all models.
+        name: of the model's folder in it.
+        seed: of the first training.
+        training: further arguments of `trainings.train_best`, the same for all models.
+    """
+    training["nominal"] = bare
+    seeds = range(seed, seed + FIRST_TRAININGS)
+    trainings.train_best(bare, out / "first", seeds, **training)
+    trainings.train_best(model, out / name, [], out / "first" / "policy.zip", **training)
+    return load_controller(out / name / "policy.zip")
 
 
 def _cost_ratios(scores: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:

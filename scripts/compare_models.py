@@ -10,7 +10,7 @@ import command_line
 from coax_env.errors import InputError
 from coax_env.files import make_folder, write_json, write_text
 from coax_env.model.vehicle_file import load_vehicle, vehicle_toml
-from controllers import machines, model_comparison
+from controllers import machines, model_comparison, removable
 
 
 def main() -> None:
@@ -78,6 +78,8 @@ def compare_machines(options: argparse.Namespace) -> None:
     )
     command_line.print_columns([machines.HEADER, *machines.rows(results)])
     print("\n".join(machines.in_words(machines.summary(results))))
+    truths = machines.stored_results(options.out, seeds, truth=True)
+    print("\n".join(removable.in_words([] if options.truth else results, truths)))
     print(page)
 
 

@@ -11,43 +11,41 @@ from tqdm import tqdm
 
 from coax_env.env.tasks import TASKS
 from coax_env.errors import InputError
-from coax_env.files import write_bytes, write_json
+from coax_env.files import write_json
 from coax_env.model.sensors import SUITES
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
-from controllers import ppo
-from controllers.evaluation import evaluate
-from controllers.policy import load_policy
-from controllers.target import TargetView
+from controllers import ppo, trainings
 
-FLIGHTS = 100
-SELECTION_SEED, TEST_SEED = 10_000, 20_000
-"""First seeds of the flights on which the best policy is selected, and on which it is then scored."""
+TEST_SEED = 20_000
+"""First seed of the flights on which the best policy is scored: it is selected on others."""
 
 
 def main() -> None:
     options = arguments()
-    if options.seeds < 1:
-        raise InputError(f"need at least one seed, found {options.seeds}")
+    if options.seeds < (0 if options.start else 1):
+        raise InputError(
+            f"need at least one seed, or a policy to start from; found {options.seeds}"
+        )
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # small nets: more threads only get in the way
 
     vehicle = load_vehicle(options.vehicle)
     training: dict[str, Any] = {
         "steps": round(options.steps), "nominal": options.nominal, "sensors": options.sensors,
         "resume": options.resume, "tensorboard": options.tensorboard,
-        "command_line": command_line.typed("train_ppo"),
-        "settings": dict(setting(text) for text in options.set),
+        "command_line": command_line.typed("train_ppo"), "task": options.task,
+        "settings": dict(setting(text) for text in options.set), "hidden": options.hidden,
     }  # fmt: skip
     world: dict[str, Any] = command_line.air(options)
     if options.randomize:
         world["randomize"] = options.randomize
-    training |= world | {"task": options.task, "hidden": options.hidden}
-    if options.seeds == 1:
-        path = train_one(vehicle, options, training)
-        score = score_of(path, vehicle, SELECTION_SEED + options.seed, options.task[0], world)
+    if options.seeds == 1 and not options.start:
+        path = train_one(vehicle, options, training | world)
+        first = trainings.SELECTION_SEED + options.seed
     else:
         path = train_several(vehicle, options, training, world)
-        score = score_of(path, vehicle, TEST_SEED + options.seed, options.task[0], world)
+        first = TEST_SEED + options.seed
+    score = trainings.score_of(path, vehicle, first, task=options.task, world=world)
     write_json(options.out / "score.json", score)
     print(in_words(score))
     print(f"policy {path}, score {options.out / 'score.json'}")
@@ -79,13 +77,19 @@ def arguments() -> argparse.Namespace:
         "--resume", metavar="PATH", help="policy.zip to go on from; it may run code: trust it"
     )
     parser.add_argument(
+        "--start", metavar="PATH",
+        help="policy.zip for another model: kept is the best, on this vehicle, of it as it is, on this "
+        "vehicle's filter and trim, trained from there, and --seeds from nothing (0: none)",
+    )  # fmt: skip
+    parser.add_argument(
         "--set", nargs="+", metavar="NAME=VALUE", default=[],
         help=f"hyperparameters, as JSON (default: {json.dumps(ppo.SETTINGS)})",
     )  # fmt: skip
     parser.add_argument("--tensorboard", metavar="DIR", help="write TensorBoard's logs there")
     parser.add_argument(
         "--seeds", type=int, default=1, metavar="N",
-        help="policies from seed, seed + 1, ...: DIR/seed_K each, the best in DIR (default: 1)",
+        help="policies from seed, seed + 1, ...: DIR/seed_K each, the best in DIR; what lies there is "
+        "not trained again (default: 1)",
     )  # fmt: skip
     command_line.add_workers(parser, "seeds", 1)
     return parser.parse_args()
@@ -116,45 +120,25 @@ def train_several(
     training: dict[str, Any],
     world: dict[str, Any],
 ) -> Path:
-    """DIR/seed_K/policy.zip and score.json of every seed, and a copy of the best in DIR.
+    """Every candidate's policy.zip and score.json in a folder of DIR, and a copy of the best in DIR.
 
     Args:
         vehicle: what flies.
         options: of the command line.
-        training: further arguments of `ppo.train_seeds`.
-        world: arguments of the env in which they are scored.
+        training: further arguments of `trainings.train_best`.
+        world: arguments of the env in which they learn and are scored.
     """
     seeds = range(options.seed, options.seed + options.seeds)
-    found: dict[int, tuple[Path, dict[str, Any]]] = {}
-    trained = ppo.train_seeds(
-        vehicle, options.out, seeds, options.jobs, options.backend, **training
-    )
-    for seed, path in tqdm(trained, total=len(seeds), unit="policy", disable=None):
-        first = SELECTION_SEED + options.seed
-        found[seed] = path, score_of(path, vehicle, first, options.task[0], world)
-        write_json(path.with_name("score.json"), found[seed][1])
-    for seed in seeds:
-        print(f"seed {seed}: {in_words(found[seed][1])}")
-    best = min(seeds, key=lambda s: (-found[s][1]["success_rate"], found[s][1]["mean_cost"]))
-    print(f"the best, seed {best}, on flights that it was not selected on:")
-    return write_bytes(options.out / "policy.zip", found[best][0].read_bytes())
-
-
-def score_of(
-    path: Path, vehicle: Vehicle, seed: int, task: str, world: dict[str, Any]
-) -> dict[str, Any]:
-    """The score of a policy.
-
-    Args:
-        path: of its policy.zip.
-        vehicle: what is flown.
-        seed: of the first flight.
-        task: that is flown, on the first suite that shows its target.
-        world: arguments of the env.
-    """
-    policy = load_policy(path)
-    suites = [s for s in policy.suites.sights if task == "hover" or TargetView(s).aims]
-    return evaluate(policy.on(suites[0]), vehicle, FLIGHTS, seed=seed, task=task, **world)
+    count = options.seeds + (3 if options.start else 0)
+    with tqdm(total=count, unit="policy", disable=None) as bar:
+        best, scores = trainings.train_best(
+            vehicle, options.out, seeds, options.start, options.jobs, options.backend,
+            done=lambda *_: bar.update(), world=world, **training,
+        )  # fmt: skip
+    for name, score in scores.items():
+        print(f"{name.replace('_', ' ')}: {in_words(score)}")
+    print(f"the best, {best.replace('_', ' ')}, on flights that it was not selected on:")
+    return options.out / "policy.zip"
 
 
 def in_words(score: dict[str, Any]) -> str:

@@ -822,6 +822,60 @@ def test_ratios_and_their_intervals_are_those_of_paired_flights():
     assert found["median_ratio"] == pytest.approx(ratio)
 
 
+def test_a_correction_is_judged_by_what_the_truth_removes():
+    from controllers import removable
+
+    noise = np.random.default_rng(0).uniform(0.3, 0.4, 40)
+
+    def scored(model, lost):
+        return {
+            "bare": {"flight_costs": (noise + 0.2).tolist()},
+            model: {"flight_costs": (noise + lost).tolist()},
+        }
+
+    truth, found = scored("corrected", 0.0), scored("corrected", 0.05)
+    floor = noise.mean() / (noise.mean() + 0.2)
+    assert removable.floor_share(truth) == pytest.approx(floor)
+    assert removable.share_removed(found, truth) == pytest.approx(0.75)
+    assert removable.share_removed(truth, truth) == pytest.approx(1.0)
+    shaken = {"corrected": {"flight_costs": (noise[::-1] + 0.2).tolist()}, "bare": truth["bare"]}
+    assert removable.shows(truth) and not removable.shows(shaken)
+    results, truths = (
+        [{"seed": seed, "scores": {"lqg": one}} for seed in (4, 5)] for one in (found, truth)
+    )
+    assert "removes 75 % in the median of the 2 machines" in removable.in_words(results, truths)[0]
+    assert removable.in_words([], truths) == [
+        f"LQG: with the truth {floor:.2f} of the bare cost stays in the median"
+    ]
+
+
+@pytest.mark.slow
+def test_policies_of_both_models_begin_alike_and_each_is_the_best_on_its_own(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    from controllers import machines, trainings
+
+    found = machines.fly_machine(16, LAMA, tmp_path, 2, ppo_steps=2048, truth=True)
+    assert set(found["scores"]["ppo"]) == {"bare", "corrected"}
+    policies = tmp_path / "policies"
+    first = (policies / "first" / "policy.zip").read_bytes()
+    assert sorted(one.name for one in (policies / "first").glob("seed_*")) == [
+        "seed_0", "seed_1", "seed_2",
+    ]  # fmt: skip
+    for side in ("bare", "corrected_16"):
+        assert (policies / side / "start" / "policy.zip").read_bytes() == first
+        scores = {
+            path.parent.name: json.loads(path.read_text())
+            for path in (policies / side).glob("*/score.json")
+        }
+        best = min(scores, key=lambda name: trainings.rank(scores[name]))
+        kept = (policies / side / "policy.zip").read_bytes()
+        assert kept == (policies / side / best / "policy.zip").read_bytes()
+    made = {path: path.stat().st_mtime_ns for path in policies.rglob("score.json")}
+    (tmp_path / "truth" / "000016.json").unlink()
+    assert machines.fly_machine(16, LAMA, tmp_path, 2, ppo_steps=2048, truth=True) == found
+    assert made == {path: path.stat().st_mtime_ns for path in policies.rglob("score.json")}
+
+
 def test_machines_are_flown_once(tmp_path):
     from controllers import machines
 

@@ -62,18 +62,21 @@ def test_drawn_vehicles_are_judged_alike_by_two_workers(backend):
 @pytest.mark.slow
 def test_seeds_trained_side_by_side_are_those_trained_alone(backend, tmp_path):
     pytest.importorskip("stable_baselines3")
-    from controllers import ppo
+    from controllers import ppo, trainings
 
     small = {"steps": 2048, "settings": {"n_envs": 16, "batch_size": 256}}
-    found = dict(ppo.train_seeds(LAMA, tmp_path, (3, 4), 2, backend, **small))
-    assert set(found) == {3, 4}
+    _, scores = trainings.train_best(
+        LAMA, tmp_path, (3, 4), jobs=2, backend=backend, flights=2, **small
+    )
+    assert set(scores) == {"seed_3", "seed_4"}
+    found = {seed: tmp_path / f"seed_{seed}" / "policy.zip" for seed in (3, 4)}
     for seed, path in found.items():
         alone = ppo.train(LAMA, tmp_path / f"alone_{seed}", seed=seed, **small)
         theirs, ours = policy.load_policy(path), policy.load_policy(alone)
         assert theirs.content["seed"] == seed
         for a, b in zip(theirs.network.layers, ours.network.layers, strict=True):
             assert (a[0] == b[0]).all() and (a[1] == b[1]).all()
-    assert (tmp_path / "seed_3" / "policy.zip").read_bytes() != found[4].read_bytes()
+    assert found[3].read_bytes() != found[4].read_bytes()
 
 
 @pytest.mark.slow
