@@ -160,3 +160,20 @@ def test_a_flight_without_two_seconds_in_a_piece_is_used_as_it_is():
     assert only.t[0] == 40.0 and only.name == "a" and only.beginning == 30.0
     assert found.counts["gaps at which a run is cut"] == 4
     assert found.counts["parts of less than 2 s left out"] == 4
+
+
+def test_a_long_run_is_flown_in_equal_parts():
+    """One after the other they are the run; 299 s are left whole."""
+    t = 30.0 + 0.05 * np.arange(14401)
+    whole = run(t=t)
+    found = flown_parts(Flight("lama400d", (whole,)), FREE)
+    assert [part.name for part in found.runs] == ["a", "a (2)", "a (3)"]
+    assert {part.whole for part in found.runs} == {"a"}
+    assert {part.beginning for part in found.runs} == {30.0}
+    assert np.array_equal(np.concatenate([part.t for part in found.runs]), t)
+    assert np.array_equal(np.concatenate([part.command for part in found.runs]), whole.command)
+    lasted = [part.t[-1] - part.t[0] for part in found.runs]
+    assert lasted == pytest.approx([240.0] * 3, abs=0.1)
+    assert found.notes == ("a: flown in 3 parts of 240 s",)
+    short = Flight("lama400d", (run(t=t[:5981]),))
+    assert flown_parts(short, FREE) is short

@@ -4,6 +4,7 @@
   where a command jumped in a gap of some rows: nobody knows when.
 - Commands that freeze, where they otherwise change all the time: the machine obeys others, or none.
 - Rotors that carry less than half the weight: it stands on the ground, or is carried.
+- What lasts long is flown in equal parts, so that an hour takes the memory of some minutes.
 
 A part keeps its run's name, from the second on with a number. All that fits or flies again (diagnosis,
 identification, replay, check) asks for the parts here, since only a vehicle says what carries it.
@@ -40,6 +41,9 @@ whatever made the machine answer sooner, on a clean synthetic flight by telemetr
 """
 SHORTEST_PART = 2.0
 """A part that is shorter [s] is left out: the filter needs the first second to settle; ours."""
+LONGEST_PART = 300.0
+"""[s] from which on a stretch is flown in equal parts. What a pass holds of each row, 3.5 kB and in the
+search for what begins up to 2 kB for each effect asked, it then holds for one of them; ours."""
 
 FROZEN = 1.0
 """Time [s] through which all four commands stay the same to the last digit..."""
@@ -106,7 +110,7 @@ def _parts(
                 f"{run.name}: cut at a gap of {step[row - 1]:.2f} s, {run.t[row]:.1f} s{why}"
             )
             counts["gaps at which a run is cut"] += 1
-    if not (gap.any() or left_out.any()):
+    if not (gap.any() or left_out.any() or _equal_parts(run.t) > 1):
         return [run]
     pieces = np.cumsum(gap | np.diff(left_out, prepend=left_out[:1]))
     kept = []
@@ -119,11 +123,20 @@ def _parts(
                 f" than {SHORTEST_PART:g} s"
             )
         else:
-            kept.append(rows)
+            count = _equal_parts(run.t[rows])
+            if count > 1:
+                lasts = run.t[rows[-1]] - run.t[rows[0]]
+                notes.append(f"{run.name}: flown in {count} parts of {lasts / count:.0f} s")
+            kept += np.array_split(rows, count)
     names = [run.name]
     while len(names) < len(kept):
         names.append(_free_name(run.name, taken))
     return [_part(run, rows, name) for rows, name in zip(kept, names, strict=False)]
+
+
+def _equal_parts(t: np.ndarray) -> int:
+    """In how many a stretch with rows at these times is flown."""
+    return max(math.ceil((t[-1] - t[0]) / LONGEST_PART), 1)
 
 
 def _free_name(name: str, taken: set[str]) -> str:
