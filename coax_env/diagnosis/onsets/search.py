@@ -98,7 +98,8 @@ def _beside_commands(steady: Changing, near: Sequence[Scored]) -> list[Scored]:
 
     A pilot who flies gusts out looks like a servo that gets late (input_innovations.py).
     """
-    wider, fit = with_command_gains(steady.problem, steady.fit, coloured=True)
+    asked = steady.problem.of_candidates({*steady.fit.active, *(s.effect for s in near)})
+    wider, fit = with_command_gains(asked, steady.fit, coloured=True)
     if not has_command_gains(wider):
         return list(near)
     _, again = scored(replace(steady, problem=wider, fit=fit))
