@@ -1000,7 +1000,9 @@ def test_what_commands_explain_is_not_worth_a_fit(monkeypatch, gains):
     monkeypatch.setattr(search, "linearise", lambda p, fit: (fit, [], None))
     monkeypatch.setattr(search, "scored", lambda state: (state, with_gains))
     fit = Fit((), {}, NOISE_OF_ALL)
-    steady = Changing(SimpleNamespace(settings=SETTINGS), fit, None, {})  # type: ignore[arg-type]
+    problem = SimpleNamespace(settings=SETTINGS)
+    problem.of_candidates = lambda names: problem
+    steady = Changing(problem, fit, None, {})  # type: ignore[arg-type]
     kept = search._beside_commands(steady, found)
     assert kept == (found[1:] if gains else found)
 

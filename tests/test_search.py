@@ -112,6 +112,21 @@ def test_what_has_evidence_is_added(moves, nats, added):
     assert (fit.active == ("wind",)) == added and fit.strongest == (nats, "wind")
 
 
+@pytest.mark.parametrize(
+    ("names", "order"),
+    [
+        (["wind", "servo_delay", "accel_bias", "servo_lag"],
+         ["wind", "servo_lag", "servo_delay", "accel_bias"]),
+        (["servo_lag", "wind", "servo_delay"], ["servo_lag", "wind", "servo_delay"]),
+        (["servo_delay", "wind"], ["servo_delay", "wind"]),
+        ([], []),
+    ],
+)  # fmt: skip
+def test_a_servos_lag_is_tried_before_its_delay(names, order):
+    strong = [SimpleNamespace(effect=name) for name in names]
+    assert [c.effect for c in module._lag_first(strong)] == order  # type: ignore[arg-type]
+
+
 def test_what_was_dropped_is_not_added_at_once_again(moves):
     """But once another has been added and has held."""
     given, done = moves

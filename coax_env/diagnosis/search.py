@@ -38,7 +38,7 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
         step_gain = -quadratic.best(near.free_names(fit.active))[0]
         candidates = scores(near, fit, quadratic, memory.banned)
         fit = _noting_strongest(fit, ((c.evidence, c.effect) for c in candidates))
-        strong = [c for c in candidates if c.evidence > chosen.evidence]
+        strong = _lag_first([c for c in candidates if c.evidence > chosen.evidence])
         clear = strong and strong[0].nats > chosen.add_before_fitted * step_gain
         converged = step_gain <= chosen.step_gain or just_fitted
         if not converged and (complete or not clear):
@@ -70,6 +70,21 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
         fit = noise_fitted(problem, moved)
     fit, _, quadratic = linearise(problem, fit)
     return fit, quadratic
+
+
+def _lag_first(strong: Sequence[Score]) -> list[Score]:
+    """The best first, but a servo's delay behind its lag: it has to explain more by more than a tie.
+
+    Every servo lags; that its command is late as well, beside what delays all commands, is the more to
+    be shown.
+    """
+    names = [c.effect for c in strong]
+    if "servo_lag" not in names or "servo_delay" not in names:
+        return list(strong)
+    lag = strong[names.index("servo_lag")]
+    rest = [c for c in strong if c is not lag]
+    rest.insert(min(names.index("servo_lag"), names.index("servo_delay")), lag)
+    return rest
 
 
 def _nearest(problem: Problem, fit: Fit, quadratic: Quadratic, kept: Collection[str]) -> Problem:

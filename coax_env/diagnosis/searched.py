@@ -12,18 +12,20 @@ And where innovations that rotors' jitter would colour stay so, it is done again
 filter (estimation/rotor_jitter.py), if its levels are worth more than a tie: after a search, since a
 motor's lag colours them too and must be found as what it is.
 
-Commands that were found to be late are read as late as that from then on (estimation/helicopter.py),
-where that is likelier, and the search goes on.
+And where commands are late, by a delay of the readings' own (estimation/helicopter.py), if that is
+likelier: what was found beside a delay that is off by a part of a row may stand for that part.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.shocks import in_shocks, with_shocks
+from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import pooled_rms, replay_runs
@@ -36,6 +38,8 @@ COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
 SHOWN_BY = ("rpm_upper", "rpm_lower", "r")
 """Channels that a rotor's jitter colours."""
+READ_WITHIN = 0.02
+"""Of a row, to which the delay of the commands that readings see is looked for; ours."""
 FINER = 2.0
 """Times finer than LEAST_READING_STD that a channel must be for a second search; ours."""
 
@@ -123,20 +127,29 @@ def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
         fit, quadratic = search(problem, steady)
     late = _with_late_readings(problem, fit)
     if late is not None:
-        problem, fit = late
-        problem.report("searching on with readings of the commands in force")
-        fit, quadratic = search(problem, fit)
+        problem.report("searching again with readings that see late commands at their own delay")
+        return _searched(late, noise, coarse)
     return Searched(problem, bare, refitted, fit, quadratic, coarse)
 
 
-def _with_late_readings(problem: Problem, fit: Fit) -> tuple[Problem, Fit] | None:
-    """The problem whose readings see late commands at the delay of a fit, where that is likelier."""
+def _with_late_readings(problem: Problem, fit: Fit) -> Problem | None:
+    """The problem whose readings see late commands at their own delay, where that is likelier."""
     delay = fit.values.get("command_delay.time", 0.0)
     if delay <= 0.0 or problem.model.read_delay is not None:
         return None
-    late = problem.with_model(problem.model.reading_after(delay))
+
+    def read_after(seconds: float) -> Problem:
+        return problem.with_model(problem.model.reading_after(seconds))
+
+    row = median_step(problem.engine.records)
+    best = minimize_scalar(
+        lambda seconds: -read_after(seconds).engine.log_likelihood(fit.values, fit.noise),
+        bounds=(max(delay - row, 0.0), delay + row), method="bounded",
+        options={"xatol": READ_WITHIN * row},
+    )  # fmt: skip
+    late = read_after(float(best.x))
     trial = fitted(late, noise_fitted(late, fitted(late, fit)))
-    return (late, trial) if trial.objective < fit.objective - problem.settings.tie else None
+    return late if trial.objective < fit.objective - problem.settings.tie else None
 
 
 def _with_jitter(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] | None:

@@ -315,10 +315,8 @@ class HeliModel:
 
     def _read(self, t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
         """A late command (n,) as readings at the rows' times `t` see it."""
-        if self.read_delay is None:
-            return _delayed_mean(t, command, _to_the_middle(t, delay))
-        rows = np.searchsorted(t, t - self.read_delay, side="right") - 1
-        return command[np.maximum(rows, 0)]
+        held = delay if self.read_delay is None else self.read_delay
+        return _delayed_mean(t, command, _to_the_middle(t, held))
 
     def reading_after(self, delay: float) -> "HeliModel":
         """The same, whose readings see commands this much later [s], once any delay is there."""
