@@ -18,15 +18,20 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from coax_env.estimation import helicopter
-from coax_env.estimation.helicopter import MEASURE, READ, STEP, HeliModel, Moment, Motion
+from coax_env.estimation.helicopter import (
+    MEASURE,
+    STEP,
+    HeliModel,
+    Moment,
+    Motion,
+    side_by_side,
+)
 from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
 from coax_env.kernel.simd import SIMD_WIDTH, select, simd_view
 from coax_env.kernel.variants import under_names
 from coax_env.model import effects
-from coax_env.model.layout import N_FULL
 
 BEFORE = "before"
 """The part of the flight before an effect's moment, as in ``swash_offset.lon@before``."""
@@ -39,9 +44,9 @@ MOVED = 5.0
 to none beside what is to be told; where it grows for longer, that length, or slow growth would stay
 where its fit begins. Its slope is taken over a fiftieth of it; ours."""
 
-_step_of: Any = None  # the model's own, put in by `_pointers`
-_measure_of: Any = None
-_drift_of: Any = None
+step_of: Any = None  # the model's own, put in by `_pointers` and `side_by_side`
+measure_of: Any = None
+drift_of: Any = None
 
 
 @compiled(inline="always")
@@ -60,15 +65,15 @@ def _own(u: Any, p: Any, work: Any) -> Any:
 
 
 def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    _step_of(x, u[: u.size - 1], dt, _own(u, p, work), work, out)
+    step_of(x, u[: u.size - 1], dt, _own(u, p, work), work, out)
 
 
 def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
-    _measure_of(x, u[: u.size - 1], _own(u, p, work), work, out)
+    measure_of(x, u[: u.size - 1], _own(u, p, work), work, out)
 
 
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    _drift_of(x, u[: u.size - 1], dt, _own(u, p, work), work, out)
+    drift_of(x, u[: u.size - 1], dt, _own(u, p, work), work, out)
 
 
 @cache
@@ -83,9 +88,9 @@ def _pointers(motion: Motion, name: str) -> tuple[Any, Any, Any]:
     )
     kind = f"changing_{name}"
     return (
-        pointer(STEP)(under_names(_step, {"_step_of": step}, kind)),
-        pointer(MEASURE)(under_names(_measure, {"_measure_of": measure}, kind)),
-        pointer(STEP)(under_names(_drift_and_readings, {"_drift_of": drift}, kind)),
+        pointer(STEP)(under_names(_step, {"step_of": step}, kind)),
+        pointer(MEASURE)(under_names(_measure, {"measure_of": measure}, kind)),
+        pointer(STEP)(under_names(_drift_and_readings, {"drift_of": drift}, kind)),
     )
 
 
@@ -127,41 +132,24 @@ def _own_of_lanes(u: Any, p: Any, work: Any) -> Any:
 
 
 def _step_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """As `helicopter._step_of_lanes`, with the row's parameters."""
-    u_, p_, out_ = simd_view(u)[: u.shape[0] - 1], _own_of_lanes(u, p, work), simd_view(out)
-    _start_of_step(simd_view(x), u_, p_, out_)
-    _step_of_registers(out_, u_, dt, p_, simd_view(work), out_)
+    """`_step` of SIMD_WIDTH states, inputs and vehicles, a column each."""
+    u_, p_ = simd_view(u)[: u.shape[0] - 1], _own_of_lanes(u, p, work)
+    step_of(simd_view(x), u_, dt, p_, simd_view(work), simd_view(out))
 
 
 def _measure_of_lanes(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     """`_measure` of as many."""
     u_, p_ = simd_view(u)[: u.shape[0] - 1], _own_of_lanes(u, p, work)
-    _measure_of_registers(simd_view(x), u_[READ], p_, simd_view(work), simd_view(out))
+    measure_of(simd_view(x), u_, p_, simd_view(work), simd_view(out))
 
 
 def _drift_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """`_drift_and_readings` of as many."""
-    u_, p_, out_ = simd_view(u)[: u.shape[0] - 1], _own_of_lanes(u, p, work), simd_view(out)
-    _drift_of_registers(simd_view(x), u_, dt, p_, simd_view(work), out_)
-    if _lanes_read_another(u):
-        _measure_of_registers(simd_view(x), u_[READ], p_, simd_view(work), out_[N_FULL:])
-    _take_in_innovations(u_, p_, out_)
+    u_, p_ = simd_view(u)[: u.shape[0] - 1], _own_of_lanes(u, p, work)
+    drift_of(simd_view(x), u_, dt, p_, simd_view(work), simd_view(out))
 
 
-_step_of_registers: Any = None  # put in by `_side_by_side`, as in helicopter.py
-_measure_of_registers: Any = None
-_drift_of_registers: Any = None
-_take_in_innovations = helicopter._take_in_innovations
-_start_of_step = helicopter._start_of_step
-_lanes_read_another = helicopter._lanes_read_another
-
-
-@cache
-def _side_by_side() -> Any:
-    """Pointers to the three; None where the helicopter has none."""
-    return helicopter.lanes_of_registers(
-        Motion(_step_of_lanes, _measure_of_lanes, _drift_of_lanes), "changing"
-    )
+OF_LANES = Motion(_step_of_lanes, _measure_of_lanes, _drift_of_lanes)
 
 
 class Timed(Protocol):
@@ -239,8 +227,10 @@ class ChangingModel(HeliModel):
 
     @property
     def side_by_side(self) -> Any:
-        """The helicopter's own, block by block; None where the model has none."""
-        return None if self.base.side_by_side is None else _side_by_side()
+        """The base's own, block by block; None where it has none."""
+        if self.base.side_by_side is None:
+            return None
+        return side_by_side(self.base.motion, f"changing_{type(self.base).__name__}", OF_LANES)
 
     def time(self, moment: Moment) -> float:
         """A moment on the clock [s]."""

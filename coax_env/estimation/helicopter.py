@@ -25,7 +25,7 @@ from coax_env.estimation import helicopter_noise
 from coax_env.estimation.kalman import LANES_MEASURE, LANES_STEP
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
-from coax_env.kernel.simd import SIMD_WIDTH, simd_view
+from coax_env.kernel.simd import any_lane, simd_view
 from coax_env.kernel.variants import under_names
 from coax_env.logs.flight import Run
 from coax_env.logs.held_signal import integral_of_held
@@ -99,18 +99,9 @@ def _take_in_innovations(u: Any, p: Any, x: Any) -> None:
 
 @compiled()
 def _reads_another(u: Any) -> bool:
-    """Whether the readings see another input than the step."""
+    """Whether the readings see another input than the step, of registers in any lane."""
     for i in range(N_INPUTS):  # noqa: SIM110, numba has no any()
-        if u[i] != u[N_INPUTS + i]:
-            return True
-    return False
-
-
-@compiled()
-def _lanes_read_another(u: Any) -> bool:
-    """Whether they do in any lane of an input (nu, SIMD_WIDTH)."""
-    for lane in range(SIMD_WIDTH):  # noqa: SIM110
-        if _reads_another(u[:, lane]):
+        if any_lane(u[i] != u[N_INPUTS + i]):
             return True
     return False
 
@@ -123,22 +114,29 @@ def _start_of_step(x: Any, u: Any, p: Any, out: Any) -> None:
     _take_in_innovations(u, p, out)
 
 
+kernel_step, kernel_measure, kernel_drift = (
+    dynamics.step,
+    dynamics.measure,
+    dynamics.drift_and_readings,
+)  # `side_by_side` puts those of registers in their places
+
+
 def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """`dynamics.step` after the input innovations are taken in, in the engine's form."""
+    """The kernel's step after the input innovations are taken in, in the engine's form."""
     _start_of_step(x, u, p, out)
-    dynamics.step(out, u, dt, p, work, out)
+    kernel_step(out, u, dt, p, work, out)
 
 
 def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
-    """`dynamics.measure`, in the form in which the engine takes a model."""
-    dynamics.measure(x, u[READ], p, work, out)
+    """The kernel's readings, in the form in which the engine takes a model."""
+    kernel_measure(x, u[READ], p, work, out)
 
 
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """`dynamics.drift_and_readings` and the input innovations, in the engine's form."""
-    dynamics.drift_and_readings(x, u, dt, p, work, out)
+    """The kernel's drift and readings with the input innovations, in the engine's form."""
+    kernel_drift(x, u, dt, p, work, out)
     if _reads_another(u):
-        dynamics.measure(x, u[READ], p, work, out[N_FULL:])
+        kernel_measure(x, u[READ], p, work, out[N_FULL:])
     _take_in_innovations(u, p, out)
 
 
@@ -167,65 +165,58 @@ class Moment:
     grows: float = 0.0
 
 
-_step_of_registers: Any = None  # what stands for them is compiled when it is first needed
-_measure_of_registers: Any = None
-_drift_of_registers: Any = None
+step_of: Any = None  # a model's own, put in by `side_by_side`
+measure_of: Any = None
+drift_of: Any = None
 
 
 def _step_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """`_step` of SIMD_WIDTH states, inputs and vehicles, a column each."""
-    u_, p_, out_ = simd_view(u), simd_view(p), simd_view(out)
-    _start_of_step(simd_view(x), u_, p_, out_)
-    _step_of_registers(out_, u_, dt, p_, simd_view(work), out_)
-
-
-def _drift_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """`_drift_and_readings` of as many."""
-    u_, p_, out_ = simd_view(u), simd_view(p), simd_view(out)
-    _drift_of_registers(simd_view(x), u_, dt, p_, simd_view(work), out_)
-    if _lanes_read_another(u):
-        _measure_of_registers(simd_view(x), u_[READ], p_, simd_view(work), out_[N_FULL:])
-    _take_in_innovations(u_, p_, out_)
+    """A step of SIMD_WIDTH states, inputs and vehicles, a column each."""
+    step_of(simd_view(x), simd_view(u), dt, simd_view(p), simd_view(work), simd_view(out))
 
 
 def _measure_of_lanes(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
-    """`_measure` of as many."""
-    _measure_of_registers(
-        simd_view(x), simd_view(u)[READ], simd_view(p), simd_view(work), simd_view(out)
-    )
+    """Readings of as many."""
+    measure_of(simd_view(x), simd_view(u), simd_view(p), simd_view(work), simd_view(out))
 
 
-def lanes_of_registers(motion: Motion, kind: str) -> Any:
-    """Pointers to a motion that calls `_step_of_registers` and its like.
+def _drift_of_lanes(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """Drift and readings of as many."""
+    drift_of(simd_view(x), simd_view(u), dt, simd_view(p), simd_view(work), simd_view(out))
+
+
+OF_LANES = Motion(_step_of_lanes, _measure_of_lanes, _drift_of_lanes)
+
+
+@cache
+def side_by_side(motion: Motion, kind: str, of_lanes: Motion = OF_LANES) -> Any:
+    """Pointers to `step`, `measure` and `drift_and_readings` of SIMD_WIDTH at once.
 
     Args:
-        motion: not compiled. kind: what tells it from others.
+        motion: a model's, not compiled, which calls the kernel as `kernel_step` and its like.
+        kind: what tells it from others.
+        of_lanes: what calls it as `step_of` and its like.
 
     Returns:
         the three; None where a user's effect does not compile for registers.
     """
-    step, measure, drift = dynamics.motion_of_registers()
-    names = {
-        "_step_of_registers": step,
-        "_measure_of_registers": measure,
-        "_drift_of_registers": drift,
-    }
-    signatures = (LANES_STEP, LANES_MEASURE, LANES_STEP)
-    try:
-        return tuple(
-            pointer(signature.signature)(under_names(function, names, kind))
-            for signature, function in zip(signatures, motion, strict=True)
+    kernel = dict(
+        zip(
+            ("kernel_step", "kernel_measure", "kernel_drift"),
+            dynamics.motion_of_registers(),
+            strict=True,
         )
+    )
+    signatures = (LANES_STEP, LANES_MEASURE, LANES_STEP)
+    names = ("step_of", "measure_of", "drift_of")
+    found = []
+    try:
+        for own, outer, name, signature in zip(motion, of_lanes, names, signatures, strict=True):
+            inner = compiled()(under_names(own, kernel, f"of_registers_{kind}"))
+            found.append(pointer(signature.signature)(under_names(outer, {name: inner}, kind)))
     except numba.core.errors.NumbaError:
         return None
-
-
-@cache
-def _side_by_side() -> Any:
-    """Pointers to the helicopter's own three."""
-    return lanes_of_registers(
-        Motion(_step_of_lanes, _measure_of_lanes, _drift_of_lanes), "all_effects"
-    )
+    return tuple(found)
 
 
 def _small_changes() -> np.ndarray:
@@ -259,13 +250,8 @@ class HeliModel:
 
     @property
     def side_by_side(self) -> Any:
-        """`step`, `measure` and `drift_and_readings` of SIMD_WIDTH at once, or None.
-
-        They are the helicopter's own: a model that moves in another way has none of them, unless it
-        says which.
-        """
-        own = self.drift_and_readings is HeliModel.drift_and_readings
-        return _side_by_side() if own else None
+        """`step`, `measure` and `drift_and_readings` of SIMD_WIDTH at once, or None."""
+        return side_by_side(self.motion, type(self).__name__)
 
     def __init__(self, vehicle: Vehicle, held: Mapping[str, float] | None = None) -> None:
         """Of a vehicle; ``held``: values that effects which it does not have would take as stated."""

@@ -23,6 +23,9 @@ from coax_env.estimation.helicopter import (
     Motion,
     _reads_another,
     _take_in_innovations,
+    kernel_drift,
+    kernel_measure,
+    kernel_step,
 )
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
@@ -95,31 +98,31 @@ def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     _take_in_innovations(u, p, out)
     taken = _shaken(out, u, p, work)
     state = work[_STATE:_INPUT]
-    dynamics.step(state, work[_INPUT:_OUT], dt, p, work, state)
+    kernel_step(state, work[_INPUT:_OUT], dt, p, work, state)
     for i in range(N_FULL):
         out[i] = state[i]
     out[S.R] -= taken
     left = math.exp(-dt / p[p.size + _MEMORY])
     for i in range(N_FULL, N_JITTERY):
-        out[i] = left * x[i]
+        out[i] *= left
 
 
 def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
     """The helicopter's readings."""
     _shaken(x, u[READ], p, work)
-    dynamics.measure(work[_STATE:_INPUT], work[_INPUT:_OUT], p, work, out)
+    kernel_measure(work[_STATE:_INPUT], work[_INPUT:_OUT], p, work, out)
 
 
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """The helicopter's; jitter fades exactly."""
     own = work[_OUT:_WORK_SIZE]
     _shaken(x, u, p, work)
-    dynamics.drift_and_readings(work[_STATE:_INPUT], work[_INPUT:_OUT], dt, p, work, own)
+    kernel_drift(work[_STATE:_INPUT], work[_INPUT:_OUT], dt, p, work, own)
     if _reads_another(u):
         _shaken(x, u[READ], p, work)
-        dynamics.measure(work[_STATE:_INPUT], work[_INPUT:_OUT], p, work, own[N_FULL:])
+        kernel_measure(work[_STATE:_INPUT], work[_INPUT:_OUT], p, work, own[N_FULL:])
     _take_in_innovations(u, p, own)
-    faded = math.expm1(-dt / p[p.size + _MEMORY])
+    faded = math.exp(-dt / p[p.size + _MEMORY]) - 1.0
     for i in range(N_FULL):
         out[i] = own[i]
     for i in range(N_FULL, N_JITTERY):
