@@ -14,7 +14,14 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-from coax_env.diagnosis.fits import fitted, linearise, noise_fitted, stepped, with_latent_noise
+from coax_env.diagnosis.fits import (
+    fitted,
+    linearise,
+    noise_fitted,
+    steadied,
+    stepped,
+    with_latent_noise,
+)
 from coax_env.diagnosis.moves import Proposal, accepted, add, drop, swaps, trials
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import Score, most_gains, scores
@@ -58,6 +65,7 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
             near, just_fitted = problem, converged
             continue
         if not complete:
+            moved = moved or _steadier(problem, fit, memory)
             moved = moved or _swap(problem, fit, quadratic, memory)
             moved = moved or _trial(problem, fit, quadratic, candidates, memory)
             moved = moved or with_latent_noise(problem, fit)
@@ -105,12 +113,14 @@ class _Memory:
     """What one search must not do again.
 
     banned: effects dropped since an addition last held. tried: sets of effects that were fitted.
+    steadied: sets of effects beside which steadier noise was asked for.
     drops: how often each effect was dropped. failures: additions in a row that did not hold.
     most: effects that were active together and held.
     """
 
     banned: set[str] = field(default_factory=set)
     tried: set[tuple[str, ...]] = field(default_factory=set)
+    steadied: set[tuple[str, ...]] = field(default_factory=set)
     drops: Counter[str] = field(default_factory=Counter)
     failures: int = 0
     most: int = 0
@@ -141,6 +151,18 @@ def _forward(
         memory.most, memory.failures = len(moved.active) - 1, 0
         memory.banned = {e for e, count in memory.drops.items() if count > 1}
     return moved
+
+
+def _steadier(problem: Problem, fit: Fit, memory: _Memory) -> Fit | None:
+    """With steadier noise, if that is likelier: what it had taken up may have a name by now."""
+    if fit.active in memory.steadied:
+        return None
+    memory.steadied.add(fit.active)
+    steady = steadied(problem, fit)
+    if steady.objective >= fit.objective - problem.settings.tie:
+        return None
+    problem.report("searching on from steadier noise")
+    return steady
 
 
 def _swap(problem: Problem, fit: Fit, quadratic: Quadratic, memory: _Memory) -> Fit | None:

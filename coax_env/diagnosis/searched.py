@@ -121,14 +121,11 @@ def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
     refitted = steadied(problem, noise_fitted(problem, fitted(problem, bare)))
     problem.report("searching for causes")
     fit, quadratic = search(problem, refitted)
-    steady = steadied(problem, fit)  # the noise had taken up what now has a name
-    if steady.objective < fit.objective - problem.settings.tie:
-        problem.report("searching on from steadier noise")
-        fit, quadratic = search(problem, steady)
     late = _with_late_readings(problem, fit)
     if late is not None:
+        problem = late  # without a delay it is as it was: `refitted` stays
         problem.report("searching again with readings that see late commands at their own delay")
-        return _searched(late, noise, coarse)
+        fit, quadratic = search(problem, refitted)
     return Searched(problem, bare, refitted, fit, quadratic, coarse)
 
 
