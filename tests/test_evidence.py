@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from study import arms, one_flight
 
@@ -49,7 +50,7 @@ class Flights:
         return replace(fit, active=fit.rest(effect))
 
     def pruned(
-        self, monkeypatch: pytest.MonkeyPatch, noise: Noise
+        self, monkeypatch: pytest.MonkeyPatch, noise: Noise, row: float = 0.01
     ) -> tuple[Fit, dict[str, evidence.Evidence]]:
         def loss(problem, quadratic, active, effect, inflation):
             return self.worth[effect] / inflation
@@ -66,9 +67,25 @@ class Flights:
             monkeypatch.setattr(evidence, name, stand_in)
         model = SimpleNamespace(moments={}, bare_values={})
         own: dict[str, tuple[()]] = dict.fromkeys(self.worth, ())
-        problem = Problem(model, SimpleNamespace(threads=1), (), own)  # type: ignore[arg-type]
+        engine = SimpleNamespace(threads=1, records=[SimpleNamespace(t=row * np.arange(9))])
+        problem = Problem(model, engine, (), own)  # type: ignore[arg-type]
         fit, _, found = prune(problem, Fit(tuple(self.worth), {}, noise))
         return fit, found
+
+
+@pytest.mark.parametrize(
+    ("row", "stay"),
+    [(0.01, {"motor_droop", "gyro_bias", "rate_damping"}), (0.04, {"gyro_bias", "rate_damping"})],
+)
+def test_between_slow_rows_a_weak_or_late_answer_must_be_worth_more(monkeypatch, row, stay):
+    """Three times as much: a pilot who answers gusts between them makes a machine look so."""
+    worth = {"motor_droop": 2.9, "gyro_bias": 2.9, "rate_damping": 3.1}
+    flights = Flights({effect: times * THRESHOLD for effect, times in worth.items()})
+    fit, found = flights.pruned(monkeypatch, GOOD, row)
+    assert set(fit.active) == set(found) == stay
+    assert found["gyro_bias"].nats == pytest.approx(2.9 * THRESHOLD)
+    share = 1.0 if row < 0.02 else 3.0
+    assert found["rate_damping"].nats == pytest.approx(3.1 * THRESHOLD / share)
 
 
 def test_what_is_worth_less_than_the_threshold_leaves_the_weakest_first(monkeypatch):

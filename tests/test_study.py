@@ -722,6 +722,17 @@ def test_expected_evidence_grows_with_the_square_of_the_size(damped: tuple) -> N
     assert (two - none) / (one - none) == pytest.approx(4.0, rel=0.15)
 
 
+def test_a_deadband_is_expected_to_be_worth_what_the_play_that_names_it_is(damped: tuple) -> None:
+    """By its own jumps it was expected to be worth 8,500 nats on a flight, and was called missed."""
+    planned, folder, _ = damped
+    flight = read_flight(folder)
+    dead, play = (
+        expected_evidence(planned, flight, {"hidden": [e], "values": {f"{e}.width": 0.02}}, ())[e]
+        for e in ("servo_deadband", "servo_play")
+    )
+    assert dead == play != 0.0
+
+
 @pytest.mark.slow
 def test_expected_evidence_is_what_the_likelihood_has_in_gusts(tmp_path: Path) -> None:
     """Of a damping, most of which a filter with its gains held would promise is not there."""

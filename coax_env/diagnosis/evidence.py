@@ -6,6 +6,9 @@ late servo. With it, a damping: the gains are constant and the filter's covarian
 so that readings correct once more what the commands have corrected, and a rate that is damped takes
 half of it back. `rate_damping` was worth 44 and 50 nats so on clean synthetic flights by telemetry
 where, alone, it was worth less than nothing.
+
+Neither likelihood knows what the commands did between rows that are far apart. What looks like a weak
+or late answer must be worth several times as much there (`Settings.slow_inflation`).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -13,7 +16,7 @@ from dataclasses import dataclass, replace
 
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_at, without
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
-from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, loss
 from coax_env.estimation.quadratic import Quadratic
@@ -29,7 +32,7 @@ class Evidence:
 
     @property
     def nats(self) -> float:
-        """What coloured innovations leave of what is lost."""
+        """What coloured innovations and slow rows leave of what is lost."""
         return self.lost / self.inflation
 
 
@@ -55,7 +58,7 @@ def weigh(
 
     def one(effect: str) -> Removal:
         held = tuple(problem.file_values(effect))
-        factor = inflation(problem, quadratic, fit.active, effect)
+        factor = _inflation(problem, fit, quadratic, effect)
         rest = noise_fitted(problem, without(problem, fit, quadratic, effect))
         rest = fitted(problem, rest, steps=1, held=held)
         if rest.objective - fit.objective < chosen.clear_evidence * chosen.evidence * factor:
@@ -140,9 +143,16 @@ def _only(problem: Problem, fit: Fit, causes: Collection[str]) -> Fit:
     return fit
 
 
+def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:
+    """What coloured innovations, and commands that change unseen, make of a cause's variance."""
+    unseen = problem.has_slow_rows and effect in WEAK_OR_LATE
+    colour = inflation(problem, quadratic, fit.active, effect)
+    return colour * problem.settings.slow_inflation if unseen else colour
+
+
 def _is_doubtful(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:
     """Whether a cause is not worth several thresholds by the quadratic."""
-    factor = inflation(problem, quadratic, fit.active, effect)
+    factor = _inflation(problem, fit, quadratic, effect)
     worth = loss(problem, quadratic, fit.active, effect, factor)
     return worth < problem.settings.clear_evidence * problem.settings.evidence
 

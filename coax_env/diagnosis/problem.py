@@ -8,10 +8,12 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TypeVar
 
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.estimation.engine import Engine
+from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import GUST_LEVELS
 from coax_env.estimation.parted_engine import AT
@@ -31,6 +33,14 @@ EXCLUSIVE = (
 """Effects of which one at most is named, and the others always tried in its place: a real servo is a
 mixture of both; the same rotors slow down; on a log of poses alone the others are one column, and far
 from each other."""
+
+WEAK_OR_LATE = frozenset({
+    "motor_lag", "motor_droop", "servo_lag", "servo_delay", "servo_play", "servo_deadband",
+    "servo_rate", "command_delay", "dynamic_inflow", "axial_damping", "yaw_damping", "rate_damping",
+    "yaw_inertia",
+})  # fmt: skip
+"""Effects by which a machine answers its commands weakly or late. So it seems to where whoever flies
+answers gusts between the rows of a log, which holds each command until the next."""
 
 T = TypeVar("T")
 
@@ -166,6 +176,11 @@ class Problem:
     def off_values(self, effect: str) -> dict[str, float]:
         """Values at which an effect is not there."""
         return {f.name: f.value for f in self.own[effect]}
+
+    @cached_property
+    def has_slow_rows(self) -> bool:
+        """Whether commands changed unseen between the rows, for all that is known."""
+        return median_step(self.engine.records) > self.settings.slow_rows
 
     @property
     def seconds(self) -> float:

@@ -9,6 +9,7 @@ from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.vibration import Line
+from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.helicopter_noise import WHITE_LEVELS
 from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
@@ -26,6 +27,7 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
         found: the confounded alternatives of each cause.
     """
     return [
+        *_slow_rows(problem),
         *_white_noise(problem, fit),
         *_moved_base(problem, fit),
         *_resting_on_unseen(problem, fit, quadratic, found),
@@ -94,6 +96,15 @@ def held_out_before(
         f"the held-out runs were flown before {plain(effect)} began: the gain says nothing of it"
         for effect, run in began_in.items()
         if runs.index(run) > last
+    ]
+
+
+def _slow_rows(problem: Problem) -> list[str]:
+    if not problem.has_slow_rows:
+        return []
+    return [
+        f"rows {1e3 * median_step(problem.engine.records):.0f} ms apart: what the commands did between "
+        "them is not known, and a lag, delay, damping or inertia counts a third of what it is worth"
     ]
 
 

@@ -69,8 +69,9 @@ def expected_evidence(
         planned: how it was flown. flight: its log. truth: of the generator, `hidden` and `values`.
         held: names of the runs that are not fitted.
     """
-    values = catalogue_values(truth["values"])
-    listed = [e for e in truth["hidden"] if e in CATALOGUE]
+    values = _by_names(catalogue_values(truth["values"]))
+    names = {e: CATALOGUE[e].named_as or e for e in truth["hidden"] if e in CATALOGUE}
+    listed = list(names.values())
     result: dict[str, float | None] = dict.fromkeys(truth["hidden"])
     if not listed:
         return result
@@ -85,7 +86,20 @@ def expected_evidence(
         problem, shaken = with_shocks(problem, replace(fit, levels=fitted_levels(noise)))
         noise = shaken.noise
     about = _Truth(problem, fit.values, noise, listed)
-    return result | {effect: about.worth(effect) for effect in listed}
+    return result | {effect: about.worth(name) for effect, name in names.items()}
+
+
+def _by_names(values: Mapping[str, float]) -> dict[str, float]:
+    """Values of effects that go by the name of another, as that one's.
+
+    A deadband's plate jumps with the last digit of a command, so that two predictions with it are far
+    apart wherever either is: what it is worth by them (8,500 nats) no likelihood shows.
+    """
+    result = {}
+    for name, value in values.items():
+        effect, _, parameter = name.partition(".")
+        result[f"{CATALOGUE[effect].named_as or effect}.{parameter}"] = value
+    return result
 
 
 def true_noise(
