@@ -9,7 +9,7 @@ from coax_env.design.discrimination import Alternative, logged_rates
 from coax_env.design.next_maneuver import Design, design
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.fits import fitted
-from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
+from coax_env.diagnosis.problem import SERVO_FORMS, Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import score, swap
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import Whiteness
@@ -100,7 +100,8 @@ def _of_one(
         _, move = swap(problem, quadratic, fit.active, effect, twin)
         trial = refit(twin, move, steps=TWIN_STEPS)
         mixed = score(problem, quadratic, fit.active, twin).evidence > chosen.evidence
-        if mixed or trial.objective - fit.objective < tie:
+        form = chosen.form_share * lost if effect in SERVO_FORMS else 0.0
+        if mixed or trial.objective - fit.objective < max(tie, form):
             found[twin] = trial
     return found
 

@@ -23,7 +23,7 @@ from coax_env.diagnosis.fits import (
     with_latent_noise,
 )
 from coax_env.diagnosis.moves import Proposal, accepted, add, drop, swaps, trials
-from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.problem import SERVO_FORMS, Fit, Problem
 from coax_env.diagnosis.scores import Score, most_gains, scores
 from coax_env.estimation.engine import RunPass
 from coax_env.estimation.quadratic import Quadratic
@@ -86,12 +86,12 @@ def _lag_first(strong: Sequence[Score]) -> list[Score]:
     Every servo lags; that its command is late as well, beside what delays all commands, is the more to
     be shown.
     """
+    lag, delay = SERVO_FORMS
     names = [c.effect for c in strong]
-    if "servo_lag" not in names or "servo_delay" not in names:
+    if lag not in names or delay not in names:
         return list(strong)
-    lag = strong[names.index("servo_lag")]
-    rest = [c for c in strong if c is not lag]
-    rest.insert(min(names.index("servo_lag"), names.index("servo_delay")), lag)
+    rest = [c for c in strong if c.effect != lag]
+    rest.insert(min(names.index(lag), names.index(delay)), strong[names.index(lag)])
     return rest
 
 
