@@ -23,8 +23,12 @@ from coax_env.model import effects
 from coax_env.model import parameters as P
 from coax_env.progress import Progress
 
+SERVO_FORMS = ("servo_lag", "servo_delay")
+"""Two forms of one servo, the usual one first. A real servo is neither: what a critically damped one of
+40 ms does to a flight, a delay explains better than a lag by 6 of 110 nats, and by 24 of 320."""
+
 EXCLUSIVE = (
-    frozenset({"servo_lag", "servo_delay"}),
+    frozenset(SERVO_FORMS),
     frozenset({"battery_sag", "battery_voltage"}),
     frozenset({"swash_phase", "frame_yaw"}),
     frozenset({"pose_delay", "attitude_delay"}),
@@ -34,12 +38,8 @@ EXCLUSIVE = (
 mixture of both; the same rotors slow down; on a log of poses alone the others are one column, and far
 from each other."""
 
-SERVO_FORMS = ("servo_lag", "servo_delay")
-"""Two forms of one servo, the usual one first. A real servo is neither: what a critically damped one of
-40 ms does to a flight, a delay explains better than a lag by 6 of 110 nats, and by 24 of 320."""
-
 WEAK_OR_LATE = frozenset({
-    "motor_lag", "motor_droop", "servo_lag", "servo_delay", "servo_play", "servo_deadband",
+    "motor_lag", "motor_droop", "servo_lag", "servo_delay", "servo_play",
     "servo_rate", "command_delay", "dynamic_inflow", "axial_damping", "yaw_damping", "rate_damping",
     "yaw_inertia",
 })  # fmt: skip

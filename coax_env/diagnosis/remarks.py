@@ -104,7 +104,8 @@ def _slow_rows(problem: Problem) -> list[str]:
         return []
     return [
         f"rows {1e3 * median_step(problem.engine.records):.0f} ms apart: what the commands did between "
-        "them is not known, and a lag, delay, damping or inertia counts a third of what it is worth"
+        "them is not known, and what looks like a weak or late answer must be worth "
+        f"{problem.settings.slow_inflation:g} times as much"
     ]
 
 

@@ -19,7 +19,7 @@ class Settings:
     the 10 ms and the 38 ms that were measured."""
     slow_inflation: float = 3.0
     """Times that what looks like a weak or late answer must then be worth more. Measured by 26 Hz
-    telemetry (`study_diagnosis.py --arms telemetry`, seeds 70 and 71): 5 of 54 clean flights had a
+    telemetry (`study_diagnosis.py --arms telemetry`, seeds 70 and 71): 5 of 71 clean flights had a
     name, motor_droop four times, worth 31 nats at most; true ones that should show 51 to 196."""
     tie: float = 6.0
     """nats within which alternatives are confounded: odds of 400 to 1, ours."""

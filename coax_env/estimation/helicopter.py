@@ -114,11 +114,9 @@ def _start_of_step(x: Any, u: Any, p: Any, out: Any) -> None:
     _take_in_innovations(u, p, out)
 
 
-kernel_step, kernel_measure, kernel_drift = (
-    dynamics.step,
-    dynamics.measure,
-    dynamics.drift_and_readings,
-)  # `side_by_side` puts those of registers in their places
+kernel_step = dynamics.step  # `side_by_side` puts those of registers in their places
+kernel_measure = dynamics.measure
+kernel_drift = dynamics.drift_and_readings
 
 
 def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
@@ -200,23 +198,18 @@ def side_by_side(motion: Motion, kind: str, of_lanes: Motion = OF_LANES) -> Any:
     Returns:
         the three; None where a user's effect does not compile for registers.
     """
-    kernel = dict(
-        zip(
-            ("kernel_step", "kernel_measure", "kernel_drift"),
-            dynamics.motion_of_registers(),
-            strict=True,
-        )
-    )
+    step, measure, drift = dynamics.motion_of_registers()
+    kernel = {"kernel_step": step, "kernel_measure": measure, "kernel_drift": drift}
+    own = [compiled()(under_names(f, kernel, f"of_registers_{kind}")) for f in motion]
+    names = dict(zip(("step_of", "measure_of", "drift_of"), own, strict=True))
     signatures = (LANES_STEP, LANES_MEASURE, LANES_STEP)
-    names = ("step_of", "measure_of", "drift_of")
-    found = []
     try:
-        for own, outer, name, signature in zip(motion, of_lanes, names, signatures, strict=True):
-            inner = compiled()(under_names(own, kernel, f"of_registers_{kind}"))
-            found.append(pointer(signature.signature)(under_names(outer, {name: inner}, kind)))
+        return tuple(
+            pointer(signature.signature)(under_names(f, names, kind))
+            for signature, f in zip(signatures, of_lanes, strict=True)
+        )
     except numba.core.errors.NumbaError:
         return None
-    return tuple(found)
 
 
 def _small_changes() -> np.ndarray:
