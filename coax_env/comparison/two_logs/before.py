@@ -1,7 +1,7 @@
 """The log before under its model, and what every number would change of its innovations."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -70,6 +70,7 @@ class Before:
             first readings as they are, biased or not.
         known: effect -> its coordinates.
         slopes: effect -> derivatives of all innovations in them, (readings, coordinates).
+        later: moment -> the same from that moment on, as far as it was asked for.
     """
 
     problem: Problem
@@ -78,6 +79,7 @@ class Before:
     there: list[np.ndarray]
     known: Mapping[str, list[Coordinate]]
     slopes: Mapping[str, np.ndarray]
+    later: dict[Moment, "Before"] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def of(cls, problem: Problem, fit: Fit) -> "Before":
@@ -101,11 +103,16 @@ class Before:
         return cls(problem, fit, here, there, known, slopes)
 
     def since(self, moment: Moment) -> "Before":
-        """Of numbers that change at a moment of the flight, not in all of it.
+        """Of numbers that change at a moment of the flight, not in all of it; remembered.
 
         Args:
             moment: its run may be one that was cut into parts.
         """
+        if moment not in self.later:
+            self.later[moment] = self._since(moment)
+        return self.later[moment]
+
+    def _since(self, moment: Moment) -> "Before":
         clock = clock_of(self.problem.engine.records)
         known = [e for e in self.known if e != ROTOR_SPEED]
         model = ChangingModel(self.problem.model, dict.fromkeys(known, moment), clock)
@@ -123,4 +130,4 @@ class Before:
         ]
         own = Logs(problem.engine, fit, self.innovations, there)
         slopes = {e: own.slopes(fit.values, group) for e, group in self.known.items()}
-        return replace(self, problem=problem, fit=fit, there=there, slopes=slopes)
+        return replace(self, problem=problem, fit=fit, there=there, slopes=slopes, later={})
