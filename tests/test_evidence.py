@@ -174,7 +174,7 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "converged", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "refined", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "quadratic_at", lambda problem, fit: (fit, nothing))
-    monkeypatch.setattr(evidence, "_is_doubtful", lambda problem, fit, quadratic, effect: True)
+    monkeypatch.setattr(evidence, "_worth", lambda problem, fit, quadratic, effect: THRESHOLD)
     monkeypatch.setattr(evidence, "weigh", removals)
     problem, fit, _, found = weighed(tables, Fit(active, {}, Noise({})))
     assert problem.gains == (tables.worth_it and tables.white) and set(found) == set(fit.active)

@@ -74,22 +74,29 @@ def prune(
     """Remove, one at a time, causes whose evidence is gone once the noise levels are fitted too.
 
     What is in doubt by the quadratic is weighed first: the clear ones wait until nothing is removed.
+    What has none by it is weighed before the fit is refined, which takes as long as all else here.
 
     Args:
         problem, fit: what may be free, and where.
         clear: known to be, and not weighed unless the quadratic doubts them.
 
     Returns:
-        the refined fit, the quadratic at it, and the evidence of what is left and was weighed.
+        the fit, refined where something was weighed, the quadratic at it, and the evidence of what is
+        left and was weighed.
     """
     while True:
-        fit = refined(problem, converged(problem, fit))
+        fit = converged(problem, fit)
         beside = problem if fit.active else problem.of_candidates(())  # for whom could they stand?
         fit, quadratic = quadratic_at(beside, fit)
-        doubtful = [e for e in fit.active if _is_doubtful(problem, fit, quadratic, e)]
-        rest = [e for e in fit.active if e not in doubtful and e not in clear]
+        better = _without_hopeless(problem, fit, quadratic)
+        if better is not None:
+            fit = better
+            continue
+        if fit.active and not _asked(problem, fit, quadratic, clear):
+            return fit, quadratic, {}
+        fit, quadratic = quadratic_at(beside, refined(problem, fit))
         removals: dict[str, Removal] = {}
-        for which in (doubtful, rest):
+        for which in _asked(problem, fit, quadratic, clear):
             removals |= weigh(problem, fit, quadratic, which)
             better = _better(problem, fit, removals)
             if better is not None:
@@ -97,6 +104,23 @@ def prune(
                 break
         else:
             return fit, quadratic, {e: removals[e].evidence for e in fit.active if e in removals}
+
+
+def _asked(
+    problem: Problem, fit: Fit, quadratic: Quadratic, clear: Collection[str]
+) -> list[list[str]]:
+    """Causes that are to be weighed together: those in doubt, then the rest but for the clear ones."""
+    doubtful = [e for e in fit.active if _is_doubtful(problem, fit, quadratic, e)]
+    rest = [e for e in fit.active if e not in doubtful and e not in clear]
+    return [which for which in (doubtful, rest) if which]
+
+
+def _without_hopeless(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
+    """As `_better`, of causes that lack more than a tie both by the quadratic and by a refit."""
+    most = problem.settings.evidence - problem.settings.tie
+    asked = [e for e in fit.active if _worth(problem, fit, quadratic, e) < most]
+    removals = weigh(problem, fit, quadratic, asked)
+    return _better(problem, fit, {e: r for e, r in removals.items() if r.evidence.nats < most})
 
 
 def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[str, Evidence]]:
@@ -152,9 +176,14 @@ def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) ->
 
 def _is_doubtful(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:
     """Whether a cause is not worth several thresholds by the quadratic."""
+    enough = problem.settings.clear_evidence * problem.settings.evidence
+    return _worth(problem, fit, quadratic, effect) < enough
+
+
+def _worth(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:
+    """Nats of a cause by the quadratic, colour and slow rows allowed for."""
     factor = _inflation(problem, fit, quadratic, effect)
-    worth = loss(problem, quadratic, fit.active, effect, factor)
-    return worth < problem.settings.clear_evidence * problem.settings.evidence
+    return loss(problem, quadratic, fit.active, effect, factor)
 
 
 def _better(problem: Problem, fit: Fit, removals: Mapping[str, Removal]) -> Fit | None:
