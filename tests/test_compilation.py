@@ -11,7 +11,14 @@ import pytest
 from numba import float64
 from numba.extending import overload
 
-from coax_env.estimation import beginnings, compile_ahead, frozen_gains, kalman, noise_score
+from coax_env.estimation import (
+    beginnings,
+    compile_ahead,
+    compiled_model,
+    frozen_gains,
+    kalman,
+    noise_score,
+)
 from coax_env.kernel import compilation
 from coax_env.kernel.compilation import compiled, compiled_when_called
 from coax_env.kernel.numba_internals import PackagedCacheLocator, cached_in
@@ -145,6 +152,6 @@ def test_a_new_checkout_is_compiled_by_two_processes_and_a_filled_one_by_none(
 
 
 def test_every_pass_is_compiled_ahead():
-    rooms = (kalman, frozen_gains, noise_score, beginnings)
+    rooms = (kalman, compiled_model, frozen_gains, noise_score, beginnings)
     passes = {f for room in rooms for f in vars(room).values() if hasattr(f, "prepare")}
     assert len(passes) > 2 and set(compile_ahead.PASSES) == passes

@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 from scipy.stats import binom, multivariate_normal
 
-from coax_env.estimation import kalman
+from coax_env.estimation import transition
 from coax_env.estimation.engine import (
     REFRESH,
     Engine,
@@ -468,8 +468,8 @@ def test_jacobian_of_a_step_is_the_exponential_of_that_of_the_drift(rate):
     A = with_places(np.zeros((nx, padded(nx))), nx)
     A.values[:, :nx] = [[-rate, 0.4, 0.0], [0.0, 0.1, 0.2], [0.3, 0.0, -0.2]]
     F = with_places(np.zeros_like(A.values), nx)
-    done = kalman.exponential(exact, A, np.zeros_like(A.values), F)
-    assert done == (rate <= kalman.MOST_DECAY)
+    done = transition.exponential(exact, A, np.zeros_like(A.values), F)
+    assert done == (rate <= transition.MOST_DECAY)
     if not done:
         assert not F.values.any()
         return
@@ -487,7 +487,7 @@ def test_a_stiff_row_has_the_jacobian_of_the_step():
     stiff.exact = np.array([False, False])
     values = {**TRUTH, "damping": 40.0}
     record = swing(1, n=40, values=values)
-    assert values["damping"] * DT > kalman.MOST_DECAY
+    assert values["damping"] * DT > transition.MOST_DECAY
     _, along = Engine(stiff, [record])._filter_run(
         0,
         stiff.vector(values),

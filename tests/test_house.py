@@ -108,7 +108,8 @@ def test_flights_are_read_without_a_model():
 
 
 ENGINE = (
-    "engine frozen_gains kalman noise_levels noise_score quadratic sparse state_space whiteness"
+    "compiled_model engine frozen_gains kalman noise_levels noise_score pass_data quadratic sparse"
+    " state_space transition whiteness"
 )
 
 

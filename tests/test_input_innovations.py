@@ -20,7 +20,7 @@ from coax_env.diagnosis.input_innovations import (
     with_input_innovations,
 )
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation import kalman
+from coax_env.estimation import compiled_model
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
@@ -198,7 +198,7 @@ def test_a_replay_has_no_innovations_in_its_open_loop(tmp_path):
     phi = CHANNELS.index("phi")
     t_end = moved.channels["phi"].t[-1]
     targets[phi] = int(np.argmin(np.abs(engine.records[0].t - t_end)))
-    kalman.fly_open_loop(
+    compiled_model.fly_open_loop(
         engine.compiled,
         engine.intervals[0],
         inputs,

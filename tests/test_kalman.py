@@ -22,7 +22,7 @@ from test_estimation import (
     with_holes,
 )
 
-from coax_env.estimation import kalman
+from coax_env.estimation import compiled_model, kalman, pass_data
 from coax_env.estimation.sparse import (
     aligned,
     combine,
@@ -118,25 +118,25 @@ def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) ->
 
 def fast_filter(
     record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray, refresh: int = 1
-) -> tuple[float, int, kalman.Trace, kalman.Covariances]:
+) -> tuple[float, int, pass_data.Trace, pass_data.Covariances]:
     """`filter_pass` with new Jacobians every `refresh` rows, and all that it stores."""
     model = Pendulum()
     model.state_scale = np.full(2, 1e-7)  # so that differences are as good as derivatives
     (n, m), readings = record.z.shape, int(np.isfinite(record.z).sum())
-    trace = kalman.Trace(
+    trace = pass_data.Trace(
         np.zeros((n, 2)), np.zeros((n, m)),
-        kalman.Gains(
+        pass_data.Gains(
             np.zeros((readings, 2), np.float32), np.zeros(readings),
             np.zeros((math.ceil(n / refresh), m, 2), np.float32), np.zeros(2, np.int64),
         ),
-        kalman.Path(np.zeros((n, 2, 2), np.float32), np.zeros(n, np.int64), np.zeros((n, 2)),
+        pass_data.Path(np.zeros((n, 2, 2), np.float32), np.zeros(n, np.int64), np.zeros((n, 2)),
                     np.arange(2), np.zeros((n, 2, 2), np.float32), np.zeros(readings)),
     )  # fmt: skip
-    kept = kalman.Covariances(np.zeros((n, 2, 2)), np.arange(n))
-    run = kalman.RunData(np.append(np.diff(record.t), 0.0), record.command, record.z)
-    start = kalman.Variances(Pendulum.start_at, np.diag(Pendulum.start_std**2), R, q, DECAY)
+    kept = pass_data.Covariances(np.zeros((n, 2, 2)), np.arange(n))
+    run = pass_data.RunData(np.append(np.diff(record.t), 0.0), record.command, record.z)
+    start = pass_data.Variances(Pendulum.start_at, np.diag(Pendulum.start_std**2), R, q, DECAY)
     log_likelihood, beyond = kalman.filter_pass(
-        kalman.CompiledModel.of(model), run, start, p, GATE, refresh, trace, kept
+        compiled_model.CompiledModel.of(model), run, start, p, GATE, refresh, trace, kept
     )
     return log_likelihood, beyond, trace, kept
 

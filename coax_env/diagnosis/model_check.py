@@ -23,7 +23,7 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation import kalman
+from coax_env.estimation import compiled_model
 from coax_env.estimation.engine import RunPass
 from coax_env.estimation.prediction import TAIL
 from coax_env.estimation.state_space import Noise, Record
@@ -189,7 +189,7 @@ def _scaled(
 
     def read(states: np.ndarray, row: int) -> np.ndarray:
         out = np.full((len(states), len(CHANNELS)), np.nan)
-        kalman.read(engine.compiled, states, inputs[row], p, out)
+        compiled_model.read(engine.compiled, states, inputs[row], p, out)
         return out
 
     for s, h in zip(*np.nonzero(rows >= 0), strict=True):

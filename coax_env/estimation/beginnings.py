@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import float64, int64, types
 
+from coax_env.estimation.compiled_model import INDICES, MATRIX
 from coax_env.estimation.frozen_gains import KEPT, Kept
-from coax_env.estimation.kalman import _M, _N, TRACE, how_many
 from coax_env.estimation.noise_score import reading_back, row_back, turned_jacobian
+from coax_env.estimation.pass_data import TRACE, how_many
 from coax_env.estimation.sparse import (
     REORDER,
     aligned,
@@ -82,9 +83,9 @@ class Moved(NamedTuple):
     kept: Kept
 
 
-ASKED = types.NamedUniTuple(_N, 3, Asked)
-SUMS = types.NamedTuple([_M, float64[:, :, ::1], _M, _M], Sums)
-MOVED = types.NamedTuple([_M, KEPT], Moved)
+ASKED = types.NamedUniTuple(INDICES, 3, Asked)
+SUMS = types.NamedTuple([MATRIX, float64[:, :, ::1], MATRIX, MATRIX], Sums)
+MOVED = types.NamedTuple([MATRIX, KEPT], Moved)
 
 
 class _Answers(NamedTuple):

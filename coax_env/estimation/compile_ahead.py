@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 
-from coax_env.estimation import beginnings, frozen_gains, kalman, noise_score
+from coax_env.estimation import beginnings, compiled_model, frozen_gains, kalman, noise_score
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.kernel import compilation
 from coax_env.model.dynamics import hover_trim
@@ -20,8 +20,8 @@ PASSES = (
     noise_score.score_pass,
     frozen_gains.mean_pass,
     frozen_gains.mean_passes,
-    kalman.fly_open_loop,
-    kalman.read,
+    compiled_model.fly_open_loop,
+    compiled_model.read,
     beginnings.beginnings_pass,
 )
 

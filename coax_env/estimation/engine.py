@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.estimation import frozen_gains, kalman, noise_score
+from coax_env.estimation import compiled_model, frozen_gains, kalman, noise_score, pass_data
 from coax_env.estimation.beginnings import Asked, Beginning, Moved, Sums, beginnings_pass
 from coax_env.estimation.freed_memory import return_freed_memory
 from coax_env.estimation.noise_score import Slopes
@@ -70,7 +70,7 @@ class PassJacobians:
     """What a filter pass linearised the model at, for the signature and score passes.
 
     F: (<= n, nx, nx) Jacobians of the step, F_of: (n,) which of them a row has. predicted: (n, nx)
-    states before each row's readings. decaying, P, beyond: see kalman.Path.
+    states before each row's readings. decaying, P, beyond: see pass_data.Path.
     """
 
     F: np.ndarray
@@ -81,10 +81,10 @@ class PassJacobians:
     beyond: np.ndarray
 
 
-def _trace(run: RunPass, at: PassJacobians) -> kalman.Trace:
-    gains = kalman.Gains(run.gains, run.per_sigma, run.H, run.shown)
-    path = kalman.Path(at.F, at.F_of, at.predicted, at.decaying, at.P, at.beyond)
-    return kalman.Trace(run.states, run.innovations, gains, path)
+def _trace(run: RunPass, at: PassJacobians) -> pass_data.Trace:
+    gains = pass_data.Gains(run.gains, run.per_sigma, run.H, run.shown)
+    path = pass_data.Path(at.F, at.F_of, at.predicted, at.decaying, at.P, at.beyond)
+    return pass_data.Trace(run.states, run.innovations, gains, path)
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class Engine:
 
     def __init__(self, model: Model, records: Sequence[Record], threads: int | None = None) -> None:
         self.model = model
-        self.compiled = kalman.CompiledModel.of(model)
+        self.compiled = compiled_model.CompiledModel.of(model)
         self.records = tuple(records)
         self.threads = threads or int(os.environ.get("COAX_THREADS", "2"))
         self.starts = [model.start(r) for r in self.records]
@@ -326,12 +326,12 @@ class Engine:
         slots[starts] = np.arange(starts.size)
         P = np.zeros((starts.size, nx, nx))
         shown = np.full(nx, -1)
-        gains = kalman.Gains(K, per_sigma, H, shown)
-        path = kalman.Path(F, F_of, predicted, decaying, rows_of_P, beyond)
+        gains = pass_data.Gains(K, per_sigma, H, shown)
+        path = pass_data.Path(F, F_of, predicted, decaying, rows_of_P, beyond)
         log_likelihood, deweighted = kalman.filter_pass(
-            self.compiled, kalman.RunData(self.intervals[i], u, record.z, record.strength),
-            kalman.Variances(x0, P0, R, q, decay), p, GATE, self._refresh[i],
-            kalman.Trace(states, e, gains, path), kalman.Covariances(P, slots),
+            self.compiled, pass_data.RunData(self.intervals[i], u, record.z, record.strength),
+            pass_data.Variances(x0, P0, R, q, decay), p, GATE, self._refresh[i],
+            pass_data.Trace(states, e, gains, path), pass_data.Covariances(P, slots),
         )  # fmt: skip
         if not np.isfinite(log_likelihood):
             K[:], per_sigma[:], H[:] = 0.0, 0.0, 0.0
@@ -610,8 +610,8 @@ class Engine:
             for vector in vectors:
                 yield e[there] if self._frozen(i, run, vector, e) else np.full(there.sum(), np.nan)
             return
-        data = kalman.RunData(self.intervals[i], run.inputs, run.record.z)
-        gains = kalman.Gains(run.gains, run.per_sigma, run.H, run.shown)
+        data = pass_data.RunData(self.intervals[i], run.inputs, run.record.z)
+        gains = pass_data.Gains(run.gains, run.per_sigma, run.H, run.shown)
         for first in range(0, len(vectors), SIMD_WIDTH):
             some = vectors[first : first + SIMD_WIDTH]
             lanes = [*some, *[p] * (SIMD_WIDTH - len(some))]
@@ -682,9 +682,9 @@ class Engine:
 
     def _frozen(self, i: int, run: RunPass, p: np.ndarray, out: np.ndarray) -> bool:
         u = self.model.inputs(run.record, p)
-        gains = kalman.Gains(run.gains, run.per_sigma, run.H, run.shown)
+        gains = pass_data.Gains(run.gains, run.per_sigma, run.H, run.shown)
         return frozen_gains.mean_pass(
-            self.compiled, kalman.RunData(self.intervals[i], u, run.record.z), self.starts[i][0], p,
+            self.compiled, pass_data.RunData(self.intervals[i], u, run.record.z), self.starts[i][0], p,
             gains, self._refresh[i], out,
         )  # fmt: skip
 

@@ -13,18 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import boolean, float32, float64, int64, types
 
-from coax_env.estimation.kalman import (
-    _A,
-    _M,
-    _N,
-    GAINS,
+from coax_env.estimation.compiled_model import (
+    INDICES,
+    MATRIX,
     MODEL,
-    RUN_DATA,
-    TRACE,
-    how_many,
+    VECTOR,
     in_every_lane,
     lanes_of,
 )
+from coax_env.estimation.pass_data import GAINS, RUN_DATA, TRACE, how_many
 from coax_env.estimation.sparse import (
     FOUR,
     ONE,
@@ -45,7 +42,7 @@ from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks
 
 
 @compiled_when_called(
-    boolean(MODEL, RUN_DATA, _A, _A, GAINS, int64, _M), makes_arrays=True, **REORDER
+    boolean(MODEL, RUN_DATA, VECTOR, VECTOR, GAINS, int64, MATRIX), makes_arrays=True, **REORDER
 )
 def mean_pass(model, run, x0, p, gains, refresh, e):
     """Whitened innovations of the mean with the gains of a filter pass.
@@ -95,7 +92,7 @@ def mean_pass(model, run, x0, p, gains, refresh, e):
 
 
 @compiled_when_called(
-    types.void(MODEL, RUN_DATA, _A, _A, _M, float64[:, :, ::1], GAINS, int64, _M),
+    types.void(MODEL, RUN_DATA, VECTOR, VECTOR, MATRIX, float64[:, :, ::1], GAINS, int64, MATRIX),
     makes_arrays=True, **REORDER,
 )  # fmt: skip
 def mean_passes(model, run, x0, p, moved, u, gains, refresh, e):
@@ -210,8 +207,10 @@ class _Signatures(NamedTuple):
     K: Any  # gain of one reading (r,)
 
 
-MOVES = types.NamedTuple([_M, _A, boolean[::1], float64[:, :, ::1], _N, _N], Moves)
-KEPT = types.NamedTuple([float32[:, :, ::1], _N], Kept)
+MOVES = types.NamedTuple(
+    [MATRIX, VECTOR, boolean[::1], float64[:, :, ::1], INDICES, INDICES], Moves
+)
+KEPT = types.NamedTuple([float32[:, :, ::1], INDICES], Kept)
 PORTION = types.NamedUniTuple(int64, 3, Portion)
 
 
@@ -376,7 +375,7 @@ def _signature_rows(model, dt, trace, p, moves, refresh, portion, J, kept, w):
 
 
 @compiled_when_called(
-    types.void(MODEL, _A, TRACE, _A, MOVES, int64, PORTION, _M, _M, _M, KEPT),
+    types.void(MODEL, VECTOR, TRACE, VECTOR, MOVES, int64, PORTION, MATRIX, MATRIX, MATRIX, KEPT),
     makes_arrays=True, **REORDER,
 )  # fmt: skip
 def signature_pass(model, dt, trace, p, moves, refresh, portion, s, J, by_channel, kept):

@@ -22,7 +22,7 @@ import numpy as np
 from numba import float64, types
 
 from coax_env.estimation import helicopter_noise
-from coax_env.estimation.kalman import LANES_MEASURE, LANES_STEP
+from coax_env.estimation.compiled_model import LANES_MEASURE, LANES_STEP
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
 from coax_env.kernel.simd import any_lane, simd_view

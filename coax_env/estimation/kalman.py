@@ -11,7 +11,7 @@ e = v / s, and so the likelihood is
 
 F and H are mostly zero, and only what is not is multiplied (sparse.py); tests/test_kalman.py holds the
 pass against the same filter with dense matrices. States that no reading shows, neither by itself nor
-through others, have no covariance (`_find_shown`): the likelihood is the same.
+through others, have no covariance (transition.py): the likelihood is the same.
 
 One departure from the book: both Jacobians are those at the predicted state, from one look at the
 rates, and serve some rows (`refresh`); that of the first step is taken where the first readings have
@@ -23,454 +23,37 @@ time); Maybeck 1979.
 """
 
 import math
-from typing import Any, NamedTuple
 
 import numpy as np
-from numba import boolean, float32, float64, int64, types
-from numba.extending import typeof_impl
+from numba import float64, int64, types
 
-from coax_env.estimation.sparse import (
-    REORDER,
-    SPARSE,
-    aligned,
-    along,
-    find_non_zeros,
-    multiply,
-    padded,
-    row_of_product,
-    with_places,
+from coax_env.estimation.compiled_model import MODEL, VECTOR
+from coax_env.estimation.pass_data import (
+    COVARIANCES,
+    RUN_DATA,
+    TRACE,
+    VARIANCES,
+    strength_changes,
 )
-from coax_env.estimation.state_space import STEADY, Strength
+from coax_env.estimation.sparse import REORDER, along, find_non_zeros, multiply, row_of_product
+from coax_env.estimation.transition import (
+    arrays_of,
+    find_shown,
+    linearise,
+    rescaled,
+    shows_more,
+    take_shown,
+    transition,
+)
 from coax_env.kernel.angles import wrap_angle
-from coax_env.kernel.compilation import compiled, compiled_when_called, pointer
-from coax_env.kernel.simd import SIMD_WIDTH, negated, simd_blocks, transpose
-from coax_env.kernel.simd import lanes as lanes_that
+from coax_env.kernel.compilation import compiled, compiled_when_called
+from coax_env.kernel.simd import SIMD_WIDTH, simd_blocks, transpose
 
-_A = float64[::1]
-_M = float64[:, ::1]
-_N = int64[::1]
-STEP = types.FunctionType(types.void(_A, _A, float64, _A, _A, _A))
-MEASURE = types.FunctionType(types.void(_A, _A, _A, _A, _A))
-LANES_STEP = types.FunctionType(types.void(_M, _M, float64, _M, _M, _M))
-LANES_MEASURE = types.FunctionType(types.void(_M, _M, _M, _M, _M))
-MOST_DECAY = 0.5
-"""Share of a state that may decay in a row for the series of the exponential to be used."""
 SAME_STEP = 1e-6
 """Steps that differ by no more of themselves are the same: what is left of a clock's rounding."""
 LEAST, MOST = 1e-100, 1e100
 """Of a product of variances before its logarithm is taken; far from the least and largest number."""
 _LOG_2PI = math.log(2.0 * math.pi)
-
-
-# --- what the passes are given and what they leave --------------------------------------------------
-
-
-@pointer(LANES_STEP.signature)
-def _no_motion(x, u, dt, p, work, out):
-    """What stands for `step_of_lanes` and `drift_of_lanes` where a model has none."""
-
-
-@pointer(LANES_MEASURE.signature)
-def _no_readings(x, u, p, work, out):
-    """What stands for `measure_of_lanes`."""
-
-
-class CompiledModel(NamedTuple):
-    """What compiled code needs of a model; see state_space.Model for each.
-
-    has_lanes: whether it has `side_by_side`, the three `_of_lanes`.
-    """
-
-    step: Any
-    measure: Any
-    drift_and_readings: Any
-    exact: np.ndarray
-    wraps: np.ndarray
-    scale: np.ndarray
-    work_size: int
-    noise_places: np.ndarray
-    has_lanes: bool
-    step_of_lanes: Any
-    measure_of_lanes: Any
-    drift_of_lanes: Any
-
-    @classmethod
-    def of(cls, model: Any) -> "CompiledModel":
-        """That of a state_space.Model."""
-        side_by_side = getattr(model, "side_by_side", None)
-        return cls(
-            model.step,
-            model.measure,
-            model.drift_and_readings,
-            np.ascontiguousarray(model.exact, bool),
-            np.ascontiguousarray(model.wraps, bool),
-            np.ascontiguousarray(model.state_scale, float),
-            int(model.work_size),
-            np.ascontiguousarray(model.noise_places, np.int64),
-            side_by_side is not None,
-            *(side_by_side or (_no_motion, _no_readings, _no_motion)),
-        )
-
-
-class RunData(NamedTuple):
-    """What a pass is given of a run.
-
-    dt: (n,) seconds from each row to the next. u: (n, nu). z: (n, m), NaN where missing.
-    strength: of its process noise, see state_space.Strength.
-    """
-
-    dt: np.ndarray
-    u: np.ndarray
-    z: np.ndarray
-    strength: Strength = STEADY
-
-
-class Variances(NamedTuple):
-    """What the filter believes at first, and how much it believes.
-
-    x0: (nx,) first state. P0: (nx, nx) its covariance. R: (m,) variances of the readings.
-    q: (e,) intensity of the process noise in each of its entries, decay: (e,) rate [1/s] at which
-    what it has added decays; see state_space.ProcessNoise.
-    """
-
-    x0: np.ndarray
-    P0: np.ndarray
-    R: np.ndarray
-    q: np.ndarray
-    decay: np.ndarray
-
-
-class Gains(NamedTuple):
-    """K: (readings, nx) and per_sigma: (readings,) 1 / s, of each reading that there is, in the order
-    of the innovations. H: (n / refresh, m, nx) Jacobians of the readings; empty: not to be stored.
-
-    shown: (nx,) the r states that any reading shows (`_find_shown`), then -1. States of K and H, and of
-    F and P of the path, are these, r of nx and in this order; behind them is whatever was there.
-    """
-
-    K: np.ndarray
-    per_sigma: np.ndarray
-    H: np.ndarray
-    shown: np.ndarray
-
-
-class Path(NamedTuple):
-    """What the filter linearised the model at; empty: not to be stored.
-
-    F: (at most n, nx, nx) Jacobians of the step. F_of: (n,) which of them a row has.
-    predicted: (n, nx) states before each row's readings.
-    decaying: (d,) states whose rows of the filtered covariance are kept; P: (n, d, nx) those.
-    beyond: (readings,) 1 / variance expected of a reading beyond the gate, 0 of one within it.
-    """
-
-    F: np.ndarray
-    F_of: np.ndarray
-    predicted: np.ndarray
-    decaying: np.ndarray
-    P: np.ndarray
-    beyond: np.ndarray
-
-
-class Trace(NamedTuple):
-    """What a filter pass leaves, in arrays of its caller.
-
-    states: (n, nx) filtered. e: (n, m) whitened innovations, NaN where there is no reading.
-    """
-
-    states: np.ndarray
-    e: np.ndarray
-    gains: Gains
-    path: Path
-
-
-class Covariances(NamedTuple):
-    """Filtered covariances of some rows: P (slots, nx, nx), and each row's slot in it (n,), or -1."""
-
-    P: np.ndarray
-    slots: np.ndarray
-
-
-class _Filter(NamedTuple):
-    """The arrays that a pass works in; matrices are `padded` to the right.
-
-    Of the r states that any reading shows, and in the order of `order`, are correction, P, K, H, F, A
-    and what is as large; AH has the same order, the other states behind.
-    """
-
-    order: Any  # (nx,) states: those that any reading shows, then the others
-    place_of: Any  # (nx,) a state's in it, -1 of the others
-    places: Any  # (e, 2) of the process noise' entries in P, or -1
-    exact: Any  # (r,) the model's
-    channels: Any  # (m,) whether the run has any reading
-    x: Any  # mean of all states
-    P: Any  # covariance
-    correction: Any  # what the row's readings have added to the mean
-    x_next: Any  # mean a row later
-    h: Any  # readings expected
-    v: Any  # innovations, before any reading of the row
-    noise: Any  # variances of the row's readings, larger beyond the gate
-    beyond: Any  # 1 / variance expected where a reading is beyond it, else 0
-    Q: Any  # growth of the covariance over the row
-    K: Any  # gain of one reading
-    HP: Any
-    H: Any  # Sparse (m, r)
-    F: Any  # Sparse (r, r)
-    A: Any  # Sparse (r, r): Jacobian of the drift, from AH
-    AA: Any
-    AH: Any  # Jacobian of drift and readings (nx + m, nx)
-    FP: Any
-    PF: Any
-    base: Any  # drift and readings (nx + m,) at the mean
-    probe: Any  # a mean with one state moved
-    moved: Any  # drift and readings there
-    whole: Any  # a Jacobian of all states as they are (nx + m, nx)
-    work: Any  # the model's scratch
-    lanes: Any  # Lanes of moved states
-    per_change: Any  # (width,) 1 / how far a state is moved, 0 beyond the last
-
-
-class Lanes(NamedTuple):
-    """What the model takes and gives of SIMD_WIDTH states, inputs and vehicles, a column each."""
-
-    x: Any
-    u: Any
-    p: Any
-    work: Any
-    out: Any
-
-
-@compiled()
-def in_every_lane(values, out):
-    """Numbers (n,) into (n, SIMD_WIDTH)."""
-    rows = simd_blocks(out)
-    for i in range(np.uint64(values.size)):
-        rows[i] = values[i]
-
-
-@compiled(makes_arrays=True)
-def lanes_of(nx, nu, p, work_size, readings):
-    """Lanes for so many states, inputs and readings, each with the parameters `p`.
-
-    Args:
-        nx, nu, readings: how many states, inputs, readings. p: parameter vector.
-        work_size: of the model's scratch.
-    """
-    lanes = Lanes(
-        aligned(nx, SIMD_WIDTH), aligned(nu, SIMD_WIDTH), aligned(p.size, SIMD_WIDTH),
-        aligned(work_size, SIMD_WIDTH), aligned(nx + readings, SIMD_WIDTH),
-    )  # fmt: skip
-    in_every_lane(p, lanes.p)
-    return lanes
-
-
-MODEL = types.NamedTuple(
-    [STEP, MEASURE, STEP, boolean[::1], boolean[::1], _A, int64, int64[:, ::1], boolean, LANES_STEP,
-     LANES_MEASURE, LANES_STEP], CompiledModel
-)  # fmt: skip
-STRENGTH = types.NamedTuple([_N, _M], Strength)
-RUN_DATA = types.NamedTuple([_A, _M, _M, STRENGTH], RunData)
-VARIANCES = types.NamedTuple([_A, _M, _A, _A, _A], Variances)
-GAINS = types.NamedTuple([float32[:, ::1], _A, float32[:, :, ::1], _N], Gains)
-PATH = types.NamedTuple([float32[:, :, ::1], _N, _M, _N, float32[:, :, ::1], _A], Path)
-TRACE = types.NamedTuple([_M, _M, GAINS, PATH], Trace)
-COVARIANCES = types.NamedTuple([float64[:, :, ::1], _N], Covariances)
-
-
-@typeof_impl.register(CompiledModel)
-def _type_of_model(model: CompiledModel, context: Any) -> types.Type:
-    """MODEL, whatever numba would find out: to look at the functions costs 50 us a call."""
-    return MODEL
-
-
-@compiled()
-def how_many(shown):
-    """Of states that any reading shows; see Gains."""
-    count = 0
-    while count < shown.size and shown[count] >= 0:
-        count += 1
-    return count
-
-
-# --- linearise --------------------------------------------------------------------------------------
-
-
-@compiled(types.void(STEP, _A, _A, float64, _A, _A, _A, _A, _A, _A, _M), **REORDER)
-def differences(flow, x, u, dt, p, work, scale, base, probe, moved, out):
-    """Jacobian in the state of a flow, or of its first values, by forward differences.
-
-    Args:
-        flow: ``(x, u, dt, p, work, out)``. x, u, dt, p, work: at what, with which scratch.
-        scale: (nx,) how far each state is moved. base: what the flow gives at `x`.
-        probe, moved: scratch, as long as `x` and as what the flow gives.
-        out: (len(base), nx or more).
-    """
-    nx = x.size
-    for j in range(nx):
-        for i in range(nx):
-            probe[i] = x[i]
-        probe[j] += scale[j]
-        flow(probe, u, dt, p, work, moved)
-        per_change = 1.0 / scale[j]
-        for i in range(base.size):
-            out[i, j] = (moved[i] - base[i]) * per_change
-
-
-@compiled(**REORDER)
-def _linearise_in_lanes(model, u, dt, w):
-    """`_linearise` with SIMD_WIDTH states moved at once; after the last comes one that is not."""
-    nx, blocks = np.uint64(w.x.size), np.uint64(w.per_change.size // SIMD_WIDTH)
-    out, table, per_change = simd_blocks(w.lanes.out), simd_blocks(w.AH), simd_blocks(w.per_change)
-    in_every_lane(u, w.lanes.u)
-    for b in range(w.x.size // SIMD_WIDTH + 1):
-        first = b * SIMD_WIDTH
-        in_every_lane(w.x, w.lanes.x)
-        for j in range(first, min(first + SIMD_WIDTH, w.x.size)):
-            w.lanes.x[w.order[j], j - first] += model.scale[w.order[j]]
-        model.drift_of_lanes(w.lanes.x, w.lanes.u, dt, w.lanes.p, w.lanes.work, w.lanes.out)
-        for i in range(nx):
-            table[i * blocks + np.uint64(b)] = out[np.uint64(w.order[i])]
-        for i in range(nx, np.uint64(w.base.size)):
-            table[i * blocks + np.uint64(b)] = out[i]
-    for i in range(np.uint64(w.base.size)):
-        w.base[i] = base = w.AH[i, nx]
-        for b in range(blocks):
-            table[i * blocks + b] = (table[i * blocks + b] - base) * per_change[b]
-
-
-@compiled(**REORDER)
-def _linearise(model, u, dt, p, w):
-    """Jacobians of the drift and of the readings at the mean, one under the other, into AH."""
-    if model.has_lanes and w.per_change.size > w.x.size:
-        _linearise_in_lanes(model, u, dt, w)
-        return
-    model.drift_and_readings(w.x, u, dt, p, w.work, w.base)
-    differences(
-        model.drift_and_readings,
-        w.x,
-        u,
-        dt,
-        p,
-        w.work,
-        model.scale,
-        w.base,
-        w.probe,
-        w.moved,
-        w.whole,
-    )
-    for i in range(w.base.size):
-        row = w.order[i] if i < w.x.size else i
-        for j in range(w.x.size):
-            w.AH[i, j] = w.whole[row, w.order[j]]
-
-
-@compiled()
-def _take_shown(first, w, A):
-    """Into A those rows of AH from `first` on, and of them the states that any reading shows."""
-    long, wide = np.uint64(w.AH.shape[1] // SIMD_WIDTH), np.uint64(A.values.shape[1] // SIMD_WIDTH)
-    rows, taken = simd_blocks(w.AH), simd_blocks(A.values)
-    for i in range(np.uint64(A.counts.size)):
-        since = (np.uint64(first) + i) * long
-        for b in range(wide):
-            taken[i * wide + b] = rows[since + b]
-
-
-@compiled()
-def _find_shown(AH, order, channels, shown):
-    """Add to the states that any reading shows, itself or through what other states do with it.
-
-    The others do nothing to the likelihood: their covariances and gains need not be known. Of a
-    helicopter without a measured position these are north and east, and actuators without lags.
-
-    Args:
-        AH: (nx + m, nx or more) Jacobian of drift and readings. order: (nx,) of its states.
-        channels: (m,) which of them have readings. shown: (nx,) truths, in place.
-    """
-    nx, more = shown.size, True
-    while more:
-        more = False
-        for j in range(nx):
-            for i in range(AH.shape[0]):
-                counts = shown[order[i]] if i < nx else channels[i - nx]
-                if counts and AH[i, j] != 0.0 and not shown[order[j]]:
-                    shown[order[j]] = more = True
-
-
-@compiled()
-def _shows_more(w):
-    """Whether a reading shows a state that none did before."""
-    nx, r, blocks = w.x.size, w.K.size, np.uint64(w.AH.shape[1] // SIMD_WIDTH)
-    rows, found = simd_blocks(w.AH), 0
-    for b in range(r // SIMD_WIDTH, blocks):
-        there = 0
-        for i in range(w.AH.shape[0]):
-            if i < r or (i >= nx and w.channels[i - nx]):
-                there |= lanes_that(negated(rows[np.uint64(i) * blocks + np.uint64(b)] == 0.0))
-        found |= there >> max(r - SIMD_WIDTH * b, 0)
-    return found != 0
-
-
-@compiled(types.boolean(boolean[::1], SPARSE, _M, SPARSE), **REORDER)
-def exponential(exact, A, AA, F):
-    """Jacobian F of a row as the exponential of that of its drift, A, to third order.
-
-    F = I + A (I + A/2 (I + A/3)), a row at a time.
-
-    Args:
-        exact: (nx,) states that the drift takes exactly; their rows are I + A.
-        A: Jacobian of the drift. AA: scratch (nx, padded). F: out.
-
-    Returns:
-        False where the row is too long for the series; F is not changed then.
-    """
-    nx = exact.size
-    largest = 0.0
-    for i in range(nx):
-        if not exact[i]:
-            largest = max(largest, abs(A.values[i, i]))
-    if largest > MOST_DECAY:
-        return False
-    find_non_zeros(A)
-    multiply(A, A.values, AA)
-    blocks = np.uint64(F.values.shape[1] // SIMD_WIDTH)
-    first, second, all_of_them = simd_blocks(A.values), simd_blocks(AA), simd_blocks(F.values)
-    for i in range(np.uint64(nx)):
-        for b in range(blocks):
-            total = first[i * blocks + b]
-            if not exact[i]:
-                total += 0.5 * second[i * blocks + b]
-                for c in range(A.counts[i]):
-                    a = np.uint64(A.places[i, c])
-                    total += A.values[i, a] / 6.0 * second[a * blocks + b]
-            all_of_them[i * blocks + b] = total
-        F.values[i, i] += 1.0
-    find_non_zeros(F)
-    return True
-
-
-@compiled(**REORDER)
-def _transition(model, u, dt, p, w):
-    """F of a row: by the series of the exponential, else by differences of the step itself."""
-    _take_shown(0, w, w.A)
-    if not exponential(w.exact, w.A, w.AA, w.F):
-        differences(
-            model.step, w.x, u, dt, p, w.work, model.scale, w.x_next, w.probe, w.moved[: w.x.size],
-            w.whole,
-        )  # fmt: skip
-        for i in range(w.K.size):
-            for j in range(w.K.size):
-                w.F.values[i, j] = w.whole[w.order[i], w.order[j]]
-        find_non_zeros(w.F)
-
-
-@compiled(inline="always", **REORDER)  # a call of its own rounds the last bit otherwise
-def _rescaled(F, ratio):
-    """The same Jacobian for another step: rows of slow states follow the step to first order."""
-    nx = F.counts.size
-    for i in range(nx):
-        if F.values[i, i] > 0.5:
-            for j in range(nx):
-                own = 1.0 if i == j else 0.0
-                F.values[i, j] = own + ratio * (F.values[i, j] - own)
 
 
 # --- correct ----------------------------------------------------------------------------------------
@@ -578,16 +161,6 @@ def growth(dt, decay):
     return -math.expm1(-2.0 * decay * dt) / (2.0 * decay)
 
 
-@compiled()
-def strength_changes(strength, k, other):
-    """Whether process noise has another strength in row `k` than in the row `other`.
-
-    Args:
-        strength: of the process noise. k, other: rows.
-    """
-    return strength.block.size > 0 and strength.block[k] != strength.block[other]
-
-
 @compiled(**REORDER)
 def _grow(assumed, dt, strength, k, w):
     """Growth of the covariance over row `k`, of `dt` seconds, into Q."""
@@ -660,10 +233,10 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
         fresh = k % refresh == 0
         if fresh:
             _make_symmetric(w.P, r)
-            _linearise(model, u, dt, p, w)
-            if _shows_more(w):
+            linearise(model, u, dt, p, w)
+            if shows_more(w):
                 return log_likelihood, deweighted, True
-            _take_shown(w.x.size, w, w.H)
+            take_shown(w.x.size, w, w.H)
             find_non_zeros(w.H)
             if keep:
                 _store_matrix(w.H.values, m, r, trace.gains.H[k // refresh])
@@ -713,13 +286,13 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
         changed = True
         if fresh or abs(dt - dt_of_F) > 0.5 * dt_of_F:
             if not fresh or k == 0:  # the first readings move the mean far
-                _linearise(model, u, dt, p, w)
-                if _shows_more(w):
+                linearise(model, u, dt, p, w)
+                if shows_more(w):
                     return log_likelihood, deweighted, True
-            _transition(model, u, dt, p, w)
+            transition(model, u, dt, p, w)
             dt_of_F = dt_now = dt
         elif abs(dt - dt_now) > SAME_STEP * dt_now:
-            _rescaled(w.F, dt / dt_now)
+            rescaled(w.F, dt / dt_now)
             dt_now = dt
         else:
             changed = False
@@ -736,48 +309,6 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
 
 
 @compiled(makes_arrays=True)
-def _arrays_of(model, run, assumed, p, shown, channels):
-    """The arrays of a pass, at the run's first row.
-
-    Args:
-        shown: (nx,) whether any reading shows a state. channels: (m,) whether the run has a reading.
-    """
-    nx, m = assumed.x0.size, assumed.R.size
-    order, place_of, exact = np.zeros(nx, np.int64), np.full(nx, -1), np.zeros(nx, np.bool_)
-    r = others = 0
-    for j in range(nx):
-        if shown[j]:
-            order[r], place_of[j], exact[r] = j, r, model.exact[j]
-            r += 1
-        else:
-            others += 1
-            order[nx - others] = j
-    places = np.zeros(model.noise_places.shape, np.int64)
-    for e in range(places.shape[0]):
-        places[e, 0] = place_of[model.noise_places[e, 0]]
-        places[e, 1] = place_of[model.noise_places[e, 1]]
-    long, wide = padded(nx), padded(r)
-    scratch = model.work_size if model.has_lanes else 0
-    w = _Filter(
-        order=order, place_of=place_of, places=places, exact=exact[:r],
-        channels=channels, x=assumed.x0.copy(), P=aligned(r, wide), correction=np.zeros(r),
-        x_next=np.zeros(nx), h=np.zeros(m), v=np.zeros(m), noise=np.zeros(m),
-        beyond=np.zeros(m), Q=aligned(r, wide), K=np.zeros(r), HP=aligned(1, wide)[0],
-        H=with_places(aligned(m, wide), r), F=with_places(aligned(r, wide), r),
-        A=with_places(aligned(r, wide), r), AA=aligned(r, wide), AH=aligned(nx + m, long),
-        FP=aligned(wide, wide), PF=aligned(wide, wide), base=np.zeros(nx + m), probe=np.zeros(nx),
-        moved=np.zeros(nx + m), whole=np.zeros((nx + m, nx)), work=np.zeros(model.work_size),
-        lanes=lanes_of(nx, run.u.shape[1], p, scratch, m), per_change=aligned(1, long)[0],
-    )  # fmt: skip
-    for j in range(nx):
-        w.per_change[j] = 1.0 / model.scale[order[j]]
-    for i in range(r):
-        for j in range(r):
-            w.P[i, j] = assumed.P0[order[i], order[j]]
-    return w
-
-
-@compiled(makes_arrays=True)
 def _channels_read(z):
     """Which channels (m,) have any reading in z (n, m)."""
     found = np.zeros(z.shape[1], np.bool_)
@@ -789,7 +320,7 @@ def _channels_read(z):
 
 @compiled_when_called(
     types.Tuple((float64, int64))(
-        MODEL, RUN_DATA, VARIANCES, _A, float64, int64, TRACE, COVARIANCES
+        MODEL, RUN_DATA, VARIANCES, VECTOR, float64, int64, TRACE, COVARIANCES
     ),
     makes_arrays=True,
     **REORDER,
@@ -817,12 +348,12 @@ def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
     shown = np.full(nx, True)
     channels = _channels_read(run.z)
     if covariances.P.shape[0] == 0:
-        w = _arrays_of(model, run, assumed, p, shown, channels)
-        _linearise(model, run.u[0], run.dt[0], p, w)
+        w = arrays_of(model, run, assumed, p, shown, channels)
+        linearise(model, run.u[0], run.dt[0], p, w)
         shown[:] = False
-        _find_shown(w.AH, w.order, channels, shown)
+        find_shown(w.AH, w.order, channels, shown)
     while True:
-        w = _arrays_of(model, run, assumed, p, shown, channels)
+        w = arrays_of(model, run, assumed, p, shown, channels)
         for j in range(nx):
             trace.gains.shown[j] = w.order[j] if j < w.K.size else -1
         log_likelihood, beyond, more = _filter_rows(
@@ -833,54 +364,6 @@ def filter_pass(model, run, assumed, p, gate, refresh, trace, covariances):
         if shown.all():  # a Jacobian that is not finite shows anything
             return -np.inf, beyond
         known = shown.sum()
-        _find_shown(w.AH, w.order, channels, shown)
+        find_shown(w.AH, w.order, channels, shown)
         if shown.sum() == known:
             shown[:] = True
-
-
-@compiled_when_called(types.void(MODEL, _M, _A, _A, _M), makes_arrays=True)
-def read(model, states, u, p, out):
-    """Readings of states, each by itself.
-
-    Args:
-        model: a CompiledModel. states: (s, nx). u: (nu,) the input of them all.
-        p: (np,) the model's parameters. out: (s, m) readings.
-    """
-    work = np.zeros(model.work_size)
-    for s in range(states.shape[0]):
-        model.measure(states[s], u, p, work, out[s])
-
-
-@compiled_when_called(boolean(MODEL, _A, _M, _A, _A, int64, _N, _A), makes_arrays=True)
-def fly_open_loop(model, dt, u, x, p, first, targets, out):
-    """Predict alone: fly from row `first` with the recorded inputs; read each channel at its own row.
-
-    Args:
-        model: a CompiledModel. dt, u: as in RunData. p: (np,) the model's parameters.
-        x: (nx,) state at `first`; on return the state at the last target.
-        targets: (m,) row at which each channel is read, or -1. out: (m,) readings.
-
-    Returns:
-        False where the flight diverged.
-    """
-    work = np.zeros(model.work_size)
-    x_next = np.zeros(x.size)
-    h = np.zeros(out.size)
-    last = targets.max()
-    for k in range(first, last + 1):
-        wanted = False
-        for i in range(out.size):
-            if targets[i] == k:
-                wanted = True
-        if wanted:
-            model.measure(x, u[k], p, work, h)
-            for i in range(out.size):
-                if targets[i] == k:
-                    out[i] = h[i]
-        if k < last:
-            model.step(x, u[k], dt[k], p, work, x_next)
-            for j in range(x.size):
-                x[j] = x_next[j]
-                if not abs(x[j]) < 1e4:
-                    return False
-    return True

@@ -6,17 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import float64, int64, types
 
-from coax_env.estimation.kalman import (
-    _A,
-    _M,
-    _N,
-    SAME_STEP,
-    STRENGTH,
-    TRACE,
-    growth,
-    how_many,
-    strength_changes,
-)
+from coax_env.estimation.compiled_model import INDICES, MATRIX, VECTOR
+from coax_env.estimation.kalman import SAME_STEP, growth
+from coax_env.estimation.pass_data import STRENGTH, TRACE, how_many, strength_changes
 from coax_env.estimation.sparse import (
     IN_ORDER,
     REORDER,
@@ -96,7 +88,7 @@ class Slopes(NamedTuple):
     reading_expected: np.ndarray
 
 
-SLOPES = types.NamedTuple([_M, _M, _A, _M, _M, _A, _A], Slopes)
+SLOPES = types.NamedTuple([MATRIX, MATRIX, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR], Slopes)
 
 
 class _Backward(NamedTuple):
@@ -248,7 +240,7 @@ def _score_rows(dt, strength, trace, places, q, decay, gate, refresh, block, out
 
 
 @compiled_when_called(
-    types.void(_A, STRENGTH, TRACE, int64[:, ::1], _A, _A, float64, int64, _N, SLOPES),
+    types.void(VECTOR, STRENGTH, TRACE, int64[:, ::1], VECTOR, VECTOR, float64, int64, INDICES, SLOPES),
     makes_arrays=True, **REORDER,
 )  # fmt: skip
 def score_pass(dt, strength, trace, places, q, decay, gate, refresh, block, out):

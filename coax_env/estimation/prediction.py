@@ -16,7 +16,7 @@ import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
-from coax_env.estimation import kalman
+from coax_env.estimation import compiled_model
 from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
@@ -150,7 +150,7 @@ def _unmoved(
     for row, first in zip(readings, run.start_rows, strict=True):
         here = np.full(len(CHANNELS), first)
         x = run.states[first].copy()
-        kalman.fly_open_loop(engine.compiled, dt, inputs, x, p, first, here, row)
+        compiled_model.fly_open_loop(engine.compiled, dt, inputs, x, p, first, here, row)
     return readings
 
 
@@ -173,7 +173,7 @@ def _fly_all(
         for gust, out in ((0.0, predicted), (1.0, decaying)):
             x = run.states[first].copy()
             x[GUSTS] *= gust
-            finite &= kalman.fly_open_loop(
+            finite &= compiled_model.fly_open_loop(
                 engine.compiled, dt, inputs, x, p, first, targets[s], out[s]
             )
     return predicted, decaying, finite
@@ -267,7 +267,7 @@ def _spread(
     x0[GUSTS] = 0.0
 
     def fly(x: np.ndarray, out: np.ndarray) -> None:
-        kalman.fly_open_loop(engine.compiled, dt, inputs, x, p, first, targets, out)
+        compiled_model.fly_open_loop(engine.compiled, dt, inputs, x, p, first, targets, out)
 
     fly(x0.copy(), base)
     for j in range(GUSTS.start):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coax_env.estimation import kalman
+from coax_env.estimation import compiled_model
 from coax_env.estimation.engine import Engine, RunPass
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
@@ -106,7 +106,7 @@ def _flown(
     readings = np.empty(len(CHANNELS))
     target = np.full(len(CHANNELS), -1, np.int64)
     x = np.full(run.states.shape[1], np.nan)
-    compiled = kalman.CompiledModel.of(model)
+    compiled = compiled_model.CompiledModel.of(model)
     for k, row in enumerate(rows):
         if begins[k]:
             x = run.states[row].copy()
@@ -114,7 +114,7 @@ def _flown(
             x[GUST_MOMENT] = 0.0
         elif np.isfinite(x).all():
             target[0] = row
-            if not kalman.fly_open_loop(
+            if not compiled_model.fly_open_loop(
                 compiled, dt, inputs, x, p, rows[k - 1], target, readings
             ):  # fmt: skip
                 x = np.full_like(x, np.nan)
