@@ -86,7 +86,7 @@ def test_signatures_are_what_moving_the_parameter_does(tmp_path, also):
         vector = model.vector({**values, name: values[name] + change})
         e = [np.zeros(run.record.z.shape) for run in passes]
         for i, run in enumerate(passes):
-            assert engine._frozen(i, run, vector, e[i])
+            assert engine.frozen(i, run, vector, e[i])
         return np.concatenate(e)
 
     e = innovations("mass", 0.0)

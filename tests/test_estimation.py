@@ -16,15 +16,10 @@ from scipy.signal import lfilter
 from scipy.stats import binom, multivariate_normal
 
 from coax_env.estimation import transition
-from coax_env.estimation.engine import (
-    REFRESH,
-    Engine,
-    Estimate,
-    RunPass,
-    _Buffers,
-)
+from coax_env.estimation.engine import Engine, Estimate
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.quadratic import Linearised, Quadratic, bounded_solve
+from coax_env.estimation.run_passes import REFRESH, Buffers, RunPass
 from coax_env.estimation.sparse import padded, with_places
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.estimation.whiteness import whiteness
@@ -488,12 +483,12 @@ def test_a_stiff_row_has_the_jacobian_of_the_step():
     values = {**TRUTH, "damping": 40.0}
     record = swing(1, n=40, values=values)
     assert values["damping"] * DT > transition.MOST_DECAY
-    _, along = Engine(stiff, [record])._filter_run(
+    _, along = Engine(stiff, [record]).filter_run(
         0,
         stiff.vector(values),
         replace(NOISE, reading=dict.fromkeys(CHANNELS, 0.1)),
-        _Buffers(),
-        _Buffers(),
+        Buffers(),
+        Buffers(),
     )
     k, d = values["stiffness"], values["damping"]
     F = [[1.0 - DT * DT * k, DT - DT * DT * d], [-DT * k, 1.0 - DT * d]]
@@ -672,13 +667,13 @@ def test_one_step_is_one_step():
 def flown(monkeypatch) -> list[int]:
     """Grows by one with every filter pass over a record."""
     passes: list[int] = []
-    filter_run = Engine._filter_run
+    filter_run = Engine.filter_run
 
     def counted(self, i, *args, **more):
         passes.append(i)
         return filter_run(self, i, *args, **more)
 
-    monkeypatch.setattr(Engine, "_filter_run", counted)
+    monkeypatch.setattr(Engine, "filter_run", counted)
     return passes
 
 

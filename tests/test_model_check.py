@@ -29,10 +29,10 @@ from coax_env.diagnosis.model_check import (
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import held_out_before, one_step_against_a_second
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.estimation.engine import RunPass
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.prediction import RunReplay
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.model.layout import CHANNELS
 

@@ -10,9 +10,11 @@ from numpy.testing import assert_allclose
 from test_estimation import Pendulum
 
 from coax_env.estimation import frozen_gains, noise_score
-from coax_env.estimation.engine import GATE, Engine, _Buffers, _trace
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.estimation.linearised_runs import moves_of, signatures_of
+from coax_env.estimation.run_passes import GATE, Buffers, trace_of
 from coax_env.estimation.sparse import aligned, padded
 from coax_env.estimation.state_space import STEADY, Noise, Record, part
 from coax_env.kernel.compilation import pointer
@@ -33,7 +35,7 @@ def passes():
     p = engine.model.vector(engine.model.bare_values, noise)
     decaying = np.flatnonzero(engine.model.process_noise(noise, p)[1] > 0.0)
     both = [
-        engine._filter_run(0, p, noise, _Buffers(), _Buffers(), rows, decaying)
+        engine.filter_run(0, p, noise, Buffers(), Buffers(), rows, decaying)
         for rows in (None, np.array([50]))
     ]
     return engine, p, noise, both
@@ -69,8 +71,8 @@ def test_slopes_in_the_noise_are_the_same(passes):
             np.zeros((2, q.size)), np.zeros(nx), np.zeros(m),
         )  # fmt: skip
         noise_score.score_pass(
-            engine.intervals[0], STEADY, _trace(run, at), engine.compiled.noise_places, q, decay, GATE,
-            engine._refresh[0], block, slopes,
+            engine.intervals[0], STEADY, trace_of(run, at), engine.compiled.noise_places, q, decay,
+            GATE, engine.refresh[0], block, slopes,
         )  # fmt: skip
         found.append(slopes)
     for few, every in zip(*found, strict=True):
@@ -81,14 +83,14 @@ def test_signatures_are_the_same(passes):
     engine, p, noise, both = passes
     free = engine.model.base_parameters() + engine.model.effect_parameters("wind")
     values = {f.name: f.value for f in free} | engine.model.bare_values
-    moves = engine._moves(values, noise, free)
+    moves = moves_of(engine.model, values, noise, free)
     found = []
     for run, at in both:
         by_channel = np.zeros((len(free), run.innovations.shape[1]))
         J = aligned(run.per_sigma.size, padded(len(free) + 1))
         whole = frozen_gains.Portion(0, run.innovations.shape[0], 0)
         none = frozen_gains.Kept(np.zeros((0, 0, 0), np.float32), np.zeros(0, np.int64))
-        engine._signatures(0, run, at, p, moves, by_channel)(whole, J, none)
+        signatures_of(engine, 0, run, at, p, moves, by_channel)(whole, J, none)
         found.append(J)
     few, every = found
     assert_allclose(few, every, atol=1e-5 * np.abs(every).max())

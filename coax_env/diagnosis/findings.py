@@ -13,11 +13,11 @@ from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.trust import Trust, of_line
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.changing_model import BEFORE
-from coax_env.estimation.engine import RunPass
 from coax_env.estimation.fitted_vehicle import median_step, with_timing
 from coax_env.estimation.helicopter_noise import level_unit
 from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.model import effects

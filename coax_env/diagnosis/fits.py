@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation.engine import NoiseScore, RunPass, objective
+from coax_env.estimation.engine import NoiseScore, objective
 from coax_env.estimation.helicopter_noise import (
     JITTER_LEVEL,
     JITTER_MEMORY,
@@ -19,6 +19,7 @@ from coax_env.estimation.helicopter_noise import (
 from coax_env.estimation.noise_levels import fit_noise, level_slopes
 from coax_env.estimation.parted_engine import AT, PartedEngine, joint_noise, of_part
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.model.effect_registry import GUST_MEMORY
 

@@ -26,7 +26,8 @@ import numpy as np
 from coax_env.diagnosis.fits import fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.shocks import engine_of
-from coax_env.estimation.engine import Engine, RunPass
+from coax_env.estimation.engine import Engine
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Record
 from coax_env.estimation.whiteness import is_white
 from coax_env.model import parameters as P

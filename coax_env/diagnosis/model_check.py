@@ -24,8 +24,8 @@ from scipy.stats import chi2, norm
 
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation import compiled_model
-from coax_env.estimation.engine import RunPass
 from coax_env.estimation.prediction import TAIL
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.model.layout import ANGLES, CHANNELS
 from coax_env.plain_words import channel_name

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from coax_env.diagnosis.fits import at_optimum, converged, fitted, stepped, without
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import Score, damping_gain, exchanges, inflation, is_large, loss
-from coax_env.estimation.engine import RunPass
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.run_passes import RunPass
 from coax_env.model import effects
 
 TOO_SMALL = "too small to matter in prediction"

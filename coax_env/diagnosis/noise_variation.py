@@ -18,8 +18,9 @@ import numpy as np
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Asked, Known, information, same_way
 from coax_env.diagnosis.scores import lost
-from coax_env.estimation.engine import Engine, RunPass
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.run_passes import RunPass
 
 SENSORS = (
     ("rpm_upper", "rpm_lower"), ("p", "q", "r"), ("ax", "ay", "az"), ("phi", "theta"), ("psi",), ("h",),

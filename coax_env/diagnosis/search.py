@@ -25,8 +25,8 @@ from coax_env.diagnosis.fits import (
 from coax_env.diagnosis.moves import Proposal, accepted, add, drop, swaps, trials
 from coax_env.diagnosis.problem import SERVO_FORMS, Fit, Problem
 from coax_env.diagnosis.scores import Score, most_gains, scores
-from coax_env.estimation.engine import RunPass
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.run_passes import RunPass
 
 
 def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:

@@ -25,9 +25,9 @@ import numpy as np
 from coax_env.diagnosis.fits import fitted, linearise, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
-from coax_env.estimation.engine import RunPass
 from coax_env.estimation.helicopter import MOST_USUAL_SIZES, HeliModel
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import whiteness
 from coax_env.kernel.compilation import compiled

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.estimation.engine import Engine, NoiseScore, RunPass
+from coax_env.estimation.engine import Engine, NoiseScore
 from coax_env.estimation.quadratic import Linearised, penalty
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
 
 AT = "@"

@@ -17,11 +17,12 @@ import numpy as np
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
 from coax_env.estimation import compiled_model
-from coax_env.estimation.engine import Engine, RunPass
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import AXES, fitted_levels, sensor_std, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Noise
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model import state as S

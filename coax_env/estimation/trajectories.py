@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from coax_env.estimation import compiled_model
-from coax_env.estimation.engine import Engine, RunPass
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.estimation.run_passes import RunPass
 from coax_env.logs.flight import Flight
 from coax_env.model.layout import ATTITUDE, CHANNELS, GUST_FORCE, GUST_MOMENT, POSITION
 from coax_env.model.vehicle import Vehicle

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 from scipy.stats import chi2
 
-from coax_env.estimation.engine import RunPass
+from coax_env.estimation.run_passes import RunPass
 
 LAGS = 20  # readings back to which correlations are taken
 SETTLING = 1.0  # [s] at the start of each run that are not counted

@@ -20,10 +20,11 @@ import numpy as np
 from scipy.signal import lfilter, savgol_filter
 
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.estimation.engine import Engine, RunPass
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise
 from coax_env.estimation.noise_levels import fit_noise
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.kernel.compilation import compiled
 from coax_env.logs.flight import Flight

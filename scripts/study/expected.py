@@ -21,9 +21,9 @@ from injector_sensors import SENSORS
 
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.shocks import in_shocks, with_shocks
-from coax_env.estimation.engine import RunPass
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise, still_air
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Noise
 from coax_env.logs.flight import Flight
 from coax_env.model.effects import CATALOGUE

@@ -8,8 +8,9 @@ import numpy as np
 from coax_env.comparison.two_logs.coordinates import ROTOR_SCALE, Coordinate, moved
 from coax_env.diagnosis.problem import Fit
 from coax_env.estimation.changing_model import ChangingModel
-from coax_env.estimation.engine import BLOCK, Engine
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import ROTORS
+from coax_env.estimation.linearised_runs import BLOCK
 from coax_env.model.layout import N_COMMANDS
 
 

@@ -13,10 +13,10 @@ from coax_env.diagnosis.onsets.every_moment import Scored
 from coax_env.diagnosis.onsets.moment import grown_or_step, moved_to_best
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.changing_model import BEFORE, Lap
-from coax_env.estimation.engine import RunPass
 from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.whiteness import whiteness
 
 CLEAR = 3.0
