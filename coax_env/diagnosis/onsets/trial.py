@@ -89,6 +89,10 @@ def fitted_change(
     trial = _with_noise_of(problem, trial, state.fit)
     trial, rivals = _compared(state, problem, trial, effect)
     trial, quadratic = quadratic_at(problem, trial, problem.free(trial.active))
+    gained = rivals.nearest() - trial.objective
+    if gained > problem.settings.tie and _is_coloured(problem, trial, quadratic, effect):
+        trial = converged(problem, trial)  # or its noise, on the way, is what is coloured
+        trial, quadratic = quadratic_at(problem, trial, problem.free(trial.active))
     onset = _worth(state, problem, trial, rivals, quadratic, found)
     changing_state = Changing(problem, trial, quadratic, {**state.onsets, effect: onset})
     return Trial(changing_state, onset, step.objective - trial.objective)
@@ -181,15 +185,20 @@ def _worth(
     without = state.problem.engine.filter(same.values, trial.noise)
     with_it = problem.engine.filter(trial.values, trial.noise)
     lasting = _lasting(without, with_it, found.moment) / inflation
-    white = whiteness(with_it, problem.model.channels)
-    shows = channels_of(problem, trial, quadratic, effect)
     if (
         min(lasting, beside_constant) < problem.settings.tie
         or not _matters(problem, trial, effect)
-        or any(c in white and not white[c].white for c in shows)
+        or _is_coloured(problem, trial, quadratic, effect)
     ):
         nats = -math.inf
     return replace(found, nats=nats)
+
+
+def _is_coloured(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:
+    """Whether a channel that shows the effect is."""
+    white = whiteness(problem.engine.filter(fit.values, fit.noise), problem.model.channels)
+    shows = channels_of(problem, fit, quadratic, effect)
+    return any(c in white and not white[c].white for c in shows)
 
 
 def _matters(problem: Problem, fit: Fit, effect: str) -> bool:
