@@ -81,19 +81,20 @@ def prune(
         clear: known to be, and not weighed unless the quadratic doubts them.
 
     Returns:
-        the fit, refined where something was weighed, the quadratic at it, and the evidence of what is
-        left and was weighed.
+        the fit, refined where something was weighed, the quadratic at it, with the candidates then, and
+        the evidence of what is left and was weighed.
     """
     while True:
         fit = converged(problem, fit)
-        beside = problem if fit.active else problem.of_candidates(())  # for whom could they stand?
-        fit, quadratic = quadratic_at(beside, fit)
+        alone = problem.of_candidates(fit.active)
+        fit, quadratic = quadratic_at(alone, fit)
         better = _without_hopeless(problem, fit, quadratic)
         if better is not None:
             fit = better
             continue
         if fit.active and not _asked(problem, fit, quadratic, clear):
             return fit, quadratic, {}
+        beside = problem if fit.active else alone  # for whom could the candidates stand?
         fit, quadratic = quadratic_at(beside, refined(problem, fit))
         removals: dict[str, Removal] = {}
         for which in _asked(problem, fit, quadratic, clear):
