@@ -6,6 +6,7 @@ from bundled_flight import bundled
 from numpy.testing import assert_allclose
 
 from coax_env.estimation import engine as engines
+from coax_env.estimation import run_passes
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
@@ -98,7 +99,7 @@ def test_portions_of_a_run_are_the_run(flown, monkeypatch):
 def test_rows_between_jacobians_follow_the_clock():
     """Every 40 ms on a log faster than 100 Hz, every fourth row of a slower one."""
     rows = [
-        engines._rows_between_jacobians(np.full(50, 1.0 / rate)) for rate in (25, 100, 200, 500)
+        run_passes._rows_between_jacobians(np.full(50, 1.0 / rate)) for rate in (25, 100, 200, 500)
     ]
     assert rows == [4, 4, 8, 20]
 
