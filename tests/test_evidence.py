@@ -34,6 +34,7 @@ class Flights:
     def __init__(self, worth: dict[str, float], lacking: float = 0.0, mends: str = "") -> None:
         self.worth, self.lacking, self.mends = worth, lacking, mends
         self.asked: list[str] = []
+        self.refined: list[tuple[str, ...]] = []
 
     def objective(self, fit: Fit) -> float:
         missing = sum(nats for e, nats in self.worth.items() if e not in fit.active)
@@ -57,7 +58,7 @@ class Flights:
 
         stand_ins = {
             "converged": self.converged, "without": self.without, "loss": loss,
-            "refined": lambda problem, fit: fit,
+            "refined": lambda problem, fit: self.refined.append(fit.active) or fit,
             "fitted": lambda problem, fit, steps, held: self.converged(problem, fit),
             "noise_fitted": lambda problem, fit: fit,
             "quadratic_at": lambda problem, fit: (fit, None),
@@ -100,6 +101,14 @@ def test_what_is_worth_less_than_the_threshold_leaves_the_weakest_first(monkeypa
     assert {e: f.nats for e, f in found.items()} == pytest.approx(
         {"gyro_bias": CLEAR, "ground_effect": 1.1 * THRESHOLD}
     )
+
+
+def test_what_has_no_evidence_leaves_before_the_fit_is_refined(monkeypatch):
+    """A refit without it says so, too; what lacks less than a tie is asked of the refined fit."""
+    near = THRESHOLD - 0.5 * SETTINGS.tie
+    flights = Flights({"gyro_bias": CLEAR, "swash_offset": near, "yaw_damping": 0.1 * THRESHOLD})
+    flights.pruned(monkeypatch, GOOD)
+    assert flights.refined == [("gyro_bias", "swash_offset"), ("gyro_bias",)]
 
 
 def test_what_is_clear_is_weighed_once(monkeypatch):

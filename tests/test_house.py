@@ -108,8 +108,8 @@ def test_flights_are_read_without_a_model():
 
 
 ENGINE = (
-    "compiled_model engine frozen_gains kalman linearised_runs noise_levels noise_score pass_data"
-    " quadratic run_passes sparse state_space transition whiteness"
+    "compiled_model engine filter_arrays frozen_gains kalman linearised_runs noise_levels noise_score"
+    " pass_data quadratic run_passes sparse state_space transition whiteness"
 )
 
 

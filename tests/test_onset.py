@@ -1008,6 +1008,56 @@ def test_what_commands_explain_is_not_worth_a_fit(monkeypatch, gains):
     assert kept == (found[1:] if gains else found)
 
 
+@pytest.mark.parametrize(
+    ("drifts", "kept"),
+    [(30.0, {"servo_lag", "cg_offset", "wind"}), (90.0, {"servo_lag", "wind"}), (500.0, {"wind"})],
+)
+def test_what_drifts_explain_as_well_is_not_worth_a_fit(monkeypatch, drifts, kept):
+    """Less than half of what drifts are worth, and nothing beside them; wind stands beside them."""
+    found = scores(servo_lag=(50.0, 50.0), cg_offset=(40.0, 40.0), wind=(30.0, 30.0))
+    beside = scores(wind=(21.0, 5.5), servo_lag=(4.7, 4.7), cg_offset=(9.0, 2.0))
+    fit = Fit((), {}, Noise({"trim_force_z": 0.01}), objective=100.0)
+    problem = SimpleNamespace(settings=SETTINGS, of_candidates=lambda names: problem)
+    state = Changing(problem, fit, None, {})  # type: ignore[arg-type]
+    calm = replace(fit, noise=Noise({"trim_force_z": 1e-6}), objective=100.0 + drifts)
+    monkeypatch.setattr(search, "scored", lambda state: (state, beside))
+    steady = replace(state, fit=calm)
+    assert {s.effect for s in search._beyond_drifts(state, steady, found)} == kept
+    assert search._beyond_drifts(state, state, found) == found  # nothing drifts
+
+
+@pytest.mark.parametrize(
+    ("gained", "coloured", "closer"),
+    [(500.0, True, True), (500.0, False, False), (5.0, True, False)],
+)
+def test_colour_is_asked_of_a_fit_that_has_converged(monkeypatch, gained, coloured, closer):
+    """Its noise may be what is coloured on the way; what gains less than a tie is not asked."""
+    state, problem, trial, quadratic = weighed("begins", 1.0)
+    problem.free = lambda active: []
+    found = changes.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
+    rivals = trials.Rivals(replace(trial, objective=100.0 + gained), None)
+    stand_ins = {
+        "beginning": lambda *given: problem, "fitted": lambda of, fit, steps=3: trial,
+        "noise_fitted": lambda of, fit: fit, "moved_to_best": lambda *given: (problem, found),
+        "grown_or_step": lambda of, fit, found: (of, fit, found),
+        "_with_noise_of": lambda of, fit, other: fit, "_compared": lambda *given: (trial, rivals),
+        "converged": lambda of, fit: replace(fit, objective=90.0),
+        "quadratic_at": lambda of, fit, free: (fit, quadratic),
+        "_is_coloured": lambda of, fit, q, effect: coloured and fit.objective > 95.0,
+        "_worth": lambda state, of, fit, rivals, q, found: replace(found, nats=-fit.objective),
+    }  # fmt: skip
+    for name, stand_in in stand_ins.items():
+        monkeypatch.setattr(trials, name, stand_in)
+    moment = Moment("a", 9.0)
+    candidate = every_moment.Scored("gyro_bias", 20.0, moment, {"gyro_bias.x": 0.01}, False, 20.0)
+    steady = SimpleNamespace(fit=state.fit)
+    changing_state = Changing(problem, state.fit, quadratic, {})  # type: ignore[arg-type]
+    after = trials.fitted_change(changing_state, steady, candidate, {}, None)  # type: ignore[arg-type]
+    assert after is not None
+    ended = 90.0 if closer else 100.0
+    assert after.state.fit.objective == ended and after.onset.nats == -ended
+
+
 def trial_worth(nats: float, gained: float) -> trials.Trial:
     """A change that was fitted, and what it gained after its step."""
     best = changes.Onset("servo_lag", Moment("a", 9.0), 9.0, 0.1, 0.1, nats)

@@ -16,6 +16,7 @@ The passes that are compiled:
 compiled_model.py    a model's functions, their differences, flight without readings
 pass_data.py         what passes are given, and what they leave
 kalman.py            the extended Kalman filter
+filter_arrays.py     the arrays that it works in
 transition.py        its Jacobians, and which states any reading shows
 frozen_gains.py      its mean with the gains held: the signatures of parameters
 noise_score.py       the likelihood's slopes in the noise, by a pass back

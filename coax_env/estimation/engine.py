@@ -430,10 +430,10 @@ class Engine(RunPasses):
                 np.zeros(shape), np.zeros(nx), np.zeros(m),
             )  # fmt: skip
             with self.borrowed_buffers() as buffers:
-                run, at = self.filter_run(i, p, noise, buffers, buffers, decaying=decaying)
+                run, path = self.filter_run(i, p, noise, buffers, buffers, decaying=decaying)
                 if np.isfinite(run.log_likelihood):
                     noise_score.score_pass(
-                        self.intervals[i], self.records[i].strength, trace_of(run, at),
+                        self.intervals[i], self.records[i].strength, trace_of(run, path),
                         self.compiled.noise_places, q, decay, GATE, self.refresh[i], blocks[i],
                         slopes,
                     )  # fmt: skip

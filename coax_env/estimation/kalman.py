@@ -28,6 +28,7 @@ import numpy as np
 from numba import float64, int64, types
 
 from coax_env.estimation.compiled_model import MODEL, VECTOR
+from coax_env.estimation.filter_arrays import arrays_of
 from coax_env.estimation.pass_data import (
     COVARIANCES,
     RUN_DATA,
@@ -37,7 +38,6 @@ from coax_env.estimation.pass_data import (
 )
 from coax_env.estimation.sparse import REORDER, along, find_non_zeros, multiply, row_of_product
 from coax_env.estimation.transition import (
-    arrays_of,
     find_shown,
     linearise,
     rescaled,

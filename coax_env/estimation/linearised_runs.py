@@ -6,9 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from coax_env.estimation import frozen_gains, pass_data
+from coax_env.estimation import frozen_gains
 from coax_env.estimation.beginnings import Asked, Beginning, Moved, Sums, beginnings_pass
-from coax_env.estimation.run_passes import Buffers, PassJacobians, RunPass, RunPasses, trace_of
+from coax_env.estimation.pass_data import Path, RunData
+from coax_env.estimation.run_passes import Buffers, RunPass, RunPasses, gains_of, trace_of
 from coax_env.estimation.sparse import add_gram, aligned, padded
 from coax_env.estimation.state_space import FreeParameter, Model, Noise
 from coax_env.kernel.simd import SIMD_WIDTH
@@ -20,7 +21,7 @@ DIVERGED = 1e6  # whitened innovations [std] that only a diverging mean has
 
 
 @dataclass(frozen=True)
-class Moves:
+class ParameterMoves:
     """Each free parameter moved: vectors (np,) with one of them moved by steps (k,).
 
     probed: (k,) where a finite step is needed. reading_only: (k,) which never move the state.
@@ -36,12 +37,12 @@ class Moves:
 class LinearisedRun:
     """One run's part of `Linearised`, its blocks' slopes with it.
 
-    run, at: its pass. J: (readings, padded) signatures of its last blocks, k of them, then the
+    run, path: its pass. J: (readings, padded) signatures of its last blocks, k of them, then the
     innovations. wild: (k,) whose signatures were not finite.
     """
 
     run: RunPass
-    at: PassJacobians
+    path: Path
     J: np.ndarray
     wild: np.ndarray
     information: np.ndarray
@@ -51,7 +52,7 @@ class LinearisedRun:
 
 def moves_of(
     model: Model, values: Mapping[str, float], noise: Noise, free: Sequence[FreeParameter]
-) -> Moves:
+) -> ParameterMoves:
     """How far each parameter is moved, and the model's vectors then.
 
     Args:
@@ -67,7 +68,7 @@ def moves_of(
         for f, step in zip(free, steps, strict=True)
     ]
     reading_only = np.array([f.reading_only for f in free], bool)
-    return Moves(vectors, steps, probed, reading_only)
+    return ParameterMoves(vectors, steps, probed, reading_only)
 
 
 def linearise_run(
@@ -75,7 +76,7 @@ def linearise_run(
     i: int,
     p: np.ndarray,
     noise: Noise,
-    moves: Moves,
+    moves: ParameterMoves,
     buffers: Buffers,
     at_once: int,
     kept: frozen_gains.Kept = NONE_KEPT,
@@ -88,14 +89,14 @@ def linearise_run(
         buffers: for what is gone with the next pass in them.
         at_once: blocks whose signatures are in memory together. kept: states' derivatives, out.
     """
-    run, at = runs.filter_run(i, p, noise, Buffers(), buffers)
+    run, path = runs.filter_run(i, p, noise, Buffers(), buffers)
     count, edges, before = len(moves.vectors), *_block_edges(run)
     width = padded(count + 1)
     products, blocks = np.zeros((width, width)), np.zeros((edges.size - 1, count))
     by_channel = np.zeros((count, run.innovations.shape[1]))
     J = np.zeros((0, width))
     if np.isfinite(run.log_likelihood):
-        signatures = signatures_of(runs, i, run, at, p, moves, by_channel)
+        signatures = signatures_of(runs, i, run, path, p, moves, by_channel)
         probed = _probed_signatures(runs, i, run, p, moves, by_channel)
         e = run.innovations[np.isfinite(run.innovations)]
         for first in range(0, edges.size - 1, at_once):
@@ -117,22 +118,22 @@ def linearise_run(
     information[wild] = information[:, wild] = 0.0
     by_channel[wild] = 0.0
     blocks[:, wild] = 0.0
-    return LinearisedRun(run, at, J, wild, information, by_channel, blocks)
+    return LinearisedRun(run, path, J, wild, information, by_channel, blocks)
 
 
 def signatures_of(
     runs: RunPasses,
     i: int,
     run: RunPass,
-    at: PassJacobians,
+    path: Path,
     p: np.ndarray,
-    moves: Moves,
+    moves: ParameterMoves,
     by_channel: np.ndarray,
 ) -> Callable[[frozen_gains.Portion, np.ndarray, frozen_gains.Kept], None]:
     """Derivatives of a run's whitened innovations where a small step does.
 
     Args:
-        runs: model and records. i: which. run, at: its pass. p: (np,) the parameters there.
+        runs: model and records. i: which. run, path: its pass. p: (np,) the parameters there.
         moves: of the parameters. by_channel: (k, m), in place.
 
     Returns:
@@ -155,7 +156,7 @@ def signatures_of(
         np.array(sets), which, columns,
     )  # fmt: skip
     s = aligned(runs.compiled.exact.size, padded(columns.size + 1))
-    trace = trace_of(run, at)
+    trace = trace_of(run, path)
 
     def of_portion(portion: frozen_gains.Portion, J: np.ndarray, kept: frozen_gains.Kept) -> None:
         frozen_gains.signature_pass(
@@ -176,7 +177,12 @@ def signatures_of(
 
 
 def _probed_signatures(
-    runs: RunPasses, i: int, run: RunPass, p: np.ndarray, moves: Moves, by_channel: np.ndarray
+    runs: RunPasses,
+    i: int,
+    run: RunPass,
+    p: np.ndarray,
+    moves: ParameterMoves,
+    by_channel: np.ndarray,
 ) -> np.ndarray:
     """The same where a finite step is needed, by a mean pass each: (readings, probed)."""
     there = np.isfinite(run.innovations)
@@ -203,8 +209,7 @@ def _moved_innovations(
         for vector in vectors:
             yield e[there] if runs.frozen(i, run, vector, e) else np.full(there.sum(), np.nan)
         return
-    data = pass_data.RunData(runs.intervals[i], run.inputs, run.record.z)
-    gains = pass_data.Gains(run.gains, run.per_sigma, run.H, run.shown)
+    data, gains = RunData(runs.intervals[i], run.inputs, run.record.z), gains_of(run)
     for first in range(0, len(vectors), SIMD_WIDTH):
         some = vectors[first : first + SIMD_WIDTH]
         lanes = [*some, *[p] * (SIMD_WIDTH - len(some))]
@@ -248,7 +253,7 @@ def beginnings_of_run(
         np.zeros((a, width)), np.zeros((a, asked.beside.size, width)), np.zeros((a, pairs)),
         np.zeros((a, pairs)),
     )  # fmt: skip
-    beginnings_pass(trace_of(of.run, of.at), runs.refresh[i], Moved(of.J, kept), asked, sums)
+    beginnings_pass(trace_of(of.run, of.path), runs.refresh[i], Moved(of.J, kept), asked, sums)
     return [
         Beginning(i, int(row), slope[:k], across[:, :k].T, crossed, own)
         for row, slope, across, crossed, own in zip(rows, *sums, strict=True)

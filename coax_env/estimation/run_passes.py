@@ -45,27 +45,14 @@ class RunPass:
     start_covariances: np.ndarray
 
 
-@dataclass(frozen=True)
-class PassJacobians:
-    """What a filter pass linearised the model at, for the signature and score passes.
-
-    F: (<= n, nx, nx) Jacobians of the step, F_of: (n,) which of them a row has. predicted: (n, nx)
-    states before each row's readings. decaying, P, beyond: see Path.
-    """
-
-    F: np.ndarray
-    F_of: np.ndarray
-    predicted: np.ndarray
-    decaying: np.ndarray
-    P: np.ndarray
-    beyond: np.ndarray
+def gains_of(run: RunPass) -> Gains:
+    """The gains of a pass that kept them, as other passes take them."""
+    return Gains(run.gains, run.per_sigma, run.H, run.shown)
 
 
-def trace_of(run: RunPass, at: PassJacobians) -> Trace:
+def trace_of(run: RunPass, path: Path) -> Trace:
     """A pass as the passes back over it take it."""
-    gains = Gains(run.gains, run.per_sigma, run.H, run.shown)
-    path = Path(at.F, at.F_of, at.predicted, at.decaying, at.P, at.beyond)
-    return Trace(run.states, run.innovations, gains, path)
+    return Trace(run.states, run.innovations, gains_of(run), path)
 
 
 class Buffers:
@@ -138,7 +125,7 @@ class RunPasses:
         jacobians: Buffers | None = None,
         start_rows: np.ndarray | None = None,
         decaying: np.ndarray | None = None,
-    ) -> tuple[RunPass, PassJacobians]:
+    ) -> tuple[RunPass, Path]:
         """The filter pass of a run, and what it linearised the model at.
 
         Args:
@@ -186,7 +173,7 @@ class RunPasses:
         run = RunPass(
             record, u, log_likelihood, e, states, deweighted, K, per_sigma, H, shown, starts, P
         )
-        return run, PassJacobians(F, F_of, predicted, decaying, rows_of_P, beyond)
+        return run, path
 
     def _reading_variances(self, noise: Noise) -> np.ndarray:
         return np.array([noise.reading.get(c, 1.0) for c in self.model.channels]) ** 2
@@ -202,10 +189,9 @@ class RunPasses:
             False where the mean diverged.
         """
         u = self.model.inputs(run.record, p)
-        gains = Gains(run.gains, run.per_sigma, run.H, run.shown)
         return frozen_gains.mean_pass(
             self.compiled, RunData(self.intervals[i], u, run.record.z), self.starts[i][0], p,
-            gains, self.refresh[i], out,
+            gains_of(run), self.refresh[i], out,
         )  # fmt: skip
 
 

@@ -106,10 +106,8 @@ def _beyond_drifts(state: Changing, steady: Changing, near: Sequence[Scored]) ->
     """
     if not near or steady.fit.noise.process == state.fit.noise.process:
         return list(near)
-    asked = state.problem.of_candidates({*state.fit.active, *(s.effect for s in near)})
-    drifting, again = scored(replace(state, problem=asked))
+    drifting, stand = _still_standing(replace(state, problem=_asking(state, near)))
     explained = steady.fit.objective - drifting.fit.objective
-    stand = {s.effect for s in _standing(again, state.problem.settings)}
     return [s for s in near if s.nats > DRIFTED * explained or s.effect in stand]
 
 
@@ -118,13 +116,22 @@ def _beside_commands(steady: Changing, near: Sequence[Scored]) -> list[Scored]:
 
     A pilot who flies gusts out looks like a servo that gets late (input_innovations.py).
     """
-    asked = steady.problem.of_candidates({*steady.fit.active, *(s.effect for s in near)})
-    wider, fit = with_command_gains(asked, steady.fit, coloured=True)
+    wider, fit = with_command_gains(_asking(steady, near), steady.fit, coloured=True)
     if not has_command_gains(wider):
         return list(near)
-    _, again = scored(replace(steady, problem=wider, fit=fit))
-    stand = {s.effect for s in _standing(again, steady.problem.settings)}
+    _, stand = _still_standing(replace(steady, problem=wider, fit=fit))
     return [s for s in near if s.effect in stand]
+
+
+def _asking(state: Changing, near: Sequence[Scored]) -> Problem:
+    """The problem with no other candidates than what is active and these."""
+    return state.problem.of_candidates({*state.fit.active, *(s.effect for s in near)})
+
+
+def _still_standing(state: Changing) -> tuple[Changing, set[str]]:
+    """The state scored, and the effects whose change is worth a fit in it."""
+    state, found = scored(state)
+    return state, {s.effect for s in _standing(found, state.problem.settings)}
 
 
 def _least(state: Changing, effect: str) -> float:
