@@ -68,7 +68,7 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
     problem = SimpleNamespace(
         engine=engine, model=SimpleNamespace(channels=()), report=lambda text: None
     )
-    found = searched.searched(problem, FINE)  # type: ignore[arg-type]
+    found = searched.searched(problem, FINE, {})  # type: ignore[arg-type]
     assert asked == pytest.approx(stds) and found.coarse == coarse
     kept = sum(flies)
     assert found.fit.noise.reading["phi"] == pytest.approx(stds[kept])
@@ -110,3 +110,30 @@ def test_strengths_of_gusts_are_fitted_beside_what_stood_them(monkeypatch, white
         assert best is first
     else:
         assert best.problem.name == f"strengths {len(beside)}"
+
+
+@pytest.mark.parametrize(
+    ("others", "onsets", "shaken", "changed"),
+    [
+        (5.0, {"wind": 0}, False, False),  # other moments are shocks too: nothing is asked
+        (0.5, {}, False, False),
+        (0.5, {"wind": 0}, True, False),  # it did not take the shock away
+        (0.5, {"wind": 0}, False, True),
+    ],
+)
+def test_one_shock_may_be_what_changed_in_flight(monkeypatch, others, onsets, shaken, changed):
+    """Then no strengths are used, which would believe the model less just where it changed."""
+    asked = []
+
+    def with_onsets(*of: Any) -> Any:
+        asked.append(of)
+        return SimpleNamespace(problem=None, fit=None, onsets=onsets)
+
+    monkeypatch.setattr(searched, "gust_kurtosis", lambda problem, fit, but_one: others)
+    monkeypatch.setattr(searched, "with_onsets", with_onsets)
+    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: shaken)
+    found = SimpleNamespace(
+        problem=SimpleNamespace(settings=SETTINGS), fit=None, quadratic=None, refitted=None
+    )
+    assert searched._changed(found, {}) == changed  # type: ignore[arg-type]
+    assert bool(asked) == (others < SETTINGS.shocks)

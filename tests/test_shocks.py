@@ -17,7 +17,7 @@ from coax_env.model.layout import GUSTS, N_FULL
 DT = 0.01
 
 
-def fitted(increments: np.ndarray, level: float = 0.2) -> float:
+def fitted(increments: np.ndarray, level: float = 0.2, but_one: bool = False) -> float:
     """Of a flight whose gusts move so from tenth to tenth of a second, on one axis after the other."""
     states = np.zeros((10 * (len(increments) + 1), N_FULL))
     walk = np.concatenate([np.zeros((1, increments.shape[1])), np.cumsum(increments, axis=0)])
@@ -27,7 +27,8 @@ def fitted(increments: np.ndarray, level: float = 0.2) -> float:
         records=[record], filter=lambda values, noise: [SimpleNamespace(states=states)]
     )
     noise = Noise(dict.fromkeys(GUST_LEVELS, level), floor=dict.fromkeys(GUST_LEVELS, 0.01))
-    return gust_kurtosis(SimpleNamespace(engine=engine), SimpleNamespace(values={}, noise=noise))
+    fit = SimpleNamespace(values={}, noise=noise)
+    return gust_kurtosis(SimpleNamespace(engine=engine), fit, but_one)
 
 
 def draw(kind: str) -> np.ndarray:
@@ -43,6 +44,15 @@ def test_one_axis_in_shocks_is_enough() -> None:
     increments = draw("normal")
     increments[::500, 4] *= 20.0
     assert fitted(increments) > 10.0 * SETTINGS.shocks
+
+
+def test_one_jump_is_a_shock_and_none_without_its_moment() -> None:
+    increments = draw("normal")
+    increments[7_000:7_003, 2] = 40.0, 25.0, -25.0
+    assert fitted(increments) > 10.0 * SETTINGS.shocks
+    assert fitted(increments, but_one=True) == pytest.approx(0.0, abs=0.2)
+    increments[12_000, 5] = 40.0
+    assert fitted(increments, but_one=True) > 10.0 * SETTINGS.shocks
 
 
 def test_gusts_at_their_floor_are_none() -> None:

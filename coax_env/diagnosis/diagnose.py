@@ -161,10 +161,11 @@ def diagnose(
     used, held = split(model, records, noise, hold_out, candidates, settings)
 
     problem = Problem.of(model, used, candidates, settings, report)
-    first = searched(problem, noise)
+    clock = clock_of(flight.runs)
+    first = searched(problem, noise, clock)
     problem, bare, refitted = first.problem, first.bare, first.refitted
     passes_before = problem.engine.filter(bare.values, bare.noise)
-    state = with_onsets(problem, first.fit, first.quadratic, refitted, clock_of(flight.runs))
+    state = with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
     report("weighing the causes against their confounded alternatives")
     problem, fit, quadratic, evidence = weighed(beside_large_axes(problem, fit), fit)

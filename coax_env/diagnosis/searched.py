@@ -16,15 +16,18 @@ And where commands are late, by a delay of the readings' own (estimation/helicop
 likelier: what was found beside a delay that is off by a part of a row may stand for that part.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
+from coax_env.diagnosis.onsets.search import with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
-from coax_env.diagnosis.shocks import in_shocks, with_shocks
+from coax_env.diagnosis.shocks import gust_kurtosis, in_shocks, with_shocks
+from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.noise_levels import fit_noise
@@ -60,14 +63,15 @@ class Searched:
     coarse: bool = False
 
 
-def searched(problem: Problem, noise: Noise) -> Searched:
+def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Searched:
     """The search from a starting noise, and from a coarser one where that flies better.
 
     Args:
         problem: what may be free. noise: levels to start from.
+        clock: of all runs in the order in which they were flown.
     """
     best = _searched(problem, noise)
-    if in_shocks(best.problem, best.fit):
+    if in_shocks(best.problem, best.fit) and not _changed(best, clock):
         best = _searched_in_shocks(best, noise)
     problem = best.problem
     found = _with_jitter(problem, best.fit)
@@ -89,6 +93,22 @@ def searched(problem: Problem, noise: Noise) -> Searched:
             break
         best = other
     return best
+
+
+def _changed(found: Searched, clock: Mapping[str, Lap]) -> bool:
+    """Whether what looks like one shock is what changed in flight.
+
+    A thrust that falls by a tenth is a jump of the force. A strength at its moment would believe the
+    model less just there, and the change were worth nothing; so it is asked before there are any.
+
+    Args:
+        found: without strengths. clock: of all runs in the order in which they were flown.
+    """
+    problem = found.problem
+    if gust_kurtosis(problem, found.fit, but_one=True) > problem.settings.shocks:
+        return False
+    state = with_onsets(problem, found.fit, found.quadratic, found.refitted, clock)
+    return bool(state.onsets) and not in_shocks(state.problem, state.fit)
 
 
 def _searched_in_shocks(first: Searched, noise: Noise) -> Searched:

@@ -23,6 +23,8 @@ from coax_env.model.layout import GUSTS, N_FULL
 
 SECONDS = 0.1
 """s between gusts of which the difference is looked at: beyond the readings' own noise; ours."""
+ABOUT = 5
+"""Increments on either side of the largest that belong to its moment: half a second; ours."""
 ROUNDS = 3
 """Of strengths and levels by turns: a level that strengths make smaller shows more of them; ours."""
 
@@ -32,19 +34,28 @@ def in_shocks(problem: Problem, fit: Fit) -> bool:
     return not _has_strengths(problem) and gust_kurtosis(problem, fit) > problem.settings.shocks
 
 
-def gust_kurtosis(problem: Problem, fit: Fit) -> float:
+def gust_kurtosis(problem: Problem, fit: Fit, but_one: bool = False) -> float:
     """Largest excess kurtosis of the increments of the gusts as filtered; 0 where there are none.
 
     Args:
         problem, fit: with the causes.
+        but_one: the moment at which increments are largest is left out.
     """
     moving = _moving(fit)
     if not moving.size:
         return 0.0
     apart = max(round(SECONDS / median_step(problem.engine.records)), 1)
     passes = problem.engine.filter(fit.values, fit.noise)
-    moved = [np.diff(run.states[::apart, moving], axis=0) for run in passes]
-    return float(np.max(kurtosis(np.concatenate(moved), axis=0), initial=0.0))
+    moved = np.concatenate([np.diff(run.states[::apart, moving], axis=0) for run in passes])
+    if but_one:
+        moved = _without_largest(moved)
+    return float(np.max(kurtosis(moved, axis=0), initial=0.0))
+
+
+def _without_largest(moved: np.ndarray) -> np.ndarray:
+    """Increments (n, k) without those about the one that is largest, of any column by its std."""
+    largest = int(np.argmax(np.max(np.abs(moved) / np.std(moved, axis=0), axis=1)))
+    return np.delete(moved, slice(max(largest - ABOUT, 0), largest + ABOUT + 1), axis=0)
 
 
 def with_shocks(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
