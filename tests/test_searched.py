@@ -132,8 +132,9 @@ def test_one_shock_may_be_what_changed_in_flight(monkeypatch, others, onsets, sh
     monkeypatch.setattr(searched, "gust_kurtosis", lambda problem, fit, but_one: others)
     monkeypatch.setattr(searched, "with_onsets", with_onsets)
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: shaken)
-    found = SimpleNamespace(
-        problem=SimpleNamespace(settings=SETTINGS), fit=None, quadratic=None, refitted=None
-    )
-    assert searched._changed(found, {}) == changed  # type: ignore[arg-type]
+    problem: Any = SimpleNamespace(settings=SETTINGS)
+    none: Any = None
+    found = searched.Searched(problem, none, none, none, none)
+    state = searched._changed(found, {})
+    assert (state is not None) == changed and (state is None or state.changing.onsets == onsets)
     assert bool(asked) == (others < SETTINGS.shocks)

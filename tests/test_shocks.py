@@ -28,7 +28,7 @@ def fitted(increments: np.ndarray, level: float = 0.2, but_one: bool = False) ->
     )
     noise = Noise(dict.fromkeys(GUST_LEVELS, level), floor=dict.fromkeys(GUST_LEVELS, 0.01))
     fit = SimpleNamespace(values={}, noise=noise)
-    return gust_kurtosis(SimpleNamespace(engine=engine), fit, but_one)
+    return gust_kurtosis(SimpleNamespace(engine=engine, row=DT), fit, but_one)
 
 
 def draw(kind: str) -> np.ndarray:

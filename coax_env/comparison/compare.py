@@ -30,7 +30,7 @@ from coax_env.comparison.two_logs.coordinates import effective
 from coax_env.comparison.two_logs.difference import difference, of_one_flight
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
-from coax_env.estimation.fitted_vehicle import median_step, with_timing
+from coax_env.estimation.fitted_vehicle import with_timing
 from coax_env.estimation.parted_engine import of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import Whiteness, whiteness
@@ -156,7 +156,7 @@ def _changes(
     """The changes, strongest first."""
     std = _std(state, quadratic)
     before, after = (part.values(state.fit.values) for part in parts_of(state.problem))
-    dt = median_step(state.problem.engine.records)
+    dt = state.problem.row
     entries = []
     for effect in state.effects:
         was, became = (_effective(state, values, effect) for values in (before, after))

@@ -165,7 +165,7 @@ def diagnose(
     first = searched(problem, noise, clock)
     problem, bare, refitted = first.problem, first.bare, first.refitted
     passes_before = problem.engine.filter(bare.values, bare.noise)
-    state = with_onsets(problem, first.fit, first.quadratic, refitted, clock)
+    state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
     report("weighing the causes against their confounded alternatives")
     problem, fit, quadratic, evidence = weighed(beside_large_axes(problem, fit), fit)

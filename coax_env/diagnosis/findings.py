@@ -13,7 +13,7 @@ from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.trust import Trust, of_line
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.changing_model import BEFORE
-from coax_env.estimation.fitted_vehicle import median_step, with_timing
+from coax_env.estimation.fitted_vehicle import with_timing
 from coax_env.estimation.helicopter_noise import level_unit
 from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
@@ -52,7 +52,7 @@ def causes(
     onsets = onsets or {}
     free = problem.free_names(fit.active)
     std = quadratic.std(free)
-    dt = median_step(problem.engine.records)
+    dt = problem.row
     entries: list[dict[str, Any]] = []
 
     def number(f: FreeParameter, inflation: float) -> dict[str, float]:

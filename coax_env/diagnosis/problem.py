@@ -184,7 +184,12 @@ class Problem:
     @cached_property
     def has_slow_rows(self) -> bool:
         """Whether commands changed unseen between the rows, for all that is known."""
-        return median_step(self.engine.records) > self.settings.slow_rows
+        return self.row > self.settings.slow_rows
+
+    @cached_property
+    def row(self) -> float:
+        """s between rows, the median."""
+        return median_step(self.engine.records)
 
     @property
     def seconds(self) -> float:

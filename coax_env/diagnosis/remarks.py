@@ -9,7 +9,6 @@ from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.vibration import Line
-from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.helicopter_noise import WHITE_LEVELS
 from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
@@ -103,7 +102,7 @@ def _slow_rows(problem: Problem) -> list[str]:
     if not problem.has_slow_rows:
         return []
     return [
-        f"rows {1e3 * median_step(problem.engine.records):.0f} ms apart: what the commands did between "
+        f"rows {1e3 * problem.row:.0f} ms apart: what the commands did between "
         "them is not known, and what looks like a weak or late answer must be worth "
         f"{problem.settings.slow_inflation:g} times as much"
     ]

@@ -23,12 +23,12 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
+from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.shocks import gust_kurtosis, in_shocks, with_shocks
 from coax_env.estimation.changing_model import Lap
-from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import pooled_rms, replay_runs
@@ -53,6 +53,7 @@ class Searched:
 
     problem: what was searched.
     coarse: whether readings were taken to be no finer than LEAST_READING_STD.
+    changing: with what began or changed in flight, where that has been asked already.
     """
 
     problem: Problem
@@ -61,6 +62,7 @@ class Searched:
     fit: Fit
     quadratic: Quadratic
     coarse: bool = False
+    changing: Changing | None = None
 
 
 def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Searched:
@@ -71,8 +73,8 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         clock: of all runs in the order in which they were flown.
     """
     best = _searched(problem, noise)
-    if in_shocks(best.problem, best.fit) and not _changed(best, clock):
-        best = _searched_in_shocks(best, noise)
+    if in_shocks(best.problem, best.fit):
+        best = _changed(best, clock) or _searched_in_shocks(best, noise)
     problem = best.problem
     found = _with_jitter(problem, best.fit)
     if found is not None:
@@ -95,8 +97,8 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     return best
 
 
-def _changed(found: Searched, clock: Mapping[str, Lap]) -> bool:
-    """Whether what looks like one shock is what changed in flight.
+def _changed(found: Searched, clock: Mapping[str, Lap]) -> Searched | None:
+    """With what changed in flight, where that is what looks like one shock.
 
     A thrust that falls by a tenth is a jump of the force. A strength at its moment would believe the
     model less just there, and the change were worth nothing; so it is asked before there are any.
@@ -106,9 +108,11 @@ def _changed(found: Searched, clock: Mapping[str, Lap]) -> bool:
     """
     problem = found.problem
     if gust_kurtosis(problem, found.fit, but_one=True) > problem.settings.shocks:
-        return False
+        return None
     state = with_onsets(problem, found.fit, found.quadratic, found.refitted, clock)
-    return bool(state.onsets) and not in_shocks(state.problem, state.fit)
+    if not state.onsets or in_shocks(state.problem, state.fit):
+        return None
+    return replace(found, changing=state)
 
 
 def _searched_in_shocks(first: Searched, noise: Noise) -> Searched:
@@ -158,7 +162,7 @@ def _with_late_readings(problem: Problem, fit: Fit) -> Problem | None:
     def read_after(seconds: float) -> Problem:
         return problem.with_model(problem.model.reading_after(seconds))
 
-    row = median_step(problem.engine.records)
+    row = problem.row
     best = minimize_scalar(
         lambda seconds: -read_after(seconds).engine.log_likelihood(fit.values, fit.noise),
         bounds=(max(delay - row, 0.0), delay + row), method="bounded",

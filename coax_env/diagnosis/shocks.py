@@ -15,7 +15,6 @@ from scipy.stats import kurtosis
 from coax_env.diagnosis.fits import fitted, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import Engine
-from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.gust_strength import with_strengths
 from coax_env.estimation.helicopter_noise import GUST_AXES
 from coax_env.estimation.state_space import Record
@@ -44,7 +43,7 @@ def gust_kurtosis(problem: Problem, fit: Fit, but_one: bool = False) -> float:
     moving = _moving(fit)
     if not moving.size:
         return 0.0
-    apart = max(round(SECONDS / median_step(problem.engine.records)), 1)
+    apart = max(round(SECONDS / problem.row), 1)
     passes = problem.engine.filter(fit.values, fit.noise)
     moved = np.concatenate([np.diff(run.states[::apart, moving], axis=0) for run in passes])
     if but_one:
