@@ -63,6 +63,7 @@ class Flights:
             "noise_fitted": lambda problem, fit: fit,
             "quadratic_at": lambda problem, fit: (fit, None),
             "inflation": lambda problem, quadratic, active, effect: 1.0,
+            "threshold": lambda problem, quadratic, active: THRESHOLD,
         }  # fmt: skip
         for name, stand_in in stand_ins.items():
             monkeypatch.setattr(evidence, name, stand_in)
@@ -184,6 +185,7 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "refined", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "quadratic_at", lambda problem, fit: (fit, nothing))
     monkeypatch.setattr(evidence, "_worth", lambda problem, fit, quadratic, effect: THRESHOLD)
+    monkeypatch.setattr(evidence, "threshold", lambda problem, quadratic, active: THRESHOLD)
     monkeypatch.setattr(evidence, "weigh", removals)
     problem, fit, _, found = weighed(tables, Fit(active, {}, Noise({})))
     assert problem.gains == (tables.worth_it and tables.white) and set(found) == set(fit.active)

@@ -58,7 +58,13 @@ def test_a_proposal_must_gain_what_is_needed_beyond_occam(monkeypatch, fallen, t
             assert said == [f"added wind: {fallen - 3.0:.1f} nats"]
 
 
-def test_trials_are_those_nearly_strong_and_dampings_with_half_the_evidence(monkeypatch):
+@pytest.fixture
+def usual(monkeypatch):
+    """What causes explain is not so much that another must be worth more than usual."""
+    monkeypatch.setattr(moves, "threshold", lambda problem, quadratic, active: SETTINGS.evidence)
+
+
+def test_trials_are_those_nearly_strong_and_dampings_with_half_the_evidence(monkeypatch, usual):
     """From 7 to 14 nats; those that take a number's place are none, nor what was tried."""
     monkeypatch.setattr(
         moves, "at_optimum", lambda problem, fit, q, active, at: replace(fit, active=active)
@@ -111,7 +117,7 @@ def test_no_more_causes_than_are_allowed(monkeypatch):
     ],
 )
 def test_the_cause_worth_least_is_dropped_where_a_refit_confirms_it(
-    monkeypatch, worth, large, confirmed, gone
+    monkeypatch, usual, worth, large, confirmed, gone
 ):
     """One too small to matter goes, if settled noise makes it no larger."""
     monkeypatch.setattr(moves, "converged", lambda problem, fit: fit)
@@ -140,7 +146,7 @@ def test_the_cause_worth_least_is_dropped_where_a_refit_confirms_it(
     ("worth", "grows", "stays"), [(141.0, True, True), (139.0, True, False), (141.0, False, False)]
 )
 def test_what_is_worth_ten_thresholds_may_grow_as_the_noise_settles(
-    monkeypatch, worth, grows, stays
+    monkeypatch, usual, worth, grows, stays
 ):
     """Small beside noise that had taken it up, and worth much: it stands if it is large in the end."""
     at_last = FIT.at({"gyro_bias.x": 1.0})
@@ -166,7 +172,8 @@ def test_a_refit_says_what_a_cause_is_worth(monkeypatch, risen, gone):
     monkeypatch.setattr(
         moves, "fitted", lambda problem, fit, held: replace(fit, objective=500.0 + risen)
     )
-    assert moves._is_worthless(PROBLEM, FIT, OCCAM, "wind", 2.0) == gone  # type: ignore[arg-type]
+    found = moves._is_worthless(PROBLEM, FIT, OCCAM, "wind", 2.0, 14.0)  # type: ignore[arg-type]
+    assert found == gone
 
 
 # --- what would do as well ----------------------------------------------------------------------------

@@ -28,7 +28,9 @@ from coax_env.diagnosis.scores import (
     score,
     scores,
     swap,
+    threshold,
 )
+from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.changing_model import BEFORE, before
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import WHITE_LEVELS
@@ -126,6 +128,19 @@ def test_an_effect_loses_what_it_has_gained_and_a_swap_is_the_difference_of_two(
         change, move = swap(PROBLEM, q, (old,), old, new)
         assert change == pytest.approx(worth[old] - worth[new])
         np.testing.assert_allclose(move, q.best([*BASE, *own(new)])[1], atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [2.0, 30.0, 2000.0])
+def test_where_causes_explain_very_much_another_must_be_worth_more(size):
+    """A form that is right to 0.7 % leaves 5e-5 of what it explains; usually the threshold is more."""
+    q = quadratic(4, size=size)
+    rest, both = [*BASE], [*BASE, *own("gyro_bias"), *own("swash_offset")]
+    parts = (q.best([*rest, *own(other)])[0] for other in ("swash_offset", "gyro_bias"))
+    explained = sum(parts) - 2.0 * q.best(both)[0]
+    needed = max(SETTINGS.evidence, 5e-5 * explained)
+    assert threshold(PROBLEM, q, ("gyro_bias", "swash_offset")) == pytest.approx(needed)
+    assert (needed > SETTINGS.evidence) == (size > 1000.0)
+    assert threshold(PROBLEM, q, ()) == SETTINGS.evidence
 
 
 def test_coloured_innovations_make_a_loss_smaller_by_their_inflation():

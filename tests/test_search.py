@@ -63,6 +63,7 @@ def moves(monkeypatch):
     monkeypatch.setattr(module, "with_latent_noise", latent)
     monkeypatch.setattr(module, "noise_fitted", noise_fitted)
     monkeypatch.setattr(module, "_nearest", lambda problem, *given: problem)
+    monkeypatch.setattr(module, "threshold", lambda problem, q, active: SETTINGS.evidence)
     monkeypatch.setattr(module, "swaps", lambda *given: iter(()))
     monkeypatch.setattr(module, "trials", lambda *given: ([], []))
     monkeypatch.setattr(module, "scores", lambda p, fit, q, banned: [

@@ -18,7 +18,7 @@ from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_a
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
 from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem
 from coax_env.diagnosis.refinement import refined
-from coax_env.diagnosis.scores import inflation, loss
+from coax_env.diagnosis.scores import inflation, loss, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import is_white
 
@@ -99,7 +99,7 @@ def prune(
         removals: dict[str, Removal] = {}
         for which in _asked(problem, fit, quadratic, clear):
             removals |= weigh(problem, fit, quadratic, which)
-            better = _better(problem, fit, removals)
+            better = _better(problem, fit, quadratic, removals)
             if better is not None:
                 fit = better
                 break
@@ -118,10 +118,11 @@ def _asked(
 
 def _without_hopeless(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
     """As `_better`, of causes that lack more than a tie both by the quadratic and by a refit."""
-    most = problem.settings.evidence - problem.settings.tie
+    most = threshold(problem, quadratic, fit.active) - problem.settings.tie
     asked = [e for e in fit.active if _worth(problem, fit, quadratic, e) < most]
     removals = weigh(problem, fit, quadratic, asked)
-    return _better(problem, fit, {e: r for e, r in removals.items() if r.evidence.nats < most})
+    hopeless = {e: r for e, r in removals.items() if r.evidence.nats < most}
+    return _better(problem, fit, quadratic, hopeless)
 
 
 def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[str, Evidence]]:
@@ -187,7 +188,9 @@ def _worth(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> flo
     return loss(problem, quadratic, fit.active, effect, factor)
 
 
-def _better(problem: Problem, fit: Fit, removals: Mapping[str, Removal]) -> Fit | None:
+def _better(
+    problem: Problem, fit: Fit, quadratic: Quadratic, removals: Mapping[str, Removal]
+) -> Fit | None:
     """A fit to go on from: with noise levels of larger likelihood, else without the weakest cause.
 
     A model with one cause less cannot be likelier but by its noise levels: the fit's have then not
@@ -201,7 +204,7 @@ def _better(problem: Problem, fit: Fit, removals: Mapping[str, Removal]) -> Fit 
         again = converged(problem, replace(fit, noise=rest.noise))
         if again.objective < fit.objective - problem.settings.tie:
             return again
-    if evidence.nats >= problem.settings.evidence:
+    if evidence.nats >= threshold(problem, quadratic, fit.active):
         return None
     problem.report(f"dropped {weakest}: worth {evidence.nats:.1f} nats in the end")
     return rest.noted(f"- {weakest}", max(evidence.nats, 0.0))

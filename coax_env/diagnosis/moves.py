@@ -6,7 +6,15 @@ from dataclasses import dataclass, replace
 
 from coax_env.diagnosis.fits import at_optimum, converged, fitted, stepped, without
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.scores import Score, damping_gain, exchanges, inflation, is_large, loss
+from coax_env.diagnosis.scores import (
+    Score,
+    damping_gain,
+    exchanges,
+    inflation,
+    is_large,
+    loss,
+    threshold,
+)
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 from coax_env.model import effects
@@ -108,7 +116,8 @@ def trials(
         what is worth a fit, and the dampings that were evaluated.
     """
     chosen = problem.settings
-    least = chosen.trial_share * chosen.evidence
+    enough = threshold(problem, quadratic, fit.active)
+    least = chosen.trial_share * enough
 
     def untried(names: Iterable[str]) -> list[str]:
         return [e for e in names if (*fit.active, e) not in tried]
@@ -116,7 +125,7 @@ def trials(
     weak = untried(
         c.effect
         for c in candidates
-        if least < c.evidence <= chosen.evidence and not problem.file_values(c.effect)
+        if least < c.evidence <= enough and not problem.file_values(c.effect)
     )[: chosen.most_trials]
     begin: dict[str, Mapping[str, float]] = {effect: {} for effect in weak}
     dampings = untried(
@@ -133,7 +142,7 @@ def trials(
             effect,
             at_optimum(problem, fit, quadratic, (*fit.active, effect), at),
             quadratic.occam(problem.acting_names(effect), problem.free_names(fit.active)),
-            chosen.evidence,
+            enough,
             f"added {effect}: {{:.1f}} nats, once fitted",
         )
         for effect, at in begin.items()
@@ -190,15 +199,16 @@ def drop(problem: Problem, fit: Fit, quadratic: Quadratic, coloured: bool) -> Fi
         else -math.inf
         for e in fit.active
     }
+    enough = threshold(problem, quadratic, fit.active)
     for effect in sorted(worth, key=lambda e: worth[e]):
-        if worth[effect] >= problem.settings.evidence:
+        if worth[effect] >= enough:
             return None
         if not math.isfinite(worth[effect]):
             settled = _settled(problem, fit, quadratic, effect)
             if settled is not None:
                 return settled
             why = TOO_SMALL
-        elif _is_worthless(problem, fit, quadratic, effect, inflations[effect]):
+        elif _is_worthless(problem, fit, quadratic, effect, inflations[effect], enough):
             why = f"worth {worth[effect]:.1f} nats"
         else:
             continue
@@ -221,7 +231,7 @@ def _settled(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> F
 
 
 def _is_worthless(
-    problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, inflation: float
+    problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, inflation: float, enough: float
 ) -> bool:
     """Whether a refit without the effect confirms that it is worth too little.
 
@@ -230,4 +240,4 @@ def _is_worthless(
     held = tuple(problem.file_values(effect))
     rest = fitted(problem, without(problem, fit, quadratic, effect), held=held)
     occam = quadratic.occam(problem.acting_names(effect), problem.free_names(rest.active))
-    return (rest.objective - fit.objective) / inflation - occam < problem.settings.evidence
+    return (rest.objective - fit.objective) / inflation - occam < enough

@@ -146,6 +146,21 @@ def loss(
     return gone / inflation - quadratic.occam(problem.acting_names(effect), rest)
 
 
+def threshold(problem: Problem, quadratic: Quadratic, active: Sequence[str]) -> float:
+    """Nats that a cause must be worth: the settings', or more where causes explain very much.
+
+    No form is exact: what one that explains a million nats is wrong by, another that is not there can
+    explain.
+
+    Args:
+        problem: what may be free.
+        quadratic: linearised at the fit.
+        active: effects in the model.
+    """
+    explained = sum(lost(problem, quadratic, active, effect) for effect in active)
+    return max(problem.settings.evidence, problem.settings.form_error * explained)
+
+
 def inflation(problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str) -> float:
     """Variance inflation by coloured innovations in an active effect's direction, at least 1.
 

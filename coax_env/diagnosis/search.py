@@ -24,7 +24,7 @@ from coax_env.diagnosis.fits import (
 )
 from coax_env.diagnosis.moves import Proposal, accepted, add, drop, swaps, trials
 from coax_env.diagnosis.problem import SERVO_FORMS, Fit, Problem
-from coax_env.diagnosis.scores import Score, most_gains, scores
+from coax_env.diagnosis.scores import Score, most_gains, scores, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 
@@ -45,7 +45,8 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
         step_gain = -quadratic.best(near.free_names(fit.active))[0]
         candidates = scores(near, fit, quadratic, memory.banned)
         fit = _noting_strongest(fit, ((c.evidence, c.effect) for c in candidates))
-        strong = _lag_first([c for c in candidates if c.evidence > chosen.evidence])
+        least = threshold(near, quadratic, fit.active)
+        strong = _lag_first([c for c in candidates if c.evidence > least])
         clear = strong and strong[0].nats > chosen.add_before_fitted * step_gain
         converged = step_gain <= chosen.step_gain or just_fitted
         if not converged and (complete or not clear):
