@@ -8,6 +8,7 @@ import pytest
 from coax_env.diagnosis import searched
 from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.helicopter_noise import LEAST_READING_STD
 from coax_env.estimation.state_space import Noise
 
@@ -113,28 +114,26 @@ def test_strengths_of_gusts_are_fitted_beside_what_stood_them(monkeypatch, white
 
 
 @pytest.mark.parametrize(
-    ("others", "onsets", "shaken", "changed"),
+    ("shock", "onsets", "shaken", "changed"),
     [
-        (5.0, {"wind": 0}, False, False),  # other moments are shocks too: nothing is asked
-        (0.5, {}, False, False),
-        (0.5, {"wind": 0}, True, False),  # it did not take the shock away
-        (0.5, {"wind": 0}, False, True),
+        (None, {"wind": 0}, False, False),  # there are others: nothing is asked
+        (Moment("a", 3.0), {}, False, False),
+        (Moment("a", 3.0), {"wind": 0}, True, False),  # it did not take the shock away
+        (Moment("a", 3.0), {"wind": 0}, False, True),
     ],
 )
-def test_one_shock_may_be_what_changed_in_flight(monkeypatch, others, onsets, shaken, changed):
+def test_one_shock_may_be_what_changed_in_flight(monkeypatch, shock, onsets, shaken, changed):
     """Then no strengths are used, which would believe the model less just where it changed."""
-    asked = []
+    asked: list[Any] = []
 
     def with_onsets(*of: Any) -> Any:
-        asked.append(of)
+        asked.append(of[-1])
         return SimpleNamespace(problem=None, fit=None, onsets=onsets)
 
-    monkeypatch.setattr(searched, "gust_kurtosis", lambda problem, fit, but_one: others)
+    monkeypatch.setattr(searched, "only_shock", lambda problem, fit: shock)
     monkeypatch.setattr(searched, "with_onsets", with_onsets)
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: shaken)
-    problem: Any = SimpleNamespace(settings=SETTINGS)
     none: Any = None
-    found = searched.Searched(problem, none, none, none, none)
-    state = searched._changed(found, {})
+    state = searched._changed(searched.Searched(none, none, none, none, none), {})
     assert (state is not None) == changed and (state is None or state.changing.onsets == onsets)
-    assert bool(asked) == (others < SETTINGS.shocks)
+    assert asked == ([shock] if shock else [])

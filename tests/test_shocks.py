@@ -1,6 +1,7 @@
 """Gusts that come in shocks: what is known of the kurtosis of a few distributions."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from study.one_flight import hide
 
 from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.diagnosis.shocks import gust_kurtosis
+from coax_env.diagnosis.shocks import gust_kurtosis, only_shock
 from coax_env.estimation.helicopter_noise import GUST_LEVELS
 from coax_env.estimation.state_space import Noise
 from coax_env.model.layout import GUSTS, N_FULL
@@ -17,18 +18,26 @@ from coax_env.model.layout import GUSTS, N_FULL
 DT = 0.01
 
 
-def fitted(increments: np.ndarray, level: float = 0.2, but_one: bool = False) -> float:
-    """Of a flight whose gusts move so from tenth to tenth of a second, on one axis after the other."""
-    states = np.zeros((10 * (len(increments) + 1), N_FULL))
-    walk = np.concatenate([np.zeros((1, increments.shape[1])), np.cumsum(increments, axis=0)])
-    states[:, GUSTS] = np.repeat(walk, 10, axis=0)
-    record = SimpleNamespace(t=DT * np.arange(len(states)))
-    engine = SimpleNamespace(
-        records=[record], filter=lambda values, noise: [SimpleNamespace(states=states)]
-    )
+def flown(increments: np.ndarray, level: float = 0.2) -> tuple[Any, Any]:
+    """Of two runs, the first of 100 s, whose gusts move so from tenth to tenth of a second."""
+    cut = [increments[:1000], increments[1000:]]
+    states = [np.zeros((10 * (len(own) + 1), N_FULL)) for own in cut]
+    for own, there in zip(cut, states, strict=True):
+        walk = np.concatenate([np.zeros((1, own.shape[1])), np.cumsum(own, axis=0)])
+        there[:, GUSTS] = np.repeat(walk, 10, axis=0)
+    records = [
+        SimpleNamespace(t=5.0 + DT * np.arange(len(there)), whole=name)
+        for there, name in zip(states, "ab", strict=True)
+    ]
+    passes = [SimpleNamespace(states=there) for there in states]
+    engine = SimpleNamespace(records=records, filter=lambda values, noise: passes)
     noise = Noise(dict.fromkeys(GUST_LEVELS, level), floor=dict.fromkeys(GUST_LEVELS, 0.01))
-    fit = SimpleNamespace(values={}, noise=noise)
-    return gust_kurtosis(SimpleNamespace(engine=engine, row=DT), fit, but_one)
+    problem = SimpleNamespace(engine=engine, row=DT, settings=SETTINGS)
+    return problem, SimpleNamespace(values={}, noise=noise)
+
+
+def fitted(increments: np.ndarray, level: float = 0.2) -> float:
+    return gust_kurtosis(*flown(increments, level))
 
 
 def draw(kind: str) -> np.ndarray:
@@ -46,13 +55,15 @@ def test_one_axis_in_shocks_is_enough() -> None:
     assert fitted(increments) > 10.0 * SETTINGS.shocks
 
 
-def test_one_jump_is_a_shock_and_none_without_its_moment() -> None:
+def test_the_only_shock_is_where_the_jump_was() -> None:
     increments = draw("normal")
     increments[7_000:7_003, 2] = 40.0, 25.0, -25.0
     assert fitted(increments) > 10.0 * SETTINGS.shocks
-    assert fitted(increments, but_one=True) == pytest.approx(0.0, abs=0.2)
+    shock = only_shock(*flown(increments))
+    assert shock is not None and shock.run == "b"
+    assert shock.t == pytest.approx(5.0 + 0.1 * (7_000 - 1_000), abs=0.11)
     increments[12_000, 5] = 40.0
-    assert fitted(increments, but_one=True) > 10.0 * SETTINGS.shocks
+    assert only_shock(*flown(increments)) is None, "there are two"
 
 
 def test_gusts_at_their_floor_are_none() -> None:

@@ -27,7 +27,7 @@ from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
-from coax_env.diagnosis.shocks import gust_kurtosis, in_shocks, with_shocks
+from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.noise_levels import fit_noise
@@ -107,9 +107,10 @@ def _changed(found: Searched, clock: Mapping[str, Lap]) -> Searched | None:
         found: without strengths. clock: of all runs in the order in which they were flown.
     """
     problem = found.problem
-    if gust_kurtosis(problem, found.fit, but_one=True) > problem.settings.shocks:
+    shock = only_shock(problem, found.fit)
+    if shock is None:
         return None
-    state = with_onsets(problem, found.fit, found.quadratic, found.refitted, clock)
+    state = with_onsets(problem, found.fit, found.quadratic, found.refitted, clock, shock)
     if not state.onsets or in_shocks(state.problem, state.fit):
         return None
     return replace(found, changing=state)

@@ -16,6 +16,7 @@ from coax_env.diagnosis.fits import fitted, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.gust_strength import with_strengths
+from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.helicopter_noise import GUST_AXES
 from coax_env.estimation.state_space import Record
 from coax_env.model.layout import GUSTS, N_FULL
@@ -33,28 +34,46 @@ def in_shocks(problem: Problem, fit: Fit) -> bool:
     return not _has_strengths(problem) and gust_kurtosis(problem, fit) > problem.settings.shocks
 
 
-def gust_kurtosis(problem: Problem, fit: Fit, but_one: bool = False) -> float:
+def gust_kurtosis(problem: Problem, fit: Fit) -> float:
     """Largest excess kurtosis of the increments of the gusts as filtered; 0 where there are none.
 
     Args:
         problem, fit: with the causes.
-        but_one: the moment at which increments are largest is left out.
     """
-    moving = _moving(fit)
-    if not moving.size:
-        return 0.0
-    apart = max(round(SECONDS / problem.row), 1)
+    return _largest_kurtosis(np.concatenate(_increments(problem, fit)))
+
+
+def only_shock(problem: Problem, fit: Fit) -> Moment | None:
+    """When the shock was without which there are none; None where there are others.
+
+    Args:
+        problem, fit: with the causes, in shocks.
+    """
+    of_runs = _increments(problem, fit)
+    moved = np.concatenate(of_runs)
+    row = int(np.argmax(np.max(np.abs(moved) / np.std(moved, axis=0), axis=1)))
+    rest = np.delete(moved, slice(max(row - ABOUT, 0), row + ABOUT + 1), axis=0)
+    if _largest_kurtosis(rest) > problem.settings.shocks:
+        return None
+    ends = np.cumsum([len(own) for own in of_runs])
+    run = int(np.searchsorted(ends, row, side="right"))
+    record, row = problem.engine.records[run], row - int(ends[run]) + len(of_runs[run])
+    return Moment(record.whole, float(record.t[row * _apart(problem)]))
+
+
+def _increments(problem: Problem, fit: Fit) -> list[np.ndarray]:
+    """Of each run, (rows, axes) how far the gusts have moved since SECONDS before."""
+    moving, apart = _moving(fit), _apart(problem)
     passes = problem.engine.filter(fit.values, fit.noise)
-    moved = np.concatenate([np.diff(run.states[::apart, moving], axis=0) for run in passes])
-    if but_one:
-        moved = _without_largest(moved)
-    return float(np.max(kurtosis(moved, axis=0), initial=0.0))
+    return [np.diff(run.states[::apart, moving], axis=0) for run in passes]
 
 
-def _without_largest(moved: np.ndarray) -> np.ndarray:
-    """Increments (n, k) without those about the one that is largest, of any column by its std."""
-    largest = int(np.argmax(np.max(np.abs(moved) / np.std(moved, axis=0), axis=1)))
-    return np.delete(moved, slice(max(largest - ABOUT, 0), largest + ABOUT + 1), axis=0)
+def _apart(problem: Problem) -> int:
+    return max(round(SECONDS / problem.row), 1)
+
+
+def _largest_kurtosis(moved: np.ndarray) -> float:
+    return float(np.max(kurtosis(moved, axis=0), initial=0.0)) if moved.size else 0.0
 
 
 def with_shocks(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:

@@ -31,6 +31,7 @@ from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import Settings
 from coax_env.estimation.changing_model import Lap
+from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import Whiteness
 
@@ -39,12 +40,19 @@ DRIFTED = 0.5
 nothing beside them. Fitted without a change, they take some of it up: on eight synthetic flights of
 test_onset.py the true ones were worth 0.28 to 1.4 of it, and 21 nats at least beside them; on three
 without a change nothing was worth more than 0.19, and 5 nats; ours."""
+ABOUT = 0.5
+"""s between two moments that may be one, as a filter sees it; ours."""
 MOST_ONSETS = 2
 """Changes that are looked for, one after the other; ours, a bound on time."""
 
 
 def with_onsets(
-    problem: Problem, fit: Fit, quadratic: Quadratic, bare: Fit, clock: Mapping[str, Lap]
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    bare: Fit,
+    clock: Mapping[str, Lap],
+    first: Moment | None = None,
 ) -> Changing:
     """The model with what begins or changes in flight, where that pays; as it is where nothing does.
 
@@ -53,11 +61,12 @@ def with_onsets(
         quadratic: linearised at the fit.
         bare: the fit without any cause, from which a search begins again.
         clock: of all runs in the order in which they were flown.
+        first: where the first change is looked for; default anywhere.
     """
     state = Changing(problem, fit, quadratic, {})
     for _ in range(MOST_ONSETS):
         problem.report("asking whether something began in flight")
-        found = _next(state, clock)
+        found = _next(state, clock, None if state.onsets else first)
         if found is None:
             break
         trial, onset = found
@@ -72,12 +81,15 @@ def with_onsets(
     return state
 
 
-def _next(state: Changing, clock: Mapping[str, Lap]) -> tuple[Changing, Onset] | None:
-    """The change that is worth most once fitted, where it pays."""
+def _next(
+    state: Changing, clock: Mapping[str, Lap], about: Moment | None
+) -> tuple[Changing, Onset] | None:
+    """The change that is worth most once fitted, where it pays; about a moment, if one is given."""
     chosen = state.problem.settings
     best = None
     steady, found = scored(replace(state, fit=without_drifts(state.fit)))
-    near = _beyond_drifts(state, steady, _standing(found, chosen))
+    near = [s for s in _standing(found, chosen) if about is None or _is_about(s.moment, about)]
+    near = _beyond_drifts(state, steady, near)
     if near and near[0].nats < chosen.clear_evidence * chosen.evidence:
         near = _beside_commands(steady, near)
     for candidate in near[: chosen.most_trials]:
@@ -90,6 +102,10 @@ def _next(state: Changing, clock: Mapping[str, Lap]) -> tuple[Changing, Onset] |
         if onset.nats > (best.onset.nats if best else _least(state, onset.effect)):
             best = trial
     return (best.state, best.onset) if best else None
+
+
+def _is_about(moment: Moment, other: Moment) -> bool:
+    return moment.run == other.run and abs(moment.t - other.t) <= ABOUT
 
 
 def _standing(found: Sequence[Scored], chosen: Settings) -> list[Scored]:
