@@ -395,6 +395,7 @@ def test_a_calibration_says_what_made_it() -> None:
     assert result["threshold_nats_for_1_percent"] > 50.0 and result["false_alarms_at_it"] == 0
     json.dumps(result, allow_nan=False)
     assert threshold.calibration(rows[:10], "too few") is None
+    assert result["false_alarm_rate"] == pytest.approx(1 / 62, abs=1e-4), "weighed, none had a name"
 
 
 CLEAN = {
@@ -411,6 +412,9 @@ def test_the_threshold_in_use_is_calibrated() -> None:
     assert rate is not None and rate <= 0.02
     other = calibration.calibrated(SETTINGS.evidence, CLEAN | {"rate_hz": 25.0})
     assert other.rate is None and "rows per second 25" in other.why
+    heavy = calibration.calibrated(SETTINGS.evidence, CLEAN | {"rate_hz": 25.0, "mass_kg": 3.0})
+    assert heavy.why.startswith("not like drawn_vehicles: rows per second 25"), "the nearest class"
+    assert ";" not in heavy.why
 
 
 def test_the_share_beyond_a_threshold() -> None:

@@ -41,7 +41,7 @@ class Calibrated:
         rate: share of clean flights of the class on which something is named; None outside every one.
         seen: the flight's class.
         name: of the calibrated class that it is in, or None.
-        why: why there is no rate, in words; "" where there is one.
+        why: in what it is not of the class that is nearest, in words; "" where there is a rate.
     """
 
     rate: float | None
@@ -56,23 +56,25 @@ class Calibrated:
 
 
 def calibrated(threshold: float, seen: Mapping[str, Any]) -> Calibrated:
-    """What is known of false alarms on flights of a class.
+    """What is known of false alarms on flights of a class; of several that it is in, the first's.
 
     Args:
         threshold: evidence [nats] from which causes are named.
         seen: of the flight, by `class_of`.
     """
-    reasons = []
+    outside: list[tuple[int, str]] = []
     for measured in _classes():
         name = measured["class"]["name"]
         if measured["threshold_used_nats"] != threshold:
-            reasons.append(f"{name}: measured with another threshold")
+            outside.append((len(seen), f"{name}: measured with another threshold"))
             continue
         beyond = differences(seen, measured["class"])
         if not beyond:
             return Calibrated(float(measured["false_alarm_rate"]), seen, name, "")
-        reasons.append(f"not like {name}: {', '.join(beyond)}")
-    return Calibrated(None, seen, None, "; ".join(reasons) or "nothing has been measured yet")
+        outside.append((len(beyond), f"not like {name}: {', '.join(beyond)}"))
+    if not outside:
+        return Calibrated(None, seen, None, "nothing has been measured yet")
+    return Calibrated(None, seen, None, min(outside, key=lambda other: other[0])[1])
 
 
 def differences(seen: Mapping[str, Any], described: Mapping[str, Any]) -> list[str]:

@@ -25,8 +25,9 @@ def calibrations(rows: Sequence[Row], command: str) -> list[dict[str, Any]]:
     Args:
         rows: of a study. command: that made them.
     """
-    arms = [arm for arm in ARMS if any(row["plan"]["arm"] == arm for row in rows)]
-    if not arms:
+    flown = [arm for arm in ARMS if any(row["plan"]["arm"] == arm for row in rows)]
+    arms = [arm for arm in flown if ARMS[arm].size == 1.0]  # without an effect no size matters
+    if not flown:
         measured = threshold.calibration(rows, command)
         return [measured] if measured else []
     result = []

@@ -3,6 +3,10 @@
 Each clean flight gives the evidence of the candidate that came nearest to being named
 (`Fit.strongest`), all of them false. The tail above its upper quartile is taken as exponential, which
 is what a likelihood ratio's tail is; the interval is a bootstrap's over flights.
+
+What a search finds must still stand once it is weighed (diagnosis/evidence.py), which that evidence
+does not know. So the rate of false alarms is no more than Laplace's estimate from their count,
+(k + 1) / (n + 2).
 """
 
 import math
@@ -50,7 +54,8 @@ def calibration(rows: Sequence[Row], command: str) -> dict[str, Any] | None:
     draws = [tail_quantile(rng.choice(evidence, evidence.size)) for _ in range(DRAWS)]
     low, high = np.nanpercentile(np.array(draws), [2.5, 97.5])
     alarms = sum(bool(judge.named(row)) for row in clean)
-    estimate = max(alarms / len(clean), share_beyond(evidence, SETTINGS.evidence))
+    beyond = share_beyond(evidence, SETTINGS.evidence)
+    estimate = max(alarms / len(clean), min(beyond, (alarms + 1) / (len(clean) + 2)))
     finite = np.sort(evidence[np.isfinite(evidence)])[::-1]
     return {
         "class": CLASS,
