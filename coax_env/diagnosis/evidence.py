@@ -96,10 +96,11 @@ def prune(
             return fit, quadratic, {}
         beside = problem if fit.active else alone  # for whom could the candidates stand?
         fit, quadratic = quadratic_at(beside, refined(problem, fit))
+        enough = threshold(problem, quadratic, fit.active)
         removals: dict[str, Removal] = {}
         for which in _asked(problem, fit, quadratic, clear):
             removals |= weigh(problem, fit, quadratic, which)
-            better = _better(problem, fit, quadratic, removals)
+            better = _better(problem, fit, enough, removals)
             if better is not None:
                 fit = better
                 break
@@ -118,11 +119,12 @@ def _asked(
 
 def _without_hopeless(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
     """As `_better`, of causes that lack more than a tie both by the quadratic and by a refit."""
-    most = threshold(problem, quadratic, fit.active) - problem.settings.tie
+    enough = threshold(problem, quadratic, fit.active)
+    most = enough - problem.settings.tie
     asked = [e for e in fit.active if _worth(problem, fit, quadratic, e) < most]
     removals = weigh(problem, fit, quadratic, asked)
     hopeless = {e: r for e, r in removals.items() if r.evidence.nats < most}
-    return _better(problem, fit, quadratic, hopeless)
+    return _better(problem, fit, enough, hopeless)
 
 
 def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[str, Evidence]]:
@@ -189,7 +191,7 @@ def _worth(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> flo
 
 
 def _better(
-    problem: Problem, fit: Fit, quadratic: Quadratic, removals: Mapping[str, Removal]
+    problem: Problem, fit: Fit, enough: float, removals: Mapping[str, Removal]
 ) -> Fit | None:
     """A fit to go on from: with noise levels of larger likelihood, else without the weakest cause.
 
@@ -204,7 +206,7 @@ def _better(
         again = converged(problem, replace(fit, noise=rest.noise))
         if again.objective < fit.objective - problem.settings.tie:
             return again
-    if evidence.nats >= threshold(problem, quadratic, fit.active):
+    if evidence.nats >= enough:
         return None
     problem.report(f"dropped {weakest}: worth {evidence.nats:.1f} nats in the end")
     return rest.noted(f"- {weakest}", max(evidence.nats, 0.0))

@@ -23,8 +23,8 @@ from coax_env.model.layout import GUSTS, N_FULL
 
 SECONDS = 0.1
 """s between gusts of which the difference is looked at: beyond the readings' own noise; ours."""
-ABOUT = 5
-"""Increments on either side of the largest that belong to its moment: half a second; ours."""
+ABOUT = 0.5
+"""s between two moments that may be one, as a filter sees it; ours."""
 ROUNDS = 3
 """Of strengths and levels by turns: a level that strengths make smaller shows more of them; ours."""
 
@@ -52,7 +52,8 @@ def only_shock(problem: Problem, fit: Fit) -> Moment | None:
     of_runs = _increments(problem, fit)
     moved = np.concatenate(of_runs)
     row = int(np.argmax(np.max(np.abs(moved) / np.std(moved, axis=0), axis=1)))
-    rest = np.delete(moved, slice(max(row - ABOUT, 0), row + ABOUT + 1), axis=0)
+    near = round(ABOUT / SECONDS)
+    rest = np.delete(moved, slice(max(row - near, 0), row + near + 1), axis=0)
     if _largest_kurtosis(rest) > problem.settings.shocks:
         return None
     ends = np.cumsum([len(own) for own in of_runs])

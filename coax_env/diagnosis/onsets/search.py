@@ -30,6 +30,7 @@ from coax_env.diagnosis.onsets.trial import fitted_change
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import Settings
+from coax_env.diagnosis.shocks import ABOUT
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.quadratic import Quadratic
@@ -40,8 +41,6 @@ DRIFTED = 0.5
 nothing beside them. Fitted without a change, they take some of it up: on eight synthetic flights of
 test_onset.py the true ones were worth 0.28 to 1.4 of it, and 21 nats at least beside them; on three
 without a change nothing was worth more than 0.19, and 5 nats; ours."""
-ABOUT = 0.5
-"""s between two moments that may be one, as a filter sees it; ours."""
 MOST_ONSETS = 2
 """Changes that are looked for, one after the other; ours, a bound on time."""
 
