@@ -43,7 +43,7 @@ from injector_craft import (
     write_vehicle,
     yaw_authority,
 )
-from injector_sensors import SENSORS, Sensors, blunt, card_text, clock, csv_text, thin
+from injector_sensors import SENSORS, Sensors, blunt, card_text, clock, csv_text, err, thin
 from numba import njit
 from scipy.spatial.transform import Rotation
 
@@ -1073,6 +1073,7 @@ def _read(
     columns["h"] = columns["h"] * (1.0 + hidden.sonar_scale)
     for channel, std in sensors.noise.items():
         columns[channel] = columns[channel] + std * rng.standard_normal(len(columns["t"]))
+    err(columns, sensors, rng)
     blunt(columns, sensors, rng)
     columns["psi"] = (columns["psi"] + np.pi) % (2.0 * np.pi) - np.pi
     return {c: x for c, x in columns.items() if c in COMMANDED or c in sensors.noise}

@@ -20,7 +20,8 @@ class Air(NamedTuple):
     """What the air and the machine's own unrest do; nothing by default.
 
     gusts: "none", "markov" (exponential memory), "heavy_tails" (the same, shaken by Student's t with
-        three degrees of freedom), "one_minus_cosine" (single gusts), "dryden".
+        three degrees of freedom), "one_minus_cosine" (single gusts), "dryden", "shedding" (each axis
+        with a frequency), "broad" (memories of 0.05, 0.4 and 3 s at once), "fitful" (weak and strong).
     force, moment_xy, moment_z: std [N, N m] on the paper's vehicle; on others the same share of
         weight and the same angular accelerations.
     memory: s, of the forces and of the moments.
@@ -154,7 +155,43 @@ def _second_order(white: np.ndarray, std: float, time: float, step: float) -> np
     return std * math.sqrt(time / step) * shaped
 
 
+def _shedding(history, air, levels, step, shape, rng) -> None:
+    """Lightly damped oscillations, as behind a pillar or a fan: 0.3 to 1.5 Hz, a tenth of critical
+    damping; each axis has its own."""
+    white = rng.standard_normal((*shape, 6)).reshape(-1, 6)
+    for i, std in enumerate(levels.tolist()):
+        turn = 2.0 * math.pi * math.exp(rng.uniform(math.log(0.3), math.log(1.5))) * step
+        decay = math.exp(-0.1 * turn)
+        poles = [1.0, -2.0 * decay * math.cos(turn), decay * decay]
+        shaken = lfilter([1.0], poles, white[:, i])
+        history[1:, i] = std * shaken / _std_of(poles)
+
+
+def _std_of(poles) -> float:
+    """Of unit white noise through 1 / (1 + a z^-1 + b z^-2), when it has settled."""
+    _, a, b = poles
+    return math.sqrt((1.0 + b) / ((1.0 - b) * ((1.0 + b) ** 2 - a * a)))
+
+
+def _broad(history, air, levels, step, shape, rng) -> None:
+    """Three memories two octaves and more apart, of equal variance: no single one is right."""
+    for memory in (0.05, 0.4, 3.0):
+        white = rng.standard_normal((*shape, 6)).reshape(-1, 6)
+        for i, std in enumerate(levels.tolist()):
+            history[1:, i] += remembered(white[:, i], std / math.sqrt(3.0), memory, step)
+
+
+def _fitful(history, air, levels, step, shape, rng) -> None:
+    """Gusts of one memory, a third as strong and twice as strong in turns of 1 to 6 s: a door."""
+    _exponential(history, air, levels, step, rng.standard_normal((*shape, 6)))
+    at, strong = 0, bool(rng.integers(2))
+    while at < len(history):
+        end = at + round(float(rng.uniform(1.0, 6.0)) / step)
+        history[at:end, :6] *= 2.0 if strong else 1.0 / 3.0
+        at, strong = end, not strong
+
+
 GUSTS = {
     "markov": _markov, "heavy_tails": _heavy_tails, "one_minus_cosine": _one_minus_cosine,
-    "dryden": _dryden,
+    "dryden": _dryden, "shedding": _shedding, "broad": _broad, "fitful": _fitful,
 }  # fmt: skip

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 NOISE = {
     "rpm_upper": 2.0, "rpm_lower": 2.0, "p": 0.0349, "q": 0.0349, "r": 0.0349,
@@ -34,6 +35,8 @@ class Sensors(NamedTuple):
     step: s between rows, as the pilot commands. unrest: std of a row's time, share of the step.
     every_row: rows from one that is logged to the next, in turn. lost: share of rows lost in bursts
         of 2 to 5. gap: s, one gap in a flight's first run.
+    wander: channel -> std and memory [s] of an error that lasts, beside the noise. smooth: channel ->
+        time constant [s] of a low-pass that reading and noise went through.
     outliers: share of rows on which all channels are off by up to 12 std. quanta: channel -> step
         of its readings. formats: channel -> how it is written.
     """
@@ -45,6 +48,8 @@ class Sensors(NamedTuple):
     every_row: tuple[int, ...] = (1,)
     lost: float = 0.0
     gap: float = 0.0
+    wander: Mapping[str, tuple[float, float]] = {}
+    smooth: Mapping[str, float] = {}
     outliers: float = 0.0
     quanta: Mapping[str, float] = {}
     formats: Mapping[str, str] = {}
@@ -59,6 +64,20 @@ SENSORS = {
     "fast": Sensors(  # the inertial sensors in each of 500 rows a second, as noisy in 10 ms as above
         {c: std * (math.sqrt(5.0) if c in FAST else 1.0) for c, std in NOISE.items()},
         {c: 5 for c in NOISE if c not in FAST}, step=0.002, formats={"t": "%.3f"},
+    ),
+    "wandering": Sensors(  # attitudes of a filter, velocities of GNSS, biases that drift
+        NOISE,
+        wander={
+            "phi": (0.01, 2.0), "theta": (0.01, 2.0), "psi": (0.02, 5.0), "h": (0.04, 1.0),
+            "vn": (0.2, 1.0), "ve": (0.2, 1.0), "vd": (0.2, 1.0),
+            **dict.fromkeys(("p", "q", "r"), (0.005, 10.0)),
+            **dict.fromkeys(("ax", "ay", "az"), (0.05, 10.0)),
+        },
+    ),
+    "coarse": Sensors(NOISE, quanta={c: 2.0 * std for c, std in NOISE.items()}),
+    "spiky": Sensors(NOISE, outliers=0.003),
+    "smooth": Sensors(  # 20 Hz, as the low-pass of an inertial sensor is often set
+        NOISE, smooth=dict.fromkeys(("p", "q", "r", "ax", "ay", "az"), 0.008)
     ),
     "pose": Sensors(
         POSE, step=1.0 / 150.0, unrest=0.2, lost=0.01, outliers=0.002,
@@ -131,6 +150,20 @@ def _logged(
         start = float(rng.uniform(0.3, 0.8)) * t[-1]
         kept[(t > start) & (t < start + sensors.gap)] = False
     return kept
+
+
+def err(columns: dict[str, np.ndarray], sensors: Sensors, rng: np.random.Generator) -> None:
+    """Errors that last and low-passes, in place, after the noise."""
+    for channel, (std, memory) in sensors.wander.items():
+        decay = math.exp(-sensors.step / memory)
+        drive = std * math.sqrt(1.0 - decay * decay)
+        white = drive * rng.standard_normal(len(columns[channel]))
+        white[0] *= std / drive  # it was so before the log began
+        columns[channel] = columns[channel] + lfilter([1.0], [1.0, -decay], white)
+    for channel, time in sensors.smooth.items():
+        decay = math.exp(-sensors.step / time)
+        x = columns[channel]
+        columns[channel], _ = lfilter([1.0 - decay], [1.0, -decay], x, zi=[decay * x[0]])
 
 
 def blunt(columns: dict[str, np.ndarray], sensors: Sensors, rng: np.random.Generator) -> None:

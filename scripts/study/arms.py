@@ -68,6 +68,13 @@ ARMS = {
     ),
     "sizes_small": Arm("effects at 0.3 of their usual size", size=0.3),
     "sizes_large": Arm("effects at 3 times their usual size", size=3.0),
+    "shedding": Arm("gusts with a frequency, 0.3-1.5 Hz, lightly damped", Air("shedding")),
+    "broad": Arm("gusts with memories of 0.05, 0.4 and 3 s at once", Air("broad")),
+    "fitful": Arm("gusts of a third and of twice the strength in turns of 1-6 s", Air("fitful")),
+    "wandering": Arm("errors of the readings that last 1-10 s", sensors=("wandering",)),
+    "coarse": Arm("readings in steps of two std of their noise", sensors=("coarse",)),
+    "spiky": Arm("outliers of up to 12 std on 0.3 % of rows", sensors=("spiky",)),
+    "smooth": Arm("gyros and accelerometers behind a low-pass of 20 Hz", sensors=("smooth",)),
     "foreign_forms": Arm("effects in no list and of no generic term's form", listed=False),
 }  # fmt: skip
 
