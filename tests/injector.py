@@ -43,7 +43,17 @@ from injector_craft import (
     write_vehicle,
     yaw_authority,
 )
-from injector_sensors import SENSORS, Sensors, blunt, card_text, clock, csv_text, err, thin
+from injector_sensors import (
+    SENSORS,
+    Sensors,
+    blunt,
+    card_text,
+    clock,
+    csv_text,
+    err,
+    smoothed,
+    thin,
+)
 from numba import njit
 from scipy.spatial.transform import Rotation
 
@@ -1072,7 +1082,12 @@ def _read(
         columns[angle] = columns[angle] + getattr(hidden, f"attitude_{axis}")
     columns["h"] = columns["h"] * (1.0 + hidden.sonar_scale)
     for channel, std in sensors.noise.items():
-        columns[channel] = columns[channel] + std * rng.standard_normal(len(columns["t"]))
+        if channel in sensors.smooth:
+            columns[channel] = smoothed(
+                columns[channel], std, sensors, sensors.smooth[channel], rng
+            )
+        else:
+            columns[channel] = columns[channel] + std * rng.standard_normal(len(columns["t"]))
     err(columns, sensors, rng)
     blunt(columns, sensors, rng)
     columns["psi"] = (columns["psi"] + np.pi) % (2.0 * np.pi) - np.pi

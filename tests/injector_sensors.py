@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter, lfilter_zi
 
 NOISE = {
     "rpm_upper": 2.0, "rpm_lower": 2.0, "p": 0.0349, "q": 0.0349, "r": 0.0349,
@@ -36,7 +36,7 @@ class Sensors(NamedTuple):
     every_row: rows from one that is logged to the next, in turn. lost: share of rows lost in bursts
         of 2 to 5. gap: s, one gap in a flight's first run.
     wander: channel -> std and memory [s] of an error that lasts, beside the noise. smooth: channel ->
-        time constant [s] of a low-pass that reading and noise went through.
+        cut-off [Hz] of a Butterworth low-pass that reading and noise went through, and its order.
     outliers: share of rows on which all channels are off by up to 12 std. quanta: channel -> step
         of its readings. formats: channel -> how it is written.
     """
@@ -49,7 +49,7 @@ class Sensors(NamedTuple):
     lost: float = 0.0
     gap: float = 0.0
     wander: Mapping[str, tuple[float, float]] = {}
-    smooth: Mapping[str, float] = {}
+    smooth: Mapping[str, tuple[float, int]] = {}
     outliers: float = 0.0
     quanta: Mapping[str, float] = {}
     formats: Mapping[str, str] = {}
@@ -76,8 +76,12 @@ SENSORS = {
     ),
     "coarse": Sensors(NOISE, quanta={c: 2.0 * std for c, std in NOISE.items()}),
     "spiky": Sensors(NOISE, outliers=0.003),
-    "smooth": Sensors(  # 20 Hz, as the low-pass of an inertial sensor is often set
-        NOISE, smooth=dict.fromkeys(("p", "q", "r", "ax", "ay", "az"), 0.008)
+    "smooth": Sensors(  # as the low-pass of an inertial sensor is often set
+        NOISE, smooth=dict.fromkeys(("p", "q", "r", "ax", "ay", "az"), (20.0, 1))
+    ),
+    "autopilot": Sensors(  # and those of a flight controller's software
+        NOISE,
+        smooth=dict.fromkeys(("p", "q", "r"), (35.0, 2)) | dict.fromkeys(("ax", "ay", "az"), (25.0, 2)),
     ),
     "pose": Sensors(
         POSE, step=1.0 / 150.0, unrest=0.2, lost=0.01, outliers=0.002,
@@ -160,10 +164,27 @@ def err(columns: dict[str, np.ndarray], sensors: Sensors, rng: np.random.Generat
         white = drive * rng.standard_normal(len(columns[channel]))
         white[0] *= std / drive  # it was so before the log began
         columns[channel] = columns[channel] + lfilter([1.0], [1.0, -decay], white)
-    for channel, time in sensors.smooth.items():
-        decay = math.exp(-sensors.step / time)
-        x = columns[channel]
-        columns[channel], _ = lfilter([1.0 - decay], [1.0, -decay], x, zi=[decay * x[0]])
+
+
+def smoothed(
+    true: np.ndarray,
+    std: float,
+    sensors: Sensors,
+    kind: tuple[float, int],
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Readings behind a Butterworth low-pass that runs at about 1 kHz and is read once a row.
+
+    Args:
+        true: as the rows begin, by straight lines between them. std: white noise of the same density,
+            were it in the rows. kind: cut-off [Hz] and order.
+    """
+    times = max(round(sensors.step / 0.001), 1)
+    n = len(true)
+    fine = np.interp(np.arange((n - 1) * times + 1) / times, np.arange(n), true)
+    fine += math.sqrt(times) * std * rng.standard_normal(fine.size)
+    b, a = butter(kind[1], kind[0], fs=times / sensors.step)
+    return lfilter(b, a, fine, zi=true[0] * lfilter_zi(b, a))[0][::times]
 
 
 def blunt(columns: dict[str, np.ndarray], sensors: Sensors, rng: np.random.Generator) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.design import next_maneuver
-from coax_env.diagnosis import confounding, findings, unlisted, vibration
+from coax_env.diagnosis import confounding, findings, sensor_low_pass, unlisted, vibration
 from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
@@ -50,6 +50,7 @@ from coax_env.estimation.fitted_vehicle import double_counting
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import sensor_std, starting_noise
+from coax_env.estimation.low_pass import records_before
 from coax_env.estimation.prediction import RunReplay, gusts_of, replay_runs
 from coax_env.estimation.state_space import Record
 from coax_env.estimation.whiteness import Whiteness, whiteness
@@ -163,7 +164,10 @@ def diagnose(
     problem = Problem.of(model, used, candidates, settings, report)
     clock = clock_of(flight.runs)
     first = searched(problem, noise, clock)
+    unasked = set(candidates) - set(first.problem.candidates)
+    low_passed = [sensor_low_pass.remark(first.low_passes, unasked)] if first.low_passes else []
     problem, bare, refitted = first.problem, first.bare, first.refitted
+    held = records_before(held, CHANNELS, first.low_passes)
     passes_before = problem.engine.filter(bare.values, bare.noise)
     state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
@@ -224,6 +228,7 @@ def diagnose(
             *passed_over,
             *double_counting(flight, vehicle),
             *([vibration_removed(lines)] if lines else []),
+            *low_passed,
             *remarks(problem, fit, quadratic, found),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
             *held_out_before(gain, causes, flight.run_names),

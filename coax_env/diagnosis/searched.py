@@ -8,6 +8,9 @@ three times that, as long as the model's open-loop flight over the horizon comes
 runs (the likelihood raised to a power less than 1, for a model that is wrong: Miller and Dunson 2019,
 J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Identification, ch. 8).
 
+Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) it is done again, with what
+was before it.
+
 And where innovations that rotors' jitter would colour stay so, it is done again with that noise in the
 filter (estimation/rotor_jitter.py), if its levels are worth more than a tie: after a search, since a
 motor's lag colours them too and must be found as what it is.
@@ -17,7 +20,7 @@ likelier: what was found beside a delay that is off by a part of a row may stand
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -27,9 +30,11 @@ from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
+from coax_env.diagnosis.sensor_low_pass import hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
+from coax_env.estimation.low_pass import LowPass, records_before
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
@@ -54,6 +59,7 @@ class Searched:
     problem: what was searched.
     coarse: whether readings were taken to be no finer than LEAST_READING_STD.
     changing: with what began or changed in flight, where that has been asked already.
+    low_passes: what some channels' readings were taken back through.
     """
 
     problem: Problem
@@ -63,6 +69,7 @@ class Searched:
     quadratic: Quadratic
     coarse: bool = False
     changing: Changing | None = None
+    low_passes: Mapping[str, LowPass] = field(default_factory=dict)
 
 
 def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Searched:
@@ -73,6 +80,22 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         clock: of all runs in the order in which they were flown.
     """
     best = _searched(problem, noise)
+    smoothed = low_passes(problem, best.fit, noise)
+    if smoothed:
+        problem.report("searching again with readings as they were before a low-pass")
+        before = records_before(problem.engine.records, problem.model.channels, smoothed)
+        asked = set(problem.candidates) - hidden_behind(smoothed, best.fit, problem)
+        best = _searched(problem.with_records(before).of_candidates(asked), noise)
+    return replace(_in_unrest(best, noise, clock), low_passes=smoothed)
+
+
+def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap]) -> Searched:
+    """Again with shocks, jitter, readings believed less, where the first search asks for it.
+
+    Args:
+        best: of the first search. noise: levels to start from.
+        clock: of all runs in the order in which they were flown.
+    """
     if in_shocks(best.problem, best.fit):
         best = _changed(best, clock) or _searched_in_shocks(best, noise)
     problem = best.problem

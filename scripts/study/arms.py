@@ -74,7 +74,10 @@ ARMS = {
     "wandering": Arm("errors of the readings that last 1-10 s", sensors=("wandering",)),
     "coarse": Arm("readings in steps of two std of their noise", sensors=("coarse",)),
     "spiky": Arm("outliers of up to 12 std on 0.3 % of rows", sensors=("spiky",)),
-    "smooth": Arm("gyros and accelerometers behind a low-pass of 20 Hz", sensors=("smooth",)),
+    "smooth": Arm(
+        "gyros and accelerometers behind low-passes: 20 Hz, first order; 35 and 25 Hz, second",
+        sensors=("smooth", "autopilot"),
+    ),
     "foreign_forms": Arm("effects in no list and of no generic term's form", listed=False),
 }  # fmt: skip
 

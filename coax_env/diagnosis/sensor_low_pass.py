@@ -1,0 +1,188 @@
+"""Whether gyros and accelerometers are read through a low-pass, which the model does not have.
+
+Where a sensor smooths, two innovations that follow each other are alike, whatever gusts and levels take
+up of it. Then each group of channels is tried with its readings taken back through low-passes of several
+times (estimation/low_pass.py), noise levels fitted anew to each. Worth the threshold, they stay so, and
+causes are searched for again. Without it every clean **synthetic** flight behind 20 Hz had a
+`thrust_exponent` of 25 to 100 nats: rotor speeds are not smoothed, and thrust seemed to follow them less.
+"""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+from scipy.optimize import minimize_scalar
+
+from coax_env.diagnosis.fits import fitted
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation.engine import Engine
+from coax_env.estimation.low_pass import (
+    ACCELEROMETERS,
+    GYROS,
+    NONE,
+    LowPass,
+    before_low_pass,
+    records_before,
+)
+from coax_env.estimation.noise_levels import fit_noise
+from coax_env.estimation.run_passes import RunPass
+from coax_env.estimation.state_space import Noise
+from coax_env.plain_words import and_list, channel_name, plain
+
+GROUPS = (GYROS, ACCELEROMETERS)
+ALIKE = 4.0
+"""std of the correlation of neighbouring innovations, pooled over a group, from which low-passes are
+tried; chance reaches it once in 30,000 flights. A low-pass of 20 Hz makes 7 to 14 of it in 110 s."""
+TIMES = (0.4, 0.65, 1.1, 1.8)
+"""Of a row, that are tried: 40 to 9 Hz at 100 Hz; ours."""
+BOUNDS = (0.2, 3.0)
+"""Of a row: less is not seen in the next one, more is no sensor's; ours."""
+TURNS = 2
+"""In which each group is asked, beside what the other one has by then; ours."""
+WITHIN = 0.01
+"""Of a row, to which the likeliest time is sought; ours."""
+
+
+def low_passes(problem: Problem, fit: Fit, noise: Noise) -> dict[str, LowPass]:
+    """The low-passes of the channels that have one.
+
+    Args:
+        problem, fit: after a search. noise: from which that began: gusts have taken up by now what a
+            low-pass does to the readings' noise.
+    """
+    if problem.has_slow_rows:
+        return {}
+    passes = problem.engine.filter(fit.values, fit.noise)
+    if max(_alike(passes, problem.model.channels, group) for group in GROUPS) < ALIKE:
+        return {}
+    found: dict[str, LowPass] = {}
+    for turn in range(TURNS):
+        for group in GROUPS:
+            low_pass, noise = _likeliest(problem, fit, noise, group, found)
+            found |= dict.fromkeys(group, low_pass)
+        if all(low_pass == NONE for low_pass in found.values()):
+            return {}
+        if turn == 0:
+            fit = _refitted(problem, replace(fit, noise=noise), found)
+    return {channel: low_pass for channel, low_pass in found.items() if low_pass != NONE}
+
+
+def hidden_behind(passes: Mapping[str, LowPass], fit: Fit, problem: Problem) -> set[str]:
+    """Effects that cannot be told from what is left of a low-pass.
+
+    Where rotors follow at once, a command acts on the accelerations within its own row, and no inverse
+    says how much of it a smoothed reading has seen: an exponent of the thrust does the same.
+
+    Args:
+        passes: by channel. fit, problem: of the search before readings were taken back through them.
+    """
+    at_once = "motor_lag" not in {*fit.active, *problem.model.vehicle.effects}
+    return {"thrust_exponent"} if at_once and passes.keys() & set(ACCELEROMETERS) else set()
+
+
+def remark(passes: Mapping[str, LowPass], hidden: Collection[str]) -> str:
+    """That readings came through a low-pass, for who reads the findings.
+
+    Args:
+        passes: by channel. hidden: effects that are not asked for, therefore.
+    """
+    said = [
+        f"{and_list([channel_name(c) for c in group])} of about {passes[group[0]].cut_off:.0f} Hz"
+        f" ({('first', 'second')[passes[group[0]].order - 1]} order)"
+        for group in GROUPS
+        if group[0] in passes
+    ]
+    text = (
+        f"readings come through a low-pass: {'; '.join(said)}."
+        " They were taken back through it before causes were looked for; the simulation has none"
+    )
+    if hidden:
+        text += (
+            f". A {and_list([plain(e) for e in sorted(hidden)])} cannot be told from the rest of it"
+            " where rotors follow at once, and is not looked for"
+        )
+    return text
+
+
+def _alike(passes: Sequence[RunPass], channels: Sequence[str], group: Sequence[str]) -> float:
+    """Correlation of neighbouring innovations, pooled over a group's channels [std of chance]."""
+    of_each = []
+    for channel in group:
+        products, squares, count = 0.0, 0.0, 0
+        for run in passes:
+            e = run.innovations[:, channels.index(channel)]
+            e = e[e == e]
+            products += float(e[1:] @ e[:-1])
+            squares += float(e @ e)
+            count += e.size
+        if count:
+            of_each.append(products / squares * math.sqrt(count))
+    return sum(of_each) / math.sqrt(max(len(of_each), 1))
+
+
+def _likeliest(
+    problem: Problem, fit: Fit, noise: Noise, group: Sequence[str], others: Mapping[str, LowPass]
+) -> tuple[LowPass, Noise]:
+    """A group's low-pass, NONE where it is not worth the threshold; the noise with it.
+
+    Args:
+        problem, fit: after a search. noise: levels from which fits of them begin.
+        group: channels. others: low-passes of all channels as found by now.
+    """
+    row, channels, chosen = problem.row, problem.model.channels, problem.settings
+
+    def at(low_pass: LowPass) -> tuple[Engine, float]:
+        passes = {**others, **dict.fromkeys(group, low_pass)}
+        found = [before_low_pass(record, channels, passes) for record in problem.engine.records]
+        records, nats = zip(*found, strict=True)
+        return Engine(problem.model, records, problem.engine.threads), sum(nats)
+
+    def worth(low_pass: LowPass, levels: Noise) -> float:
+        engine, nats = at(low_pass)
+        return engine.log_likelihood(fit.values, levels) + nats
+
+    def noise_at(low_pass: LowPass, levels: Noise) -> Noise:
+        return fit_noise(
+            at(low_pass)[0], fit.values, levels, fit.levels,
+            chosen.first_noise_evaluations, chosen.step_gain, problem.noise_fit_seconds,
+        )  # fmt: skip
+
+    def scaled(levels: Noise, since: LowPass, to: LowPass) -> Noise:
+        factor = to.noise_before(row) / since.noise_before(row)
+        return levels.with_levels(
+            {c: factor * levels.reading[c] for c in group if c in levels.reading}
+        )
+
+    had = others.get(group[0], NONE)
+    tried = {}
+    for order in (1, 2):
+        for time in TIMES:
+            trial = LowPass(time * row, order)
+            levels = noise_at(trial, scaled(noise, had, trial))
+            tried[trial] = (worth(trial, levels), levels)
+    best = max(tried, key=lambda trial: tried[trial][0])
+    levels = tried[best][1]
+    k = TIMES.index(min(TIMES, key=lambda time: abs(time * row - best.time)))
+    near = (BOUNDS[0], *TIMES, BOUNDS[1])
+
+    def cost(time: float) -> float:
+        trial = LowPass(time * row, best.order)
+        return -worth(trial, scaled(levels, best, trial))
+
+    least = minimize_scalar(
+        cost, bounds=(near[k], near[k + 2]), method="bounded", options={"xatol": WITHIN}
+    )
+    found = LowPass(float(least.x) * row, best.order)
+    levels = noise_at(found, scaled(levels, best, found))
+    gained = worth(found, levels) - worth(NONE, noise_at(NONE, fit.noise))
+    problem.report(
+        f"a low-pass of {found.cut_off:.0f} Hz, order {found.order}, of {', '.join(group)}:"
+        f" {gained:.1f} nats"
+    )
+    return (found, levels) if gained > chosen.evidence else (NONE, scaled(noise, had, NONE))
+
+
+def _refitted(problem: Problem, fit: Fit, passes: Mapping[str, LowPass]) -> Fit:
+    """The fit to readings as they were before these: what was found may stand for them."""
+    records = records_before(problem.engine.records, problem.model.channels, passes)
+    return fitted(problem.with_records(records), fit)

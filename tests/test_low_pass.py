@@ -1,0 +1,100 @@
+"""Readings behind a sensor's low-pass, taken back through it; how it is found in a flight."""
+
+import injector
+import numpy as np
+import pytest
+from injector_air import GUSTY
+from numpy.testing import assert_allclose
+from scipy.signal import butter, lfilter
+from scipy.stats import multivariate_normal
+
+from coax_env.diagnosis import sensor_low_pass
+from coax_env.diagnosis.diagnose import diagnose
+from coax_env.estimation.low_pass import NONE, LowPass, before_low_pass
+from coax_env.estimation.state_space import Record
+
+STEP = 0.01
+
+
+def record(t: np.ndarray, p: np.ndarray) -> Record:
+    return Record("r", t, np.zeros((t.size, 4)), np.stack([p, np.ones(t.size)], axis=1))
+
+
+@pytest.mark.parametrize("low_pass", [LowPass(0.008), LowPass(0.007, 2), NONE])
+def test_what_a_low_pass_smoothed_comes_back(low_pass):
+    rng = np.random.default_rng(1)
+    t = np.cumsum(rng.uniform(0.7, 1.3, 300)) * STEP
+    true, logged = rng.standard_normal(300), np.zeros(300)
+    for k in range(2, 300):
+        a, b = low_pass.shares(t[k : k + 1] - t[k - 1])[:, 0]
+        logged[k] = a * logged[k - 1] + b * logged[k - 2] + (1.0 - a - b) * true[k]
+    found, _ = before_low_pass(record(t, logged), ["p", "h"], {"p": low_pass})
+    assert np.isnan(found.z[:2, 0]).all()
+    assert_allclose(found.z[2:, 0], true[2:], atol=1e-12)
+    assert_allclose(found.z[:, 1], 1.0)
+
+
+def test_readings_that_are_missing_have_no_part():
+    p = lfilter([1.0 - 0.3], [1.0, -0.3], np.random.default_rng(2).standard_normal(50))
+    p[10:14] = np.nan
+    found, _ = before_low_pass(record(STEP * np.arange(50), p), ["p", "h"], {"p": LowPass(0.008)})
+    assert np.array_equal(np.isnan(found.z[2:, 0]), np.isnan(p[2:]))
+
+
+@pytest.mark.parametrize("low_pass", [LowPass(0.008), LowPass(0.009, 2)])
+def test_likelihoods_of_the_readings_as_logged_and_before_agree(low_pass):
+    """Of white noise of std 0.7 before it: the density of what was logged, given its first two."""
+    a, b = low_pass.shares(np.array([STEP]))[:, 0]
+    n = 40
+    back = np.eye(n) - a * np.eye(n, k=-1) - b * np.eye(n, k=-2)
+    back[:2, :2] = np.eye(2)
+    gain = np.diag([1.0, 1.0, *[0.7 * (1.0 - a - b)] * (n - 2)])
+    covariance = np.linalg.inv(back) @ gain @ gain @ np.linalg.inv(back).T
+    logged = np.linalg.inv(back) @ gain @ np.random.default_rng(3).standard_normal(n)
+    whole = multivariate_normal(cov=covariance).logpdf(logged)
+    first = multivariate_normal(cov=np.eye(2)).logpdf(logged[:2])
+    found, nats = before_low_pass(record(STEP * np.arange(n), logged), ["p", "h"], {"p": low_pass})
+    white = multivariate_normal(cov=0.49).logpdf(found.z[2:, 0]).sum()
+    assert white + nats == pytest.approx(whole - first, rel=1e-9)
+
+
+@pytest.mark.parametrize("low_pass", [LowPass(0.008), LowPass(0.009, 2)])
+def test_how_much_noise_was_smoothed_away(low_pass):
+    a, b = low_pass.shares(np.array([STEP]))[:, 0]
+    white = np.random.default_rng(4).standard_normal(400_000)
+    logged = lfilter([1.0 - a - b], [1.0, -a, -b], white)
+    assert low_pass.noise_before(STEP) * logged.std() == pytest.approx(1.0, rel=0.01)
+
+
+def test_poles_are_those_of_a_butterworth_low_pass():
+    """That SciPy designs at 100 kHz, whose bilinear map then bends nothing, each 1000th step of it."""
+    b = LowPass(1.0 / (2.0 * np.pi * 25.0), 2).shares(np.array([STEP]))[:, 0]
+    _, a = butter(2, 25.0, fs=1000.0 / STEP)
+    poles = np.roots(a) ** 1000
+    assert_allclose(b, [poles.sum().real, -np.prod(poles).real], rtol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def smoothed(tmp_path_factory):
+    """**Synthetic**: nothing is hidden, gyros and accelerometers are behind 20 Hz at 1 kHz."""
+    folder = tmp_path_factory.mktemp("smooth") / "flight"
+    injector.fly(folder, {}, gusts=GUSTY, sensors="smooth", seed=5, longest=8.0)
+    return folder
+
+
+@pytest.mark.slow
+def test_a_low_pass_is_found_and_nothing_is_named(smoothed):
+    found = diagnose(smoothed)
+    assert found.findings["causes"] == []
+    said = [line for line in found.remarks if "low-pass" in line]
+    assert len(said) == 1
+    assert "forward acceleration" in said[0]
+    assert "yaw rate" in said[0]
+
+
+def test_the_remark_says_where_it_cuts_off_and_what_is_not_asked():
+    passes = dict.fromkeys(("p", "q", "r"), LowPass(1.0 / (2.0 * np.pi * 20.0)))
+    said = sensor_low_pass.remark(passes, {"thrust_exponent"})
+    assert "roll rate, pitch rate and yaw rate of about 20 Hz (first order)" in said
+    assert "thrust exponent" in said
+    assert "thrust exponent" not in sensor_low_pass.remark(passes, ())
