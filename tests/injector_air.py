@@ -27,6 +27,7 @@ class Air(NamedTuple):
     memory: s, of the forces and of the moments.
     wind: m/s, of "dryden": its mean over the ground at 6 m, which the turbulence drifts by with.
     every: s, mean time between single gusts.
+    frequency: Hz, of "shedding": of the three forces and the three moments.
     trim_thrust, trim_torque: random walks of both thrusts and of a torque, share per s^1/2.
     jitter: rad/s at the paper's speeds, std of the rotor speeds; jitter_memory: s.
     jitter_reaction: share of the rotors' angular momentum that the body then takes up.
@@ -39,6 +40,7 @@ class Air(NamedTuple):
     memory: tuple[float, float] = (0.5, 0.5)
     wind: float = 3.0
     every: float = 3.0
+    frequency: tuple[float, ...] = (0.6, 0.8, 1.1, 0.5, 0.9, 0.7)
     trim_thrust: float = 0.0
     trim_torque: float = 0.0
     jitter: float = 0.0
@@ -156,11 +158,10 @@ def _second_order(white: np.ndarray, std: float, time: float, step: float) -> np
 
 
 def _shedding(history, air, levels, step, shape, rng) -> None:
-    """Lightly damped oscillations, as behind a pillar or a fan: 0.3 to 1.5 Hz, a tenth of critical
-    damping; each axis has its own."""
+    """Lightly damped oscillations, as behind a pillar or a fan: a tenth of critical damping."""
     white = rng.standard_normal((*shape, 6)).reshape(-1, 6)
-    for i, std in enumerate(levels.tolist()):
-        turn = 2.0 * math.pi * math.exp(rng.uniform(math.log(0.3), math.log(1.5))) * step
+    for i, (std, frequency) in enumerate(zip(levels.tolist(), air.frequency, strict=True)):
+        turn = 2.0 * math.pi * frequency * step
         decay = math.exp(-0.1 * turn)
         poles = [1.0, -2.0 * decay * math.cos(turn), decay * decay]
         shaken = lfilter([1.0], poles, white[:, i])

@@ -7,8 +7,9 @@ so that readings correct once more what the commands have corrected, and a rate 
 half of it back. `rate_damping` was worth 44 and 50 nats so on clean synthetic flights by telemetry
 where, alone, it was worth less than nothing.
 
-Neither likelihood knows what the commands did between rows that are far apart. What looks like a weak
-or late answer must be worth several times as much there (`Settings.slow_inflation`).
+Neither likelihood knows what the commands did between rows that are far apart, nor what a pilot saw
+coming of gusts that are not as the filter has them (with a frequency, say). What looks like a weak or
+late answer must be worth several times as much there (`Settings.unseen_inflation`).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -19,8 +20,9 @@ from coax_env.diagnosis.input_innovations import has_command_gains, with_command
 from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, loss, threshold
+from coax_env.estimation.low_pass import ACCELEROMETERS
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.whiteness import is_white
+from coax_env.estimation.whiteness import is_white, whiteness
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Evidence:
 
     @property
     def nats(self) -> float:
-        """What coloured innovations and slow rows leave of what is lost."""
+        """What colour, and commands for what the filter does not see, leave of what is lost."""
         return self.lost / self.inflation
 
 
@@ -137,6 +139,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         the problem, with the gains where they are worth it and innovations white, what `prune` has of
         it, and the lesser evidence of the two.
     """
+    problem = replace(problem, unlike_gusts=_unlike_gusts(problem, fit))
     while True:
         wider, trial = with_command_gains(problem, fit, coloured=True)
         # colour spoils the gains for a model, not for the question
@@ -158,6 +161,14 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         fit = _only(problem, fit, asked.active)
 
 
+def _unlike_gusts(problem: Problem, fit: Fit) -> bool:
+    """Whether no accelerometer's innovations are white: forces of every axis come otherwise."""
+    passes = problem.engine.filter(fit.values, fit.noise)
+    seen = whiteness(passes, problem.model.channels)
+    logged = [seen[channel].white for channel in ACCELEROMETERS if channel in seen]
+    return len(logged) == len(ACCELEROMETERS) and not any(logged)
+
+
 def _is_white(problem: Problem, fit: Fit) -> bool:
     """Whether the readings' innovations are."""
     return is_white(problem.engine.filter(fit.values, fit.noise), problem.model.channels)
@@ -172,10 +183,10 @@ def _only(problem: Problem, fit: Fit, causes: Collection[str]) -> Fit:
 
 
 def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:
-    """What coloured innovations, and commands that change unseen, make of a cause's variance."""
-    unseen = problem.has_slow_rows and effect in WEAK_OR_LATE
+    """What colour, and commands for what the filter does not see, make of a cause's variance."""
+    unseen = (problem.has_slow_rows or problem.unlike_gusts) and effect in WEAK_OR_LATE
     colour = inflation(problem, quadratic, fit.active, effect)
-    return colour * problem.settings.slow_inflation if unseen else colour
+    return colour * problem.settings.unseen_inflation if unseen else colour
 
 
 def _is_doubtful(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:

@@ -44,7 +44,8 @@ WEAK_OR_LATE = frozenset({
     "yaw_inertia",
 })  # fmt: skip
 """Effects by which a machine answers its commands weakly or late. So it seems to where whoever flies
-answers gusts between the rows of a log, which holds each command until the next."""
+answers gusts between the rows of a log, which holds each command until the next, or foresees them
+better than the filter does."""
 
 T = TypeVar("T")
 
@@ -67,6 +68,7 @@ class Problem:
             (unlisted.py) and command gains (input_innovations.py).
         settings: what decides.
         progress: called with a line of text.
+        unlike_gusts: whether gusts turned out not to be as the filter has them (evidence.py).
     """
 
     model: HeliModel
@@ -76,6 +78,7 @@ class Problem:
     added: tuple[FreeParameter, ...] = ()
     settings: Settings = SETTINGS
     progress: Progress | None = None
+    unlike_gusts: bool = False
 
     @classmethod
     def of(

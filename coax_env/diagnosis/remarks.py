@@ -13,6 +13,7 @@ from coax_env.estimation.helicopter_noise import WHITE_LEVELS
 from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
+from coax_env.estimation.swinging_gusts import AXES_OF_GUSTS
 from coax_env.model.effects import CATALOGUE
 from coax_env.plain_words import and_list, channel_name, plain
 
@@ -27,6 +28,8 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
     """
     return [
         *_slow_rows(problem),
+        *_unlike_gusts(problem),
+        *_swings(problem),
         *_white_noise(problem, fit),
         *_moved_base(problem, fit),
         *_resting_on_unseen(problem, fit, quadratic, found),
@@ -104,7 +107,24 @@ def _slow_rows(problem: Problem) -> list[str]:
     return [
         f"rows {1e3 * problem.row:.0f} ms apart: what the commands did between "
         "them is not known, and what looks like a weak or late answer must be worth "
-        f"{problem.settings.slow_inflation:g} times as much"
+        f"{problem.settings.unseen_inflation:g} times as much"
+    ]
+
+
+def _swings(problem: Problem) -> list[str]:
+    """At what frequencies the gusts come, where they have some."""
+    of = zip(AXES_OF_GUSTS, problem.model.base.frequencies, strict=False)
+    said = [f"{axis} {frequency:.2g}" for axis, frequency in of if frequency > 0.0]
+    return [f"gusts have a frequency [Hz]: {', '.join(said)}"] if said else []
+
+
+def _unlike_gusts(problem: Problem) -> list[str]:
+    if not problem.unlike_gusts:
+        return []
+    return [
+        "no accelerometer's innovations are white: gusts are not as the filter has them, who flies may"
+        " foresee them better, and what looks like a weak or late answer must be worth"
+        f" {problem.settings.unseen_inflation:g} times as much"
     ]
 
 

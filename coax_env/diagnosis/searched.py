@@ -8,8 +8,9 @@ three times that, as long as the model's open-loop flight over the horizon comes
 runs (the likelihood raised to a power less than 1, for a model that is wrong: Miller and Dunson 2019,
 J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Identification, ch. 8).
 
-Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) it is done again, with what
-was before it.
+Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) it is done again, with
+what was before it. Where gusts have a frequency, with that in the filter
+(estimation/swinging_gusts.py), if nothing is coloured then: what a model lacks may swing, too.
 
 And where innovations that rotors' jitter would colour stay so, it is done again with that noise in the
 filter (estimation/rotor_jitter.py), if its levels are worth more than a tie: after a search, since a
@@ -32,6 +33,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.sensor_low_pass import hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
+from coax_env.diagnosis.swings import with_swings
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.low_pass import LowPass, records_before
@@ -96,6 +98,11 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap]) -> Search
         best: of the first search. noise: levels to start from.
         clock: of all runs in the order in which they were flown.
     """
+    swinging = with_swings(best.problem, best.fit)
+    if swinging is not None:
+        problem, levels = swinging
+        problem.report("gusts have a frequency: searching again with that")
+        return _searched(problem, noise.with_levels(levels))
     if in_shocks(best.problem, best.fit):
         best = _changed(best, clock) or _searched_in_shocks(best, noise)
     problem = best.problem

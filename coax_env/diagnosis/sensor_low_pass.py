@@ -1,10 +1,11 @@
 """Whether gyros and accelerometers are read through a low-pass, which the model does not have.
 
 Where a sensor smooths, two innovations that follow each other are alike, whatever gusts and levels take
-up of it. Then each group of channels is tried with its readings taken back through low-passes of several
-times (estimation/low_pass.py), noise levels fitted anew to each. Worth the threshold, they stay so, and
-causes are searched for again. Without it every clean **synthetic** flight behind 20 Hz had a
-`thrust_exponent` of 25 to 100 nats: rotor speeds are not smoothed, and thrust seemed to follow them less.
+up of it. Then each group of channels is tried with its readings taken back through low-passes of
+several times (estimation/low_pass.py), noise levels fitted anew to each. Worth the threshold, they stay
+so, and causes are searched for again. Without it every clean **synthetic** flight behind 20 Hz had a
+`thrust_exponent` of 25 to 100 nats: rotor speeds are not smoothed, and thrust seemed to follow them
+less.
 """
 
 import math

@@ -17,8 +17,9 @@ class Settings:
     slow_rows: float = 0.025
     """s between rows beyond which what a command did before the next one is not known; ours, between
     the 10 ms and the 38 ms that were measured."""
-    slow_inflation: float = 3.0
-    """Times that what looks like a weak or late answer must then be worth more. Measured by 26 Hz
+    unseen_inflation: float = 3.0
+    """Times that what looks like a weak or late answer must then be worth more, and where gusts are not
+    as the filter has them. Measured by 26 Hz
     telemetry (`study_diagnosis.py --arms telemetry`, seeds 70 and 71): 5 of 71 clean flights had a
     name, motor_droop four times, worth 31 nats at most; true ones that should show 51 to 196."""
     tie: float = 6.0

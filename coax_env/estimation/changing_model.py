@@ -219,6 +219,7 @@ class ChangingModel(HeliModel):
         self._size = base.vector(base.bare_values).size
         self.exact, self.work_size = base.exact, base.work_size + self._size
         self.state_scale, self.noise_places = base.state_scale, base.noise_places
+        self.air = base.air
 
     @property
     def base(self) -> HeliModel:

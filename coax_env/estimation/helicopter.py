@@ -11,7 +11,7 @@ It is searched along the line through their middles, off by half a row at most; 
 so, that of the readings is held (`reading_after`), and that of the step fitted by itself.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cache
@@ -230,7 +230,9 @@ class HeliModel:
     motion = Motion(_step, _measure, _drift_and_readings)
     step, measure, drift_and_readings = motion.pointers()
     read_delay: float | None = None  # [s] of commands to the readings; None: follows the steps'
+    frequencies: Sequence[float] = ()  # [Hz] of gusts that swing; see swinging_gusts.py
     moments: Mapping[str, Moment] = {}  # when effects begin or change; see changing_model.py
+    air = np.arange(GUST_FORCE.start, GUST_MOMENT.stop)  # states of the gusts
     exact = np.arange(N_FULL) >= N_STATES
     work_size = dynamics.WORK_SIZE
     noise_places = helicopter_noise.NOISE_PLACES

@@ -4,8 +4,8 @@ Inertial sensors and flight controllers smooth what they log, with cut-offs of 1
 then holds shares of those before it, and so does its noise, which is white no more; and rotor speeds,
 which nobody smooths, are ahead of the accelerations that they cause. The step from row to row is
 inverted: new = (reading - shares . last readings) / (1 - sum of the shares), with the poles of a
-first-order low-pass or of a Butterworth one of second order (Oppenheim and Schafer, Discrete-Time Signal
-Processing, ch. 7: impulse invariance).
+first-order low-pass or of a Butterworth one of second order (Oppenheim and Schafer, Discrete-Time
+Signal Processing, ch. 7: impulse invariance).
 """
 
 import cmath

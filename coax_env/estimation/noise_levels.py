@@ -43,7 +43,7 @@ def fit_noise(
         seconds: of flight that are enough: whole runs, evenly picked.
         progress: called with a line of text.
     """
-    some = _some(engine.records, seconds)
+    some = evenly_picked(engine.records, seconds)
     whole = len(some) == len(engine.records)
     picked = engine if whole else Engine(engine.model, some, engine.threads)
     first = _Point.at(picked, values, noise, levels)
@@ -215,7 +215,7 @@ def _logs(noise: Noise, levels: Sequence[str]) -> tuple[np.ndarray, np.ndarray, 
     return start, lower, upper
 
 
-def _some(records: Sequence[Record], seconds: float) -> list[Record]:
+def evenly_picked(records: Sequence[Record], seconds: float) -> list[Record]:
     """Records of so many seconds in all, or just more, evenly picked."""
     whole = sum(r.t[-1] - r.t[0] for r in records)
     count = math.ceil(min(1.0, seconds / whole) * len(records))

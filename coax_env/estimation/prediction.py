@@ -173,7 +173,7 @@ def _fly_all(
     for s, first in enumerate(run.start_rows):
         for gust, out in ((0.0, predicted), (1.0, decaying)):
             x = run.states[first].copy()
-            x[GUSTS] *= gust
+            x[engine.model.air] *= gust
             finite &= compiled_model.fly_open_loop(
                 engine.compiled, dt, inputs, x, p, first, targets[s], out[s]
             )
@@ -265,7 +265,7 @@ def _spread(
     moved = np.full(len(CHANNELS), np.nan)
     x0 = run.states[first].copy()
     sensitivity = np.zeros((len(CHANNELS), x0.size))
-    x0[GUSTS] = 0.0
+    x0[engine.model.air] = 0.0
 
     def fly(x: np.ndarray, out: np.ndarray) -> None:
         compiled_model.fly_open_loop(engine.compiled, dt, inputs, x, p, first, targets, out)

@@ -155,6 +155,7 @@ class Model(Protocol):
     step: Any  # compiled pointer: (x, u, dt, p, work, out)
     measure: Any  # compiled pointer: (x, u, p, work, out)
     drift_and_readings: Any  # compiled pointer: (x, u, dt, p, work, out), see above
+    air: np.ndarray  # places of the states that are gusts
     exact: np.ndarray  # (nx,) True where the drift is more than first order in dt
     work_size: int
     noise_places: (

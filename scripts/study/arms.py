@@ -137,6 +137,9 @@ def planned(name: str, kind: str, number: int, seed: int) -> PlannedFlight:
         low, high = (float(np.log(bound)) for bound in arm.memory)
         force, moment = np.exp(rng.uniform(low, high, 2)).tolist()
         air = air._replace(memory=(force, moment))
+    if air.gusts == "shedding":
+        swings = np.exp(rng.uniform(np.log(0.3), np.log(1.5), 6)).tolist()
+        air = air._replace(frequency=tuple(swings))
     return PlannedFlight(
         kind=kind,
         number=number,

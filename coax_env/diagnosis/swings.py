@@ -1,0 +1,125 @@
+"""Whether gusts have a frequency, which a memory that fades does not have.
+
+Asked after a search, where something stays coloured. Spectra of the filter's own gusts show where each
+may swing (estimation/swinging_gusts.py); from there frequencies, noise levels and numbers are fitted in
+turns, frequencies by the likelihood itself, since they change the filter's gains. What a model lacks
+may look like a swing as well: nothing may be coloured then, or none is used.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import gmean
+
+from coax_env.diagnosis.fits import fitted, noise_fitted
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation.helicopter_noise import AXES, GUST_AXES, GUST_LEVELS, MEMORIES
+from coax_env.estimation.noise_levels import evenly_picked
+from coax_env.estimation.state_space import Noise
+from coax_env.estimation.swinging_gusts import FASTEST, SwingingModel, swings
+from coax_env.estimation.whiteness import is_white
+from coax_env.plain_words import and_list
+
+TURNS = 3
+"""Of frequencies, noise levels and numbers, at most; ours."""
+EVALUATIONS = 60
+"""Likelihoods of a group's frequencies, memory and level, at most; ours."""
+SWUNG = 1.0
+"""Swings that a memory lasts, where its fit begins: a sixth of critical damping; ours."""
+SLOWEST = 0.05
+"""Hz: slower, no run shows a swing of; ours."""
+
+
+def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] | None:
+    """The problem whose gusts swing, and levels of these, where that leaves nothing coloured.
+
+    Args:
+        problem, fit: after a search.
+    """
+    channels = problem.model.channels
+    passes = problem.engine.filter(fit.values, fit.noise)
+    if is_white(passes, channels):
+        return None
+    frequencies = swings(passes, problem.row)
+    if not any(frequencies):
+        return None
+    best, trial = (
+        _swinging(problem, frequencies),
+        replace(fit, noise=_lasting(fit.noise, frequencies)),
+    )
+    last = math.inf
+    for _ in range(TURNS):
+        trial = fitted(best, trial)
+        if last - trial.objective < problem.settings.tie:
+            break
+        last = trial.objective
+        part = best.with_records(evenly_picked(best.engine.records, best.noise_fit_seconds))
+        for axes in AXES:
+            frequencies, trial = _likeliest(part, trial, frequencies, axes)
+        best = _swinging(problem, frequencies)
+    trial = fitted(best, noise_fitted(best, trial))
+    gained = fit.objective - trial.objective
+    problem.report(
+        f"gusts that swing at {and_list([f'{f:.2f}' for f in frequencies])} Hz: {gained:.1f} nats"
+    )
+    if gained < problem.settings.evidence:
+        return None
+    if not is_white(best.engine.filter(trial.values, trial.noise), channels):
+        return None
+    return best, {name: trial.noise.level(name) for name in (*GUST_LEVELS, *MEMORIES)}
+
+
+def _swinging(problem: Problem, frequencies: Sequence[float]) -> Problem:
+    return problem.with_model(SwingingModel.like(problem.model, frequencies))
+
+
+def _lasting(noise: Noise, frequencies: Sequence[float]) -> Noise:
+    """Noise levels whose memories are SWUNG swings, where a gust of the group has some."""
+    of_group: dict[str, list[float]] = {}
+    for axes, frequency in zip(GUST_AXES, frequencies, strict=True):
+        if frequency > 0.0:
+            of_group.setdefault(f"memory_{axes}", []).append(SWUNG / frequency)
+    return noise.with_levels({name: float(gmean(memories)) for name, memories in of_group.items()})
+
+
+def _likeliest(
+    problem: Problem, fit: Fit, frequencies: Sequence[float], axes: str
+) -> tuple[list[float], Fit]:
+    """Frequencies [Hz], memory and level of one group of axes, by the likelihood itself.
+
+    Args:
+        problem, fit: with the frequencies. axes: one of AXES.
+    """
+    swinging = [i for i, f in enumerate(frequencies) if f > 0.0 and GUST_AXES[i] == axes]
+    if not swinging:
+        return list(frequencies), fit
+    levels = [axes, f"memory_{axes}"]
+    first = [*(frequencies[i] for i in swinging), *(fit.noise.level(n) for n in levels)]
+    lows = [SLOWEST] * len(swinging) + [fit.noise.floor[n] for n in levels]
+    highs = [FASTEST] * len(swinging) + [fit.noise.ceiling[n] for n in levels]
+    bounds = np.log(np.stack([lows, highs], axis=1))
+    start = np.clip(np.log(first), *bounds.T)
+
+    def at(logs: np.ndarray) -> tuple[list[float], Noise]:
+        found, values = list(frequencies), np.exp(logs).tolist()
+        for i, f in zip(swinging, values, strict=False):
+            found[i] = f
+        return found, fit.noise.with_levels(dict(zip(levels, values[-2:], strict=True)))
+
+    def cost(logs: np.ndarray) -> float:
+        found, noise = at(logs)
+        return -_swinging(problem, found).engine.log_likelihood(fit.values, noise)
+
+    least = minimize(
+        cost, start, method="Nelder-Mead",
+        bounds=bounds,
+        options={
+            "maxfev": EVALUATIONS, "fatol": 1.0, "xatol": 0.03,
+            "initial_simplex": start + np.vstack([np.zeros(len(start)), 0.3 * np.eye(len(start))]),
+        },
+    )  # fmt: skip
+    found, noise = at(least.x)
+    return found, replace(fit, noise=noise)
