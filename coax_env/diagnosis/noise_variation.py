@@ -64,10 +64,8 @@ def not_holding(
 def _levels(problem: Problem, fit: Fit) -> Iterable[Level]:
     """Every level of the process noise, and every sensor's noise."""
     yield from (Level((name,), name.replace("_", " ")) for name in fit.noise.process)
-    measured = np.any([np.isfinite(r.z).any(0) for r in problem.engine.records], axis=0)
-    there = {c for c, has in zip(problem.model.channels, measured, strict=True) if has}
     for sensor in SENSORS:
-        names = tuple(c for c in sensor if c in there and c in fit.noise.reading)
+        names = tuple(c for c in sensor if c in problem.aboard and c in fit.noise.reading)
         if names:
             yield Level(names, f"the noise of {', '.join(names)}")
 

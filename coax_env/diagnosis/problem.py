@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
 
+import numpy as np
+
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.fitted_vehicle import median_step
@@ -193,6 +195,12 @@ class Problem:
     def row(self) -> float:
         """s between rows, the median."""
         return median_step(self.engine.records)
+
+    @cached_property
+    def aboard(self) -> frozenset[str]:
+        """Channels that have a reading."""
+        read = np.any([np.isfinite(r.z).any(0) for r in self.engine.records], axis=0)
+        return frozenset(np.array(self.model.channels)[read].tolist())
 
     @property
     def seconds(self) -> float:

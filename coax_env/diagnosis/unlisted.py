@@ -290,9 +290,7 @@ def excitation(
 
 def measured_terms(problem: Problem) -> list[Term]:
     """The terms that need no channel that no run has."""
-    records = problem.engine.records
-    aboard = np.any([np.isfinite(r.z).any(0) for r in records], axis=0)
-    return [t for t in TERMS if all(aboard[CHANNELS.index(c)] for c in t.needs)]
+    return [t for t in TERMS if problem.aboard.issuperset(t.needs)]
 
 
 # --- the search -----------------------------------------------------------------------------------
