@@ -51,7 +51,7 @@ class Flights:
         return replace(fit, active=fit.rest(effect))
 
     def pruned(
-        self, monkeypatch: pytest.MonkeyPatch, noise: Noise, row: float = 0.01
+        self, monkeypatch: pytest.MonkeyPatch, noise: Noise, row: float = 0.01, unlike: bool = False
     ) -> tuple[Fit, dict[str, evidence.Evidence]]:
         def loss(problem, quadratic, active, effect, inflation):
             return self.worth[effect] / inflation
@@ -70,24 +70,41 @@ class Flights:
         model = SimpleNamespace(moments={}, bare_values={})
         own: dict[str, tuple[()]] = dict.fromkeys(self.worth, ())
         engine = SimpleNamespace(threads=1, records=[SimpleNamespace(t=row * np.arange(9))])
-        problem = Problem(model, engine, (), own)  # type: ignore[arg-type]
+        problem = Problem(model, engine, (), own, unlike_gusts=unlike)  # type: ignore[arg-type]
         fit, _, found = prune(problem, Fit(tuple(self.worth), {}, noise))
         return fit, found
 
 
-@pytest.mark.parametrize(
-    ("row", "stay"),
-    [(0.01, {"motor_droop", "gyro_bias", "rate_damping"}), (0.04, {"gyro_bias", "rate_damping"})],
-)
-def test_between_slow_rows_a_weak_or_late_answer_must_be_worth_more(monkeypatch, row, stay):
-    """Three times as much: a pilot who answers gusts between them makes a machine look so."""
+@pytest.mark.parametrize(("row", "unlike"), [(0.01, False), (0.04, False), (0.01, True)])
+def test_a_weak_or_late_answer_to_what_the_filter_does_not_see_must_be_worth_more(
+    monkeypatch, row, unlike
+):
+    """Three times: a pilot who answers gusts between slow rows, or foresees them, makes it so."""
     worth = {"motor_droop": 2.9, "gyro_bias": 2.9, "rate_damping": 3.1}
     flights = Flights({effect: times * THRESHOLD for effect, times in worth.items()})
-    fit, found = flights.pruned(monkeypatch, GOOD, row)
+    fit, found = flights.pruned(monkeypatch, GOOD, row, unlike)
+    unseen = unlike or row > 0.02
+    stay = {"gyro_bias", "rate_damping"} | (set() if unseen else {"motor_droop"})
     assert set(fit.active) == set(found) == stay
     assert found["gyro_bias"].nats == pytest.approx(2.9 * THRESHOLD)
-    share = 1.0 if row < 0.02 else 3.0
-    assert found["rate_damping"].nats == pytest.approx(3.1 * THRESHOLD / share)
+    assert found["rate_damping"].nats == pytest.approx(3.1 * THRESHOLD / (3.0 if unseen else 1.0))
+
+
+@pytest.mark.parametrize(
+    ("white", "unlike"),
+    [
+        ({"ax": False, "ay": False, "az": False, "p": True}, True),
+        ({"ax": False, "ay": True, "az": False}, False),  # a force of one axis is something else
+        ({"ax": False, "ay": False}, False),
+        ({"phi": False, "h": False}, False),
+    ],
+)
+def test_gusts_are_unlike_the_filters_where_no_accelerometer_is_white(monkeypatch, white, unlike):
+    seen = {channel: SimpleNamespace(white=so) for channel, so in white.items()}
+    monkeypatch.setattr(evidence, "whiteness", lambda passes, channels: seen)
+    engine = SimpleNamespace(filter=lambda values, noise: [])
+    problem = SimpleNamespace(engine=engine, model=SimpleNamespace(channels=()))
+    assert evidence._unlike_gusts(problem, Fit((), {}, GOOD)) == unlike  # type: ignore[arg-type]
 
 
 def test_what_is_worth_less_than_the_threshold_leaves_the_weakest_first(monkeypatch):
@@ -144,7 +161,9 @@ class Tables:
     joint: dict[frozenset[str], dict[str, float]]
     worth_it: bool = True
     white: bool = True
+    feels: bool = True
     gains: bool = False
+    unlike_gusts: bool = False
     settings: Any = SETTINGS
     asked: list[bool] = field(default_factory=list)
 
@@ -181,6 +200,8 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "with_command_gains", gained)
     monkeypatch.setattr(evidence, "has_command_gains", lambda problem: problem.gains)
     monkeypatch.setattr(evidence, "_is_white", lambda problem, fit: problem.white)
+    monkeypatch.setattr(evidence, "_feels_gusts", lambda problem: problem.feels)
+    monkeypatch.setattr(evidence, "_unlike_gusts", lambda problem, fit: False)
     monkeypatch.setattr(evidence, "converged", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "refined", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "quadratic_at", lambda problem, fit: (fit, nothing))
@@ -188,7 +209,8 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "threshold", lambda problem, quadratic, active: THRESHOLD)
     monkeypatch.setattr(evidence, "weigh", removals)
     problem, fit, _, found = weighed(tables, Fit(active, {}, Noise({})))
-    assert problem.gains == (tables.worth_it and tables.white) and set(found) == set(fit.active)
+    assert problem.gains == (tables.worth_it and tables.white and tables.feels)
+    assert set(found) == set(fit.active)
     return fit.active
 
 
@@ -208,6 +230,17 @@ def test_names_are_asked_so_where_colour_keeps_the_gains_out_of_the_model(monkey
     for joint, stands in ((CLEAR, True), (2.0, False)):
         tables = Tables(of(play=CLEAR), of(play=joint), white=False)
         assert named(monkeypatch, tables, "play") == (("play",) if stands else ())
+
+
+def test_by_poses_alone_names_are_asked_so_and_numbers_are_the_readings(monkeypatch):
+    for joint, stands in ((CLEAR, True), (2.0, False)):
+        tables = Tables(of(motor_lag=CLEAR), of(motor_lag=joint), feels=False)
+        assert named(monkeypatch, tables, "motor_lag") == (("motor_lag",) if stands else ())
+
+
+@pytest.mark.parametrize(("aboard", "feels"), [({"phi", "pn"}, False), ({"phi", "r"}, True)])
+def test_gyros_and_accelerometers_feel_gusts(aboard, feels):
+    assert evidence._feels_gusts(SimpleNamespace(aboard=frozenset(aboard))) == feels  # type: ignore[arg-type]
 
 
 def test_where_commands_show_nothing_the_readings_decide(monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 
 from coax_env.diagnosis import noise_variation, replication
 from coax_env.diagnosis.noise_variation import Level, _Trial
-from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Asked, Known
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.quadratic import Linearised, Quadratic
@@ -71,15 +71,7 @@ def test_of_a_clear_cause_less_is_enough(monkeypatch):
 
 def test_every_level_is_varied_and_sensors_of_one_kind_together():
     """Process noise level by level; of the sensors those that read and whose noise is known."""
-    channels = ("p", "q", "r", "h", "psi", "vn")
-    z = np.full((2, 6), np.nan)
-    z[:, [0, 1, 3, 4]] = 1.0
-    other = np.full((2, 6), np.nan)
-    other[:, 2] = 1.0
-    records = [SimpleNamespace(z=z), SimpleNamespace(z=other)]
-    problem = SimpleNamespace(
-        engine=SimpleNamespace(records=records), model=SimpleNamespace(channels=channels)
-    )
+    problem = SimpleNamespace(aboard=frozenset(("p", "q", "r", "h", "psi")))
     reading = dict.fromkeys(("p", "q", "r", "h", "vn"), 0.1)
     fit = Fit((), {}, Noise({"force_xy": 1.0, "memory_force_xy": 0.5}, reading))
     found = list(noise_variation._levels(problem, fit))  # type: ignore[arg-type]
@@ -87,6 +79,15 @@ def test_every_level_is_varied_and_sensors_of_one_kind_together():
         Level(("force_xy",), "force xy"), Level(("memory_force_xy",), "memory force xy"),
         Level(("p", "q", "r"), "the noise of p, q, r"), Level(("h",), "the noise of h"),
     ]  # fmt: skip
+
+
+def test_aboard_is_what_any_run_reads():
+    z = np.full((2, 2, 3), np.nan)
+    z[0, 1, 0] = z[1, 0, 2] = 1.0
+    engine = SimpleNamespace(records=[SimpleNamespace(z=each) for each in z])
+    model = SimpleNamespace(channels=("p", "q", "h"))
+    problem = Problem(model, engine, (), {})  # type: ignore[arg-type]
+    assert problem.aboard == {"p", "h"}
 
 
 def passed(e: float) -> Any:

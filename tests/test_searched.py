@@ -3,14 +3,18 @@
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from coax_env.diagnosis import searched
 from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.searched import Searched
+from coax_env.diagnosis.sensor_low_pass import hidden_behind
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.helicopter_noise import LEAST_READING_STD
-from coax_env.estimation.state_space import Noise
+from coax_env.estimation.low_pass import LowPass
+from coax_env.estimation.state_space import Noise, Record
 
 
 def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
@@ -58,9 +62,11 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
     def one(problem: Any, noise: Noise, coarse: bool = False) -> Any:
         asked.append(noise.reading["phi"])
         fit = Fit((), {}, noise)
-        return SimpleNamespace(problem=problem, fit=fit, coarse=coarse)
+        return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
 
     monkeypatch.setattr(searched, "_searched", one)
+    monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
+    monkeypatch.setattr(searched, "with_swings", lambda problem, fit: None)
     monkeypatch.setattr(searched, "_with_jitter", lambda problem, fit: None)
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
@@ -73,6 +79,79 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
     assert asked == pytest.approx(stds) and found.coarse == coarse
     kept = sum(flies)
     assert found.fit.noise.reading["phi"] == pytest.approx(stds[kept])
+
+
+def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkeypatch):
+    """Nothing is coloured then, and nothing else is asked."""
+    asked: list[tuple[Any, float]] = []
+
+    def one(problem: Any, noise: Noise, coarse: bool = False) -> Searched:
+        asked.append((problem, noise.level("force_xy")))
+        fit = Fit((), {}, noise)
+        return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
+
+    swinging = SimpleNamespace(report=lambda text: None)
+    monkeypatch.setattr(searched, "_searched", one)
+    monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
+    monkeypatch.setattr(searched, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
+    found = searched.searched("fading", Noise({"force_xy": 0.2}), {})  # type: ignore[arg-type]
+    assert asked == [("fading", 0.2), (swinging, 0.7)]
+    assert found.problem is swinging and found.low_passes == {}
+
+
+def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypatch):
+    """Without what cannot be told from the rest of it where rotors follow at once."""
+    t, smooth = 0.01 * np.arange(30), np.linspace(0.0, 1.0, 30)
+    record = Record("a", t, np.zeros((30, 4)), np.stack([smooth, smooth], axis=1))
+    model = SimpleNamespace(channels=("ax", "h"), vehicle=SimpleNamespace(effects=()))
+
+    class Problem(SimpleNamespace):
+        def with_records(self, records: Any) -> "Problem":
+            return Problem(**{**vars(self), "engine": SimpleNamespace(records=records)})
+
+        def of_candidates(self, names: Any) -> "Problem":
+            return Problem(**{**vars(self), "candidates": tuple(sorted(names))})
+
+    asked = []
+
+    def one(problem: Any, noise: Noise, coarse: bool = False) -> Searched:
+        asked.append(problem)
+        fit = Fit(("thrust_exponent",), {}, noise)
+        return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(searched, "_searched", one)
+    monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock: best)
+    monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {"ax": LowPass(0.008)})
+    problem = Problem(
+        model=model, engine=SimpleNamespace(records=[record]), report=lambda text: None,
+        candidates=("thrust_exponent", "wind"),
+    )  # fmt: skip
+    found = searched.searched(problem, FINE, {})  # type: ignore[arg-type]
+    assert found.low_passes == {"ax": LowPass(0.008)}
+    assert asked[0] is problem and asked[1].candidates == ("wind",)
+    searched_on = asked[1].engine.records[0].z
+    share = np.exp(-0.01 / 0.008)
+    ahead = smooth[2:] + share / (1.0 - share) / 29.0  # of a ramp, by its slope times the delay
+    np.testing.assert_allclose(searched_on[2:, 0], ahead)
+    np.testing.assert_allclose(searched_on[:, 1], smooth)
+
+
+@pytest.mark.parametrize(
+    ("active", "own", "smoothed", "hidden"),
+    [
+        ((), (), ("ax",), {"thrust_exponent"}),
+        ((), (), ("p",), set()),  # no command acts on a rate within its row
+        (("motor_lag",), (), ("ax",), set()),
+        ((), ("motor_lag",), ("ax",), set()),
+    ],
+)
+def test_an_exponent_of_thrust_hides_behind_a_low_pass_where_rotors_follow_at_once(
+    active, own, smoothed, hidden
+):
+    problem = SimpleNamespace(model=SimpleNamespace(vehicle=SimpleNamespace(effects=own)))
+    fit = Fit(active, {}, FINE)
+    passes = dict.fromkeys(smoothed, LowPass(0.008))
+    assert hidden_behind(passes, fit, problem) == hidden  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

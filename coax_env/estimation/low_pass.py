@@ -91,5 +91,9 @@ def before_low_pass(
 def records_before(
     records: Sequence[Record], channels: Sequence[str], passes: Mapping[str, LowPass]
 ) -> list[Record]:
-    """Records with readings as they were before these low-passes."""
+    """Each of some records with readings as they were before their low-pass.
+
+    Args:
+        records: as logged. channels: of their columns. passes: by channel.
+    """
     return [before_low_pass(record, channels, passes)[0] for record in records]
