@@ -238,9 +238,18 @@ def test_by_poses_alone_names_are_asked_so_and_numbers_are_the_readings(monkeypa
         assert named(monkeypatch, tables, "motor_lag") == (("motor_lag",) if stands else ())
 
 
-@pytest.mark.parametrize(("aboard", "feels"), [({"phi", "pn"}, False), ({"phi", "r"}, True)])
-def test_gyros_and_accelerometers_feel_gusts(aboard, feels):
-    assert evidence._feels_gusts(SimpleNamespace(aboard=frozenset(aboard))) == feels  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("aboard", "slow", "feels"),
+    [
+        ({"phi", "pn"}, False, False),
+        ({"phi", "r"}, False, True),
+        ({"az"}, False, True),
+        ({"az", "r"}, True, False),
+    ],
+)
+def test_gyros_and_accelerometers_feel_gusts_in_time_but_between_slow_rows(aboard, slow, feels):
+    problem = SimpleNamespace(aboard=frozenset(aboard), has_slow_rows=slow)
+    assert evidence._feels_gusts(problem) == feels  # type: ignore[arg-type]
 
 
 def test_where_commands_show_nothing_the_readings_decide(monkeypatch):

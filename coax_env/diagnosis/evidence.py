@@ -7,10 +7,11 @@ so that readings correct once more what the commands have corrected, and a rate 
 half of it back. `rate_damping` was worth 44 and 50 nats so on clean synthetic flights by telemetry
 where, alone, it was worth less than nothing.
 
-The numbers are those with the gains where these are stated: innovations white, and gyros or
-accelerometers aboard. By poses alone a gust shows long after the command that answers it, which no
-constant gain says: of nine **synthetic** flights five had a number 2.5 to 6.5 std off with the
-gains, a motor lag of 74 ms as 47 +- 5 and an exponent of the wrong sign; without, two, 2.4 and 2.5.
+The numbers are those with the gains where these are stated: innovations white, gyros or accelerometers
+aboard, rows not slow. By poses alone a gust shows long after the command that answers it, which no
+constant gain says: of nine **synthetic** flights five had a number 2.5 to 6.5 std off with the gains, a
+motor lag of 72 ms as 49 +- 5 and an exponent of the wrong sign; without, two, 2.4 and 2.5. Nor between
+slow rows: a servo's delay of 35 ms was 14 +- 3 with them, 28 +- 3 without.
 
 Neither likelihood knows what the commands did between rows that are far apart, nor what a pilot saw
 coming of gusts that are not as the filter has them (with a frequency, say). What looks like a weak or
@@ -147,7 +148,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
     problem = replace(problem, unlike_gusts=_unlike_gusts(problem, fit))
     while True:
         wider, trial = with_command_gains(problem, fit, coloured=True)
-        # colour, and gusts that no reading feels, spoil the gains for a model, not for the question
+        # colour, and gusts that no reading feels in time, spoil them for a model, not to ask with
         stated = has_command_gains(wider) and _feels_gusts(problem) and _is_white(problem, fit)
         joint, alone = (wider, trial), (problem, fit)
         (first, start), (second, again) = (joint, alone) if stated else (alone, joint)
@@ -175,8 +176,8 @@ def _unlike_gusts(problem: Problem, fit: Fit) -> bool:
 
 
 def _feels_gusts(problem: Problem) -> bool:
-    """Whether gyros or accelerometers are aboard."""
-    return not problem.aboard.isdisjoint((*GYROS, *ACCELEROMETERS))
+    """Whether gyros or accelerometers are aboard, and read before a command answers what they feel."""
+    return not problem.has_slow_rows and not problem.aboard.isdisjoint((*GYROS, *ACCELEROMETERS))
 
 
 def _is_white(problem: Problem, fit: Fit) -> bool:
