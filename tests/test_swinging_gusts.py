@@ -1,6 +1,7 @@
 """Gusts with a frequency: what the filter's six partners do, how they are found, what is named then."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import injector
@@ -11,6 +12,9 @@ from numpy.testing import assert_allclose
 from scipy.linalg import expm, solve_continuous_lyapunov
 
 from coax_env import diagnose, load_vehicle
+from coax_env.diagnosis import swings as asking
+from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import AXES, GUST_AXES
 from coax_env.estimation.state_space import Noise
@@ -137,6 +141,42 @@ def test_a_gust_that_only_fades_has_none():
         for _ in range(20)
     ]
     assert np.count_nonzero(found) <= 2
+
+
+@pytest.mark.parametrize(
+    ("white_before", "peak", "gain", "white_with", "used"),
+    [
+        (False, 0.8, 100.0, True, True),
+        (True, 0.8, 100.0, True, False),  # nothing asks for more
+        (False, 0.0, 100.0, True, False),  # nor swings
+        (False, 0.8, 10.0, True, False),  # not worth the threshold
+        (False, 0.8, 100.0, False, False),  # what a model lacks may swing, too
+    ],
+)
+def test_swings_are_used_where_they_are_worth_it_and_nothing_stays_coloured(
+    monkeypatch, white_before, peak, gain, white_with, used
+):
+    """The fits are stand-ins, which gain at once what they may."""
+    white = iter([white_before, white_with])
+    fit = Fit((), {}, NOISE, objective=500.0)
+    gained = lambda problem, fit: replace(fit, objective=500.0 - gain)  # noqa: E731
+    monkeypatch.setattr(asking, "is_white", lambda passes, channels: next(white))
+    monkeypatch.setattr(asking, "swings", lambda passes, row: [peak] * 6)
+    monkeypatch.setattr(asking, "fitted", gained)
+    monkeypatch.setattr(asking, "noise_fitted", gained)
+    monkeypatch.setattr(asking, "_swinging", lambda problem, frequencies: problem)
+    monkeypatch.setattr(asking, "_likeliest", lambda part, trial, found, axes: (found, trial))
+    monkeypatch.setattr(asking, "evenly_picked", lambda records, seconds: records)
+    problem = SimpleNamespace(
+        engine=SimpleNamespace(filter=lambda values, noise: [], records=[]), row=0.01,
+        model=SimpleNamespace(channels=()), settings=SETTINGS, noise_fit_seconds=60.0,
+        report=lambda text: None, with_records=lambda records: None,
+    )  # fmt: skip
+    found = asking.with_swings(problem, fit)  # type: ignore[arg-type]
+    assert (found is not None) == used
+    if found is not None:
+        levels = {**LEVELS, **{f"memory_{axes}": 1.25 for axes in AXES}}  # one swing at 0.8 Hz
+        assert found[0] is problem and found[1] == pytest.approx(levels)
 
 
 @pytest.mark.slow

@@ -46,14 +46,13 @@ def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] 
     frequencies = swings(passes, problem.row)
     if not any(frequencies):
         return None
-    best, trial = (
-        _swinging(problem, frequencies),
-        replace(fit, noise=_lasting(fit.noise, frequencies)),
-    )
+    best = _swinging(problem, frequencies)
+    trial = replace(fit, noise=_lasting(fit.noise, frequencies))
     last = math.inf
-    for _ in range(TURNS):
+    for turn in range(TURNS):
         trial = fitted(best, trial)
-        if last - trial.objective < problem.settings.tie:
+        hopeless = turn > 0 and trial.objective > fit.objective
+        if hopeless or last - trial.objective < problem.settings.tie:
             break
         last = trial.objective
         part = best.with_records(evenly_picked(best.engine.records, best.noise_fit_seconds))
