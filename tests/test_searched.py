@@ -93,6 +93,7 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
     swinging = SimpleNamespace(report=lambda text: None)
     monkeypatch.setattr(searched, "_searched", one)
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
+    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     monkeypatch.setattr(searched, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
     found = searched.searched("fading", Noise({"force_xy": 0.2}), {})  # type: ignore[arg-type]
     assert asked == [("fading", 0.2), (swinging, 0.7)]

@@ -98,13 +98,14 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap]) -> Search
         best: of the first search. noise: levels to start from.
         clock: of all runs in the order in which they were flown.
     """
-    swinging = with_swings(best.problem, best.fit)
-    if swinging is not None:
-        problem, levels = swinging
-        problem.report("gusts have a frequency: searching again with that")
-        return _searched(problem, noise.with_levels(levels))
     if in_shocks(best.problem, best.fit):
         best = _changed(best, clock) or _searched_in_shocks(best, noise)
+    else:
+        swinging = with_swings(best.problem, best.fit)
+        if swinging is not None:
+            problem, levels = swinging
+            problem.report("gusts have a frequency: searching again with that")
+            return _searched(problem, noise.with_levels(levels))
     problem = best.problem
     found = _with_jitter(problem, best.fit)
     if found is not None:
