@@ -47,8 +47,8 @@ SPECTRUM_SECONDS = 5.0
 """s of the pieces whose spectra are averaged: 0.2 Hz apart; ours."""
 STANDS_OUT, CLEARLY = 1.5, 5.0
 """Times the density at the lowest frequency that a swing's must be, and the clearest one's of the six.
-Of four **synthetic** flights whose gusts swing, at 0.3 to 1.5 Hz, the clearest had 20 to 47 and the least
-3; gusts that only fade have up to 2.1, since the lowest frequency is half in a window's mean."""
+Of four **synthetic** flights whose gusts swing, at 0.3 to 1.5 Hz, the clearest had 20 to 47 and the
+least 3; gusts that only fade have up to 2.1, since the lowest frequency is half in a window's mean."""
 
 # of the scratch, behind the kernel's: drift and readings
 _OUT = dynamics.WORK_SIZE
