@@ -13,6 +13,7 @@ from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.rotor_jitter import REACTION, JitteryModel, with_jitter
 from coax_env.estimation.sparse import add_gram, find_non_zeros, padded, with_places
 from coax_env.estimation.state_space import part
+from coax_env.estimation.swinging_gusts import SwingingModel
 from coax_env.model import effects
 from coax_env.model.vehicle_file import load_vehicle
 
@@ -58,8 +59,16 @@ def flown():
         (HeliModel, LATE),
         (JitteryModel, ACTIVE),
         (JitteryModel, LATE),
+        (SwingingModel, ACTIVE),
     ],
-    ids=["bare", "six effects", "late commands", "jitter, six effects", "jitter, late commands"],
+    ids=[
+        "bare",
+        "six effects",
+        "late commands",
+        "jitter, six effects",
+        "jitter, late commands",
+        "swings, six effects",
+    ],
 )
 def test_derivatives_in_lanes_are_those_one_by_one(flown, kind, active):
     """Likelihood and signatures to the rounding of their differences, effects on or off."""
@@ -70,6 +79,8 @@ def test_derivatives_in_lanes_are_those_one_by_one(flown, kind, active):
     both = []
     for lanes in (same, one_by_one):
         model = lanes(kind(vehicle))
+        if kind is SwingingModel:
+            model.frequencies = (0.6, 0.8, 1.1, 0.5, 0.0, 0.7)
         engine = Engine(model, [record])
         assert engine.compiled.has_lanes == (lanes is same)
         (run,), lin = engine.linearise({**values, **active}, noise, free)

@@ -40,7 +40,8 @@ def compile_passes() -> None:
 def compile_model() -> None:
     """The model with all effects, of registers and of numbers: the other half."""
     lama = load_vehicle("lama400d")
-    assert HeliModel(lama).side_by_side is not None
+    model = HeliModel(lama)
+    assert model.step and model.side_by_side is not None
     hover_trim(
         lama.with_effect("motor_lag", upper=0.05).with_effect("rotor_drag", coefficient=1e-4)
     )

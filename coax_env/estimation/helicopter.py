@@ -145,10 +145,12 @@ class Motion(NamedTuple):
     measure: Any
     drift_and_readings: Any
 
-    def pointers(self) -> tuple[Any, Any, Any]:
-        """The three, as the engine takes them."""
-        step, measure, drift = self
-        return pointer(STEP)(step), pointer(MEASURE)(measure), pointer(STEP)(drift)
+
+@cache
+def pointers(motion: Motion) -> tuple[Any, Any, Any]:
+    """A model's three, as the engine takes them: compiled when a model of its kind is first made."""
+    step, measure, drift = motion
+    return pointer(STEP)(step), pointer(MEASURE)(measure), pointer(STEP)(drift)
 
 
 @dataclass(frozen=True)
@@ -228,7 +230,6 @@ class HeliModel:
     channels = CHANNELS
     wraps = np.array([c in ANGLES for c in CHANNELS])
     motion = Motion(_step, _measure, _drift_and_readings)
-    step, measure, drift_and_readings = motion.pointers()
     read_delay: float | None = None  # [s] of commands to the readings; None: follows the steps'
     frequencies: Sequence[float] = ()  # [Hz] of gusts that swing; see swinging_gusts.py
     moments: Mapping[str, Moment] = {}  # when effects begin or change; see changing_model.py
@@ -253,6 +254,7 @@ class HeliModel:
         self.vehicle = vehicle
         self.bare_values = {**(held or {}), **vehicle.values()}
         self.size_ratios = usual_sizes.ratios(vehicle)
+        self.step, self.measure, self.drift_and_readings = pointers(self.motion)
 
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """Parameter vector of the vehicle with some values changed, effects included.

@@ -135,7 +135,6 @@ class JitteryModel(HeliModel):
     """A vehicle whose rotor speeds jitter, through the engine's protocol."""
 
     motion = Motion(_step, _measure, _drift_and_readings)
-    step, measure, drift_and_readings = motion.pointers()
     exact = np.append(HeliModel.exact, [True, True])
     work_size = _WORK_SIZE
     state_scale = np.append(HeliModel.state_scale, [1e-2, 1e-2])

@@ -120,7 +120,6 @@ class SwingingModel(HeliModel):
     """A vehicle in gusts that swing, through the engine's protocol."""
 
     motion = Motion(_step, _measure, _drift_and_readings)
-    step, measure, drift_and_readings = motion.pointers()
     air = np.append(HeliModel.air, np.arange(SWINGS.start, SWINGS.stop))
     exact = np.append(HeliModel.exact, np.ones(6, bool))
     work_size = _WORK_SIZE
