@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
+from injector_air import remembered
 from scipy.signal import butter, lfilter, lfilter_zi
 
 NOISE = {
@@ -157,13 +158,13 @@ def _logged(
 
 
 def err(columns: dict[str, np.ndarray], sensors: Sensors, rng: np.random.Generator) -> None:
-    """Errors that last and low-passes, in place, after the noise."""
+    """Errors that last, in place, after the noise."""
     for channel, (std, memory) in sensors.wander.items():
-        decay = math.exp(-sensors.step / memory)
-        drive = std * math.sqrt(1.0 - decay * decay)
-        white = drive * rng.standard_normal(len(columns[channel]))
-        white[0] *= std / drive  # it was so before the log began
-        columns[channel] = columns[channel] + lfilter([1.0], [1.0, -decay], white)
+        white = rng.standard_normal(len(columns[channel]))
+        white[0] /= math.sqrt(
+            1.0 - math.exp(-2.0 * sensors.step / memory)
+        )  # so before the log began
+        columns[channel] = columns[channel] + remembered(white, std, memory, sensors.step)
 
 
 def smoothed(

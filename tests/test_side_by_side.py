@@ -80,7 +80,7 @@ def test_derivatives_in_lanes_are_those_one_by_one(flown, kind, active):
     for lanes in (same, one_by_one):
         model = lanes(kind(vehicle))
         if kind is SwingingModel:
-            model.frequencies = (0.6, 0.8, 1.1, 0.5, 0.0, 0.7)
+            model = model.swinging_at((0.6, 0.8, 1.1, 0.5, 0.0, 0.7))
         engine = Engine(model, [record])
         assert engine.compiled.has_lanes == (lanes is same)
         (run,), lin = engine.linearise({**values, **active}, noise, free)

@@ -20,13 +20,14 @@ from coax_env.estimation.helicopter_noise import AXES, GUST_AXES
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.swinging_gusts import N_SWINGING, SWINGS, SwingingModel, swings
 from coax_env.model import dynamics
+from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model.layout import GUSTS, N_CHANNELS, N_FULL
 
 LAMA = load_vehicle("lama400d")
 PLAIN = HeliModel(LAMA)
 FREQUENCIES = (0.6, 1.2, 0.0, 0.5, 0.9, 0.7)
-MODEL = SwingingModel.like(PLAIN, FREQUENCIES)
+MODEL = SwingingModel.like(PLAIN).swinging_at(FREQUENCIES)
 LEVELS = dict(zip(AXES, (0.2, 0.3, 0.006, 0.003), strict=True))
 NOISE = Noise({**LEVELS, **{f"memory_{axes}": 0.8 for axes in AXES}})
 HOVER, COMMAND = dynamics.hover_trim(LAMA)
@@ -118,6 +119,21 @@ def test_all_other_noise_is_the_helicopters():
     assert_allclose(others, np.delete(plain.intensity, np.r_[GUSTS]))
     assert np.array_equal(np.delete(MODEL.noise_places, np.r_[SWINGS], 0), PLAIN.noise_places)
     assert_allclose(MODEL.start_noise(NOISE)[SWINGS], MODEL.start_noise(NOISE)[GUSTS])
+
+
+def test_what_commands_show_of_gusts_turns_with_them():
+    """By constant gains, before the step, in the drift that derivatives are taken of as in the step."""
+    gains = {name: 0.01 * (1.0 + k) for k, name in enumerate(P.COMMAND_GAINS)}
+    u = np.append(INPUT, [0.3, -0.2, 0.1, 0.2, 0.0, 0.0])  # innovations of rotors and swash plate
+    p, x = MODEL.vector(gains, NOISE), state()
+    work, later = np.zeros(MODEL.work_size), np.zeros(N_SWINGING)
+    out = np.zeros(N_SWINGING + N_CHANNELS)
+    MODEL.step.__wrapped__(x, u, 1e-4, p, work, later)
+    MODEL.drift_and_readings.__wrapped__(x, u, 1e-4, p, work, out)
+    exact = np.r_[GUSTS, SWINGS]
+    assert_allclose(out[exact], (later - x)[exact], rtol=1e-9)
+    shown = gains["command_gain.moment_xy"] * 0.2  # of the lateral one
+    assert out[S.GUST_L] == pytest.approx(shown, rel=0.05)
 
 
 def passes(gust: np.ndarray) -> list[SimpleNamespace]:

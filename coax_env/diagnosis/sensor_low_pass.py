@@ -12,6 +12,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.fits import fitted
@@ -112,7 +113,7 @@ def _alike(passes: Sequence[RunPass], channels: Sequence[str], group: Sequence[s
         products, squares, count = 0.0, 0.0, 0
         for run in passes:
             e = run.innovations[:, channels.index(channel)]
-            e = e[e == e]
+            e = e[np.isfinite(e)]
             products += float(e[1:] @ e[:-1])
             squares += float(e @ e)
             count += e.size
@@ -138,15 +139,13 @@ def _likeliest(
         records, nats = zip(*found, strict=True)
         return Engine(problem.model, records, problem.engine.threads), sum(nats)
 
-    def worth(low_pass: LowPass, levels: Noise) -> float:
+    def fitted_at(low_pass: LowPass, levels: Noise) -> tuple[float, Noise]:
         engine, nats = at(low_pass)
-        return engine.log_likelihood(fit.values, levels) + nats
-
-    def noise_at(low_pass: LowPass, levels: Noise) -> Noise:
-        return fit_noise(
-            at(low_pass)[0], fit.values, levels, fit.levels,
+        levels = fit_noise(
+            engine, fit.values, levels, fit.levels,
             chosen.first_noise_evaluations, chosen.step_gain, problem.noise_fit_seconds,
         )  # fmt: skip
+        return engine.log_likelihood(fit.values, levels) + nats, levels
 
     def scaled(levels: Noise, since: LowPass, to: LowPass) -> Noise:
         factor = to.noise_before(row) / since.noise_before(row)
@@ -157,25 +156,24 @@ def _likeliest(
     had = others.get(group[0], NONE)
     tried = {}
     for order in (1, 2):
-        for time in TIMES:
+        for k, time in enumerate(TIMES):
             trial = LowPass(time * row, order)
-            levels = noise_at(trial, scaled(noise, had, trial))
-            tried[trial] = (worth(trial, levels), levels)
-    best = max(tried, key=lambda trial: tried[trial][0])
-    levels = tried[best][1]
-    k = TIMES.index(min(TIMES, key=lambda time: abs(time * row - best.time)))
-    near = (BOUNDS[0], *TIMES, BOUNDS[1])
+            tried[order, k] = trial, *fitted_at(trial, scaled(noise, had, trial))
+    order, k = max(tried, key=lambda place: tried[place][1])
+    best, _, levels = tried[order, k]
+    bounds = (BOUNDS[0], *TIMES, BOUNDS[1])
 
     def cost(time: float) -> float:
-        trial = LowPass(time * row, best.order)
-        return -worth(trial, scaled(levels, best, trial))
+        trial = LowPass(time * row, order)
+        engine, nats = at(trial)
+        return -engine.log_likelihood(fit.values, scaled(levels, best, trial)) - nats
 
     least = minimize_scalar(
-        cost, bounds=(near[k], near[k + 2]), method="bounded", options={"xatol": WITHIN}
+        cost, bounds=(bounds[k], bounds[k + 2]), method="bounded", options={"xatol": WITHIN}
     )
-    found = LowPass(float(least.x) * row, best.order)
-    levels = noise_at(found, scaled(levels, best, found))
-    gained = worth(found, levels) - worth(NONE, noise_at(NONE, fit.noise))
+    found = LowPass(float(least.x) * row, order)
+    nats, levels = fitted_at(found, scaled(levels, best, found))
+    gained = nats - fitted_at(NONE, fit.noise)[0]
     problem.report(
         f"a low-pass of {found.cut_off:.0f} Hz, order {found.order}, of {', '.join(group)}:"
         f" {gained:.1f} nats"

@@ -72,7 +72,7 @@ def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] 
 
 
 def _swinging(problem: Problem, frequencies: Sequence[float]) -> Problem:
-    return problem.with_model(SwingingModel.like(problem.model, frequencies))
+    return problem.with_model(SwingingModel.like(problem.model).swinging_at(frequencies))
 
 
 def _lasting(noise: Noise, frequencies: Sequence[float]) -> Noise:

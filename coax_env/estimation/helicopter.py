@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numba
 import numpy as np
@@ -255,6 +255,13 @@ class HeliModel:
         self.bare_values = {**(held or {}), **vehicle.values()}
         self.size_ratios = usual_sizes.ratios(vehicle)
         self.step, self.measure, self.drift_and_readings = pointers(self.motion)
+
+    @classmethod
+    def like(cls, model: "HeliModel") -> Self:
+        """Of the same vehicle, whose readings see the same commands."""
+        own = cls(model.vehicle, model.bare_values)
+        own.read_delay = model.read_delay
+        return own
 
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """Parameter vector of the vehicle with some values changed, effects included.

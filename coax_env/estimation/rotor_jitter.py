@@ -140,13 +140,6 @@ class JitteryModel(HeliModel):
     state_scale = np.append(HeliModel.state_scale, [1e-2, 1e-2])
     noise_places = np.insert(HeliModel.noise_places, N_FULL, [[N_FULL] * 2, [N_FULL + 1] * 2], 0)
 
-    @classmethod
-    def like(cls, model: HeliModel) -> "JitteryModel":
-        """Of the same vehicle, whose readings see the same commands."""
-        jittery = cls(model.vehicle, model.bare_values)
-        jittery.read_delay = model.read_delay
-        return jittery
-
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """The helicopter's parameter vector, and behind it the jitter's memory and reaction."""
         own = {name: value for name, value in values.items() if name != REACTION.name}

@@ -11,6 +11,7 @@ had inertias 10 to 40 % too large, and plays and lags of the servos.
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,7 @@ def _turned(x, partner, memory, frequency, dt, out):
 
 @compiled()
 def _turned_all(x, dt, p, out):
-    """All six, by the frequencies at the end of `p`, and the memories behind them."""
+    """All six, by what `p` ends with: their frequencies, then their memories. `out` may be `x`."""
     for i in range(6):
         _turned(x, N_FULL + i, p[p.size - 6 + i], p[p.size - 12 + i], dt, out)
 
@@ -102,16 +103,16 @@ def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) 
     kernel_drift(x[:N_FULL], u, dt, p, work, own)
     if _reads_another(u):
         kernel_measure(x[:N_FULL], u[READ], p, work, own[N_FULL:])
-    _take_in_innovations(u, p, own)
-    _turned_all(x, dt, p, out)
-    for i in range(S.GUST_X, S.GUST_X + 6):
-        out[i] -= x[i]
-    for i in range(N_FULL, N_SWINGING):
+    for i in range(N_SWINGING):
+        out[i] = x[i]
+    _take_in_innovations(u, p, out)
+    _turned_all(out, dt, p, out)
+    for i in range(N_SWINGING):
         out[i] -= x[i]
     for i in range(S.GUST_X):
-        out[i] = own[i]
+        out[i] += own[i]
     for i in range(S.GUST_X + 6, N_FULL):
-        out[i] = own[i]
+        out[i] += own[i]
     for i in range(N_CHANNELS):
         out[N_SWINGING + i] = own[N_FULL + i]
 
@@ -127,22 +128,17 @@ class SwingingModel(HeliModel):
     noise_places = np.insert(
         HeliModel.noise_places, N_FULL, [[i, i] for i in range(SWINGS.start, SWINGS.stop)], 0
     )
+    frequencies: Sequence[float] = (0.0,) * 6
 
-    frequencies: Sequence[float] = (
-        0.0,
-    ) * 6  # [Hz] of forces along and of moments about the three axes
-
-    @classmethod
-    def like(cls, model: HeliModel, frequencies: Sequence[float]) -> "SwingingModel":
-        """Of the same vehicle, whose readings see the same commands.
+    def swinging_at(self, frequencies: Sequence[float]) -> "SwingingModel":
+        """The same in gusts with these frequencies.
 
         Args:
-            model: of the vehicle. frequencies: six [Hz], 0 of a gust that only fades.
+            frequencies: of forces along and of moments about the axes [Hz], 0 of one that only fades.
         """
-        swinging = cls(model.vehicle, model.bare_values)
-        swinging.read_delay = model.read_delay
-        swinging.frequencies = tuple(frequencies)
-        return swinging
+        model = copy(self)
+        model.frequencies = tuple(frequencies)
+        return model
 
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """The helicopter's parameter vector, and behind it six frequencies and memories."""
@@ -181,10 +177,8 @@ class SwingingModel(HeliModel):
         swinging = swung > 0.0
         driven = np.zeros(6)
         driven[swinging] = 2.0 * (1.0 + 1.0 / swung[swinging] ** 2) * fading[swinging]
-        intensity, decay = (
-            np.insert(own.intensity, N_FULL, driven),
-            np.insert(own.decay, N_FULL, fades),
-        )
+        intensity = np.insert(own.intensity, N_FULL, driven)
+        decay = np.insert(own.decay, N_FULL, fades)
         intensity[GUSTS] = np.where(swinging, 0.0, fading)
         decay[GUSTS] = fades
         return ProcessNoise(intensity, decay)
