@@ -264,6 +264,8 @@ class Pilot(NamedTuple):
 
     home: m/s per m. speed: rad per m/s. tilt, rate: rad per rad, per rad/s. height, climb, turn,
     yaw_rate: share per m, m/s, rad, rad/s. side_trim, lift_trim, yaw_trim: the same per s, integrals.
+    lost: share of rows whose command is lost on the way, in bursts of 1 to 4; the one before stays.
+    grain: steps in which commands arrive, shares of the hover speeds and rad of the paper's swash.
     most_tilt [rad], most_yaw: limits. senses: 1/s, of their lag. delay: s before what is seen is
     acted on. hold: rows between decisions. tremor_rotor [rad/s], tremor_swash [rad]: std, memory [s].
     """
@@ -286,6 +288,8 @@ class Pilot(NamedTuple):
     hold: int = 1
     tremor_rotor: tuple[float, float] = (0.4, 0.12)
     tremor_swash: tuple[float, float] = (0.003, 0.25)
+    lost: float = 0.0
+    grain: tuple[float, float] = (0.0, 0.0)
 
 
 USUAL = Pilot()
@@ -300,8 +304,11 @@ PILOTS = {
         yaw_rate=0.012, side_trim=0.006, senses=12.0, delay=0.1, tremor_rotor=(0.6, 0.4),
         tremor_swash=(0.004, 0.5),
     ),
+    "by_radio": USUAL._replace(lost=0.03),
+    "by_steps": USUAL._replace(grain=(0.004, 0.004)),
 }  # fmt: skip
-"""Beside the usual one: a full-state stabiliser at half the rate, 30 ms late; a slow hand."""
+"""Beside the usual one: a full-state stabiliser at half the rate, 30 ms late; a slow hand; the usual
+one by a radio that loses commands, and by servos and motors of 7 bits."""
 
 
 class Reach(NamedTuple):
@@ -615,6 +622,7 @@ def _fly(
     trusts,
     extra,
     tremor,
+    arrives,
     pushes,
     pilot,
     early,
@@ -630,11 +638,13 @@ def _fly(
     Readings: 0-1 rotor speeds, 2-4 rates, 5-7 accelerometers, 8-10 attitude, 11-13 position,
     14-16 velocity, 17 cosine of the tilt. ``clock``: (rows,) s, the log begins at 0. ``dt``: (rows,)
     s to the next row; ``step``: s, what it usually is. ``targets`` (rows, 8), ``trusts`` (rows,):
-    the pilot's. ``extra``, ``tremor``: (rows, 4) added to the commands. ``pushes``:
+    the pilot's. ``extra``, ``tremor``: (rows, 4) added to the commands. ``arrives``: (rows,) whether
+    a command does. ``pushes``:
     (rows * SUBSTEPS + 1, DISTURBANCES).
     """
     rows = len(clock)
     commands = np.empty((rows, 4))
+    arrived = np.empty((rows, 4))
     readings = np.empty((rows, 18))
     s = np.zeros(N_STATE)
     s[0], s[1], s[2] = targets[0, 0], targets[0, 1], -targets[0, 2]
@@ -686,9 +696,14 @@ def _fly(
         command[2] = round(min(max(command[2], -0.25), 0.25) * 1e5) / 1e5
         command[3] = round(min(max(command[3], -0.25), 0.25) * 1e5) / 1e5
         commands[k] = command
+        if arrives[k] or k == 0:
+            arrived[k, :2] = _in_steps(command[:2], pilot.grain[0] * rotors.hover_upper)
+            arrived[k, 2:] = _in_steps(command[2:], pilot.grain[1])
+        else:
+            arrived[k] = arrived[k - 1]
         rates = s[10:13].copy()  # a gyro does not see the jump of this very instant
         push = pushes[k * SUBSTEPS]
-        actual = _acting(commands, clock, dt, k, 0, hidden, rotors)
+        actual = _acting(arrived, clock, dt, k, 0, hidden, rotors)
         _follow_at_once(s, actual, hidden, craft)
         ds = _derivative(s, actual, push, hidden, craft, rotors, out)
         readings[k, 0:2] = s[17:19] + push[8:10]
@@ -703,7 +718,7 @@ def _fly(
         for j in range(SUBSTEPS):
             push, later = pushes[k * SUBSTEPS + j], pushes[k * SUBSTEPS + j + 1]
             if j > 0 and _is_late(hidden):
-                actual = _acting(commands, clock, dt, k, j, hidden, rotors)
+                actual = _acting(arrived, clock, dt, k, j, hidden, rotors)
                 _follow_at_once(s, actual, hidden, craft)
             ds = _derivative(s, actual, push, hidden, craft, rotors, out2)
             middle = s + h * ds
@@ -714,6 +729,12 @@ def _fly(
             taken -= craft.rotor_lower * (later[9] - push[9])
             s[12] += taken / inertia
     return commands, readings
+
+
+@njit(cache=True)
+def _in_steps(values, step):
+    """Values to the nearest of equal steps; all of them where these are 0."""
+    return np.round(values / step) * step if step > 0.0 else values.copy()
 
 
 @njit(cache=True)
@@ -993,7 +1014,8 @@ def _fly_run(
         pushes = _on(pushes, times, sensors.step)
     pushes = np.ascontiguousarray(pushes)
     commands, readings = _fly(
-        times[:-1], dt, sensors.step, target[at], trust[at], extra[at], tremor, pushes,
+        times[:-1], dt, sensors.step, target[at], trust[at], extra[at], tremor,
+        _arrives(rows, pilot.lost, rng), pushes,
         _suited(pilot, craft), hidden, craft, rotors_of(craft), course.at_last,
         course.shares(times[:-1]),
     )  # fmt: skip
@@ -1021,6 +1043,15 @@ def _fly_run(
             [volts(p, t, rotors) for p, t in zip(product, times[first:-1], strict=True)]
         )
     return columns
+
+
+def _arrives(rows: int, lost: float, rng: np.random.Generator) -> np.ndarray:
+    """Whether each row's command does; where none is lost no number is drawn."""
+    arrives = np.ones(rows, dtype=bool)
+    if lost > 0.0:
+        for start in rng.integers(rows, size=round(lost * rows / 2.5)):
+            arrives[start : start + int(rng.integers(1, 5))] = False
+    return arrives
 
 
 def _late_rows(first: int, rows: int, delay: float, step: float) -> np.ndarray:
@@ -1082,6 +1113,8 @@ def _read(
         columns[angle] = columns[angle] + getattr(hidden, f"attitude_{axis}")
     columns["h"] = columns["h"] * (1.0 + hidden.sonar_scale)
     for channel, std in sensors.noise.items():
+        if channel in sensors.common:
+            std *= math.sqrt(0.5)
         if channel in sensors.smooth:
             columns[channel] = smoothed(
                 columns[channel], std, sensors, sensors.smooth[channel], rng

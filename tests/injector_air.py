@@ -21,7 +21,8 @@ class Air(NamedTuple):
 
     gusts: "none", "markov" (exponential memory), "heavy_tails" (the same, shaken by Student's t with
         three degrees of freedom), "one_minus_cosine" (single gusts), "dryden", "shedding" (each axis
-        with a frequency), "broad" (memories of 0.05, 0.4 and 3 s at once), "fitful" (weak and strong).
+        with a frequency), "broad" (memories of 0.05, 0.4 and 3 s at once), "fitful" (weak and strong),
+        "one_sided" (skewed), "together" (one gust pushes, turns and lifts), "days" (each run its own).
     force, moment_xy, moment_z: std [N, N m] on the paper's vehicle; on others the same share of
         weight and the same angular accelerations.
     memory: s, of the forces and of the moments.
@@ -192,7 +193,37 @@ def _fitful(history, air, levels, step, shape, rng) -> None:
         at, strong = end, not strong
 
 
+def _one_sided(history, air, levels, step, shape, rng) -> None:
+    """Log-normal, less its mean: long lulls, and gusts that come from one side, another on each axis
+    and in each run."""
+    steps = len(history) - 1
+    white = rng.standard_normal((steps, 6))
+    for i, (std, memory) in enumerate(zip(levels.tolist(), _memories(air), strict=True)):
+        gauss = remembered(white[:, i], 0.8, memory, step)
+        mean, square = math.exp(0.32), math.exp(0.64)
+        skewed = (np.exp(gauss) - mean) / (mean * math.sqrt(square - 1.0))
+        history[1:, i] = float(rng.choice([-1.0, 1.0])) * std * skewed
+
+
+def _together(history, air, levels, step, shape, rng) -> None:
+    """A gust that pushes to a side also turns the body, and lifts: nine tenths of moments and a half of
+    the vertical force are those of the side force."""
+    _exponential(history, air, levels, step, rng.standard_normal((*shape, 6)))
+    for i, source, share in ((4, 0, -0.9), (3, 1, 0.9), (5, 1, 0.6), (2, 0, 0.5)):
+        of_gust = share * levels[i] / levels[source] * history[:, source]
+        history[:, i] = of_gust + math.sqrt(1.0 - share * share) * history[:, i]
+
+
+def _days(history, air, levels, step, shape, rng) -> None:
+    """Each run on its own day: a quarter to twice the strength, a third to three times the memory."""
+    strength = math.exp(rng.uniform(math.log(0.25), math.log(2.0)))
+    slower = math.exp(rng.uniform(-math.log(3.0), math.log(3.0)))
+    air = air._replace(memory=(slower * air.memory[0], slower * air.memory[1]))
+    _exponential(history, air, strength * levels, step, rng.standard_normal((*shape, 6)))
+
+
 GUSTS = {
     "markov": _markov, "heavy_tails": _heavy_tails, "one_minus_cosine": _one_minus_cosine,
     "dryden": _dryden, "shedding": _shedding, "broad": _broad, "fitful": _fitful,
+    "one_sided": _one_sided, "together": _together, "days": _days,
 }  # fmt: skip

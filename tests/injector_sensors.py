@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from injector_air import remembered
-from scipy.signal import butter, lfilter, lfilter_zi
+from scipy.signal import butter, filtfilt, lfilter, lfilter_zi
+from scipy.spatial.transform import Rotation
 
 NOISE = {
     "rpm_upper": 2.0, "rpm_lower": 2.0, "p": 0.0349, "q": 0.0349, "r": 0.0349,
@@ -38,6 +39,14 @@ class Sensors(NamedTuple):
         of 2 to 5. gap: s, one gap in a flight's first run.
     wander: channel -> std and memory [s] of an error that lasts, beside the noise. smooth: channel ->
         cut-off [Hz] of a Butterworth low-pass that reading and noise went through, and its order.
+    flicker: channel -> std of an error with memories of 0.03 to 30 s, equal in each decade, beside the
+        noise. common: channels that have half the variance of their noise in common.
+    fused: s, memory of an onboard filter whose attitudes, velocities and height are logged: gyros and
+        accelerometers carry them on, and they go back in it to what `noise` is of. 0: as they are read.
+    stamps: s, std of the error of a row's logged time.
+    between: channel -> rows between readings, of which straight lines are logged. held: the same of
+        readings that are logged until the next. steadied: channel -> cut-off [Hz] of a Butterworth
+        low-pass of second order that readings and noise went through forwards and back.
     outliers: share of rows on which all channels are off by up to 12 std. quanta: channel -> step
         of its readings. formats: channel -> how it is written.
     """
@@ -51,6 +60,13 @@ class Sensors(NamedTuple):
     gap: float = 0.0
     wander: Mapping[str, tuple[float, float]] = {}
     smooth: Mapping[str, tuple[float, int]] = {}
+    flicker: Mapping[str, float] = {}
+    common: tuple[str, ...] = ()
+    fused: float = 0.0
+    stamps: float = 0.0
+    between: Mapping[str, int] = {}
+    held: Mapping[str, int] = {}
+    steadied: Mapping[str, float] = {}
     outliers: float = 0.0
     quanta: Mapping[str, float] = {}
     formats: Mapping[str, str] = {}
@@ -74,6 +90,28 @@ SENSORS = {
             **dict.fromkeys(("p", "q", "r"), (0.005, 10.0)),
             **dict.fromkeys(("ax", "ay", "az"), (0.05, 10.0)),
         },
+    ),
+    "flicker": Sensors(
+        NOISE, flicker={c: 0.4 * std for c, std in NOISE.items() if not c.startswith("rpm")}
+    ),
+    "common": Sensors(NOISE, common=("p", "q", "r", "ax", "ay", "az", "phi", "theta", "psi")),
+    "fused": Sensors(NOISE | {"phi": 0.03, "theta": 0.03, "psi": 0.05}, fused=1.0),
+    "stamped": Sensors(NOISE, stamps=0.002, formats={"t": "%.5f"}),
+    "resampled": Sensors(  # all on the clock of the fastest, by straight lines
+        NOISE,
+        between={"phi": 2, "theta": 2, "psi": 2, "h": 5, "vn": 10, "ve": 10, "vd": 10},
+    ),
+    "held": Sensors(  # the last one written again
+        NOISE, held={"phi": 2, "theta": 2, "psi": 2, "h": 5, "vn": 10, "ve": 10, "vd": 10}
+    ),
+    "fifty": Sensors(NOISE, every_row=(2,)),
+    "pose_steadied": Sensors(  # by the motion capture's own software
+        {c: 5.0 * std for c, std in POSE.items()}, step=0.01,
+        steadied=dict.fromkeys(POSE, 10.0), formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"),
+    ),
+    "camera": Sensors(
+        {"phi": 0.01, "theta": 0.01, "psi": 0.01, "pn": 0.003, "pe": 0.003, "h": 0.004}, step=0.01,
+        every_row=(3,), formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"),
     ),
     "coarse": Sensors(NOISE, quanta={c: 2.0 * std for c, std in NOISE.items()}),
     "spiky": Sensors(NOISE, outliers=0.003),
@@ -165,6 +203,58 @@ def err(columns: dict[str, np.ndarray], sensors: Sensors, rng: np.random.Generat
             1.0 - math.exp(-2.0 * sensors.step / memory)
         )  # so before the log began
         columns[channel] = columns[channel] + remembered(white, std, memory, sensors.step)
+    for channel, std in sensors.flicker.items():
+        for memory in (0.03, 0.3, 3.0, 30.0):
+            white = rng.standard_normal(len(columns[channel]))
+            white[0] /= math.sqrt(1.0 - math.exp(-2.0 * sensors.step / memory))
+            columns[channel] = columns[channel] + remembered(white, std, memory, sensors.step)
+    if sensors.common:
+        shared = rng.standard_normal(len(columns["t"]))
+        for channel in sensors.common:
+            columns[channel] = columns[channel] + math.sqrt(0.5) * sensors.noise[channel] * shared
+    for channel, every in {**sensors.between, **sensors.held}.items():
+        rows = np.arange(len(columns["t"]))
+        read = rows[::every]
+        values = columns[channel][read]
+        if channel == "psi":
+            values = np.unwrap(values)
+        of_row = rows // every if channel in sensors.held else None
+        columns[channel] = np.interp(rows, read, values) if of_row is None else values[of_row]
+    for channel, cut_off in sensors.steadied.items():
+        b, a = butter(2, cut_off, fs=1.0 / sensors.step)
+        values = np.unwrap(columns[channel]) if channel == "psi" else columns[channel]
+        columns[channel] = filtfilt(b, a, values)
+    if sensors.fused > 0.0:
+        fuse(columns, sensors)
+    if sensors.stamps > 0.0:
+        late = sensors.stamps * rng.standard_normal(len(columns["t"]))
+        columns["t"] = columns["t"] + np.clip(late, -0.45 * sensors.step, 0.45 * sensors.step)
+        columns["t"] -= columns["t"][0]
+
+
+def fuse(columns: dict[str, np.ndarray], sensors: Sensors) -> None:
+    """Attitudes, velocities and height as an onboard filter says them, in place.
+
+    A complementary filter: the noisy gyros and accelerometers carry its state from row to row, and
+    in `sensors.fused` s it goes back to the noisy angles, velocities and heights.
+    """
+    rates = np.stack([columns[c] for c in "pqr"], axis=-1)
+    force = np.stack([columns[c] for c in ("ax", "ay", "az")], axis=-1)
+    angles = np.stack([columns[c] for c in ("psi", "theta", "phi")], axis=-1)
+    speeds = np.stack([columns[c] for c in ("vn", "ve", "vd")], axis=-1)
+    back = sensors.step / sensors.fused
+    attitude, speed, height = Rotation.from_euler("ZYX", angles[0]), speeds[0], columns["h"][0]
+    for k in range(len(rates)):
+        off = attitude.inv() * Rotation.from_euler("ZYX", angles[k])
+        attitude = attitude * Rotation.from_rotvec(back * off.as_rotvec())
+        speed = speed + back * (speeds[k] - speed)
+        height = height + back * (columns["h"][k] - height)
+        columns["psi"][k], columns["theta"][k], columns["phi"][k] = attitude.as_euler("ZYX")
+        columns["vn"][k], columns["ve"][k], columns["vd"][k] = speed
+        columns["h"][k] = height
+        height = height - sensors.step * speed[2]
+        speed = speed + sensors.step * (attitude.apply(force[k]) + [0.0, 0.0, 9.81])
+        attitude = attitude * Rotation.from_rotvec(sensors.step * rates[k])
 
 
 def smoothed(

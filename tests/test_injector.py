@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from injector_air import DISTURBANCES, GUSTS, Air, disturbances
 from injector_craft import COAX, LAMA, Craft, draw, rotors_of, spread, write_vehicle
-from injector_sensors import POSE, SENSORS
+from injector_sensors import NOISE, POSE, SENSORS
 from shared_flights import shared_flight
 
 import coax_env
@@ -232,6 +232,120 @@ def test_single_gusts_come_and_go() -> None:
     push = abs(history[:, 0]) / 0.2
     assert 1.5 < push.max() < 5.0
     assert 0.2 < np.mean(push > 0.75) < 0.6, "with calm between them"
+
+
+def history_of(gusts: str, rows: int = 100_000, seed: int = 1) -> np.ndarray:
+    """Gusts in shares of their levels."""
+    rng = np.random.default_rng(seed)
+    history = disturbances(Air(gusts), LAMA, rows, 5, 0.002, rng)[1000:, :6]
+    return history / [0.2, 0.2, 0.2, 0.006, 0.006, 0.003]
+
+
+def test_one_sided_gusts_are_log_normal() -> None:
+    """Of a log-normal the skewness is (exp(s^2) + 2) sqrt(exp(s^2) - 1), here 3.7; its mean is 0."""
+    gusts = history_of("one_sided", 400_000)
+    np.testing.assert_allclose(gusts.std(axis=0), 1.0, rtol=0.2)
+    np.testing.assert_allclose(gusts.mean(axis=0), 0.0, atol=0.15)
+    np.testing.assert_allclose(abs(np.mean(gusts**3, axis=0)), 3.7, rtol=0.6)
+
+
+def test_a_gust_that_comes_together_turns_and_lifts() -> None:
+    alike = np.corrcoef(history_of("together").T)
+    for source, target, share in ((0, 4, -0.9), (1, 3, 0.9), (1, 5, 0.6), (0, 2, 0.5)):
+        assert alike[source, target] == pytest.approx(share, abs=0.1)
+    assert abs(alike[0, 1]) < 0.15 and abs(alike[0, 3]) < 0.15
+
+
+def test_each_day_has_its_own_gusts() -> None:
+    stds = [history_of("days", 20_000, seed).std() for seed in range(30)]
+    assert min(stds) < 0.5 and max(stds) > 1.3
+    assert min(stds) > 0.15 and max(stds) < 2.6
+
+
+@pytest.fixture(scope="module")
+def turns(tmp_path_factory: pytest.TempPathFactory):
+    """The same run of the heading by other sensors and pilots."""
+
+    def flown(sensors: str = "full", pilot: str = "usual"):
+        folder = tmp_path_factory.mktemp("turn") / f"{sensors}_{pilot}"
+        runs = ["heading_turn"]
+        injector.fly(folder, {}, sensors=sensors, pilot=pilot, runs=runs, seed=2)
+        return read_flight(folder).run("heading_turn")
+
+    return flown
+
+
+def off(run, channel: str) -> np.ndarray:
+    """What a channel is off from a running mean over 0.2 s."""
+    values = run.measured[channel]
+    values = np.unwrap(values) if channel == "psi" else values
+    return (values - np.convolve(values, np.ones(21) / 21, "same"))[50:-50]
+
+
+def test_flicker_is_an_error_of_every_memory(turns) -> None:
+    """Four memories of 0.4 of the noise's std each: sqrt(1 + 4 * 0.16) as large, and it lasts."""
+    flicker, full = (turns(sensors).measured["phi"] for sensors in ("flicker", "full"))
+    more = flicker - full  # the noise's own draws come first and are the same
+    assert more.std() == pytest.approx(0.8 * NOISE["phi"], rel=0.4)
+    assert np.mean(more[100:] * more[:-100]) > 0.2 * more.var()
+
+
+def test_noise_in_common_is_half_of_the_variance(turns) -> None:
+    run = turns("common")
+    alike = np.corrcoef([off(run, c) for c in ("p", "phi", "ax", "h")])
+    np.testing.assert_allclose(alike[0, 1:3], 0.5, atol=0.1)
+    assert abs(alike[0, 3]) < 0.1
+    assert off(run, "phi").std() == pytest.approx(NOISE["phi"], rel=0.1)
+
+
+def test_an_onboard_filters_attitude_is_carried_by_its_gyros(turns) -> None:
+    """A row adds what the gyro says, and goes back a hundredth of 0.03 rad of noise."""
+    run = turns("fused")
+    more = np.diff(run.measured["phi"]) - 0.01 * run.measured["p"][:-1]
+    assert more[100:].std() < 2.0 * 0.01 * 0.03
+    full = turns()
+    assert np.diff(full.measured["phi"]).std() > 10.0 * more[100:].std()
+
+
+def test_times_of_rows_may_be_wrong(turns) -> None:
+    steps = np.diff(turns("stamped").t)
+    assert steps.min() > 0.0
+    assert steps.std() == pytest.approx(0.002 * math.sqrt(2.0), rel=0.1)
+
+
+def test_readings_between_two_are_straight_lines_or_the_last_one(tmp_path: Path) -> None:
+    """Of ten rows; as they are logged: the package sees that these are no readings."""
+    for sensors, order in (("resampled", 2), ("held", 1)):
+        injector.fly(tmp_path, {}, sensors=sensors, runs=["heading_turn"], seed=2)
+        logged = np.genfromtxt(tmp_path / "heading_turn.csv", delimiter=",", names=True)["vn"]
+        pieces = logged[:1000].reshape(100, 10)
+        np.testing.assert_allclose(np.diff(pieces, order), 0.0, atol=0.0021)
+        assert np.diff(pieces[:, 0]).std() > 0.1
+
+
+def test_a_motion_captures_software_steadies_without_delay(turns) -> None:
+    """10 Hz of second order, forwards and back: white noise is a fifth as steep and less."""
+    run = turns("pose_steadied")
+    steps = np.diff(run.measured["pn"], 2).std()
+    assert steps < 0.2 * math.sqrt(6.0) * 5e-4
+
+
+def test_a_radio_loses_commands_in_bursts(turns) -> None:
+    arrives = injector._arrives(20_000, 0.03, np.random.default_rng(1))
+    assert 1.0 - arrives.mean() == pytest.approx(0.03, rel=0.15)
+    lost = np.split(arrives, np.flatnonzero(np.diff(arrives.astype(int))) + 1)
+    assert np.mean([len(burst) <= 4 for burst in lost if not burst[0]]) > 0.9
+    usual, radio = turns(), turns(pilot="by_radio")
+    assert abs(usual.measured["theta"][-100:] - radio.measured["theta"][-100:]).max() > 1e-3
+
+
+def test_commands_may_arrive_in_steps(turns) -> None:
+    """Of 0.4 % of the hover speed, 0.8 rad/s: off by up to half of that, evenly."""
+    run = turns(pilot="by_steps")
+    speed = run.measured["rpm_upper"] / injector.RPM - run.command[:, 0]
+    step = 0.004 * injector.rotors_of(LAMA).hover_upper
+    expected = math.hypot(step / math.sqrt(12.0), NOISE["rpm_upper"] / injector.RPM)
+    assert np.nanstd(speed) == pytest.approx(expected, rel=0.1)
 
 
 def test_unrest_of_rotors_and_trim(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from coax_env.estimation import run_passes
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.estimation.lasting_errors import ErringModel, with_errors
 from coax_env.estimation.rotor_jitter import REACTION, JitteryModel, with_jitter
 from coax_env.estimation.sparse import add_gram, find_non_zeros, padded, with_places
 from coax_env.estimation.state_space import part
@@ -60,6 +61,7 @@ def flown():
         (JitteryModel, ACTIVE),
         (JitteryModel, LATE),
         (SwingingModel, ACTIVE),
+        (ErringModel, ACTIVE),
     ],
     ids=[
         "bare",
@@ -68,6 +70,7 @@ def flown():
         "jitter, six effects",
         "jitter, late commands",
         "swings, six effects",
+        "errors that last, six effects",
     ],
 )
 def test_derivatives_in_lanes_are_those_one_by_one(flown, kind, active):
@@ -79,6 +82,8 @@ def test_derivatives_in_lanes_are_those_one_by_one(flown, kind, active):
     both = []
     for lanes in (same, one_by_one):
         model = lanes(kind(vehicle))
+        if kind is ErringModel:
+            noise = with_errors(noise)
         if kind is SwingingModel:
             model = model.swinging_at((0.6, 0.8, 1.1, 0.5, 0.0, 0.7))
         engine = Engine(model, [record])

@@ -22,7 +22,14 @@ import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.design import next_maneuver
-from coax_env.diagnosis import confounding, findings, sensor_low_pass, unlisted, vibration
+from coax_env.diagnosis import (
+    confounding,
+    findings,
+    onboard_filter,
+    sensor_low_pass,
+    unlisted,
+    vibration,
+)
 from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
@@ -165,7 +172,8 @@ def diagnose(
     clock = clock_of(flight.runs)
     first = searched(problem, noise, clock)
     unasked = set(candidates) - set(first.problem.candidates)
-    low_passed = [sensor_low_pass.remark(first.low_passes, unasked)] if first.low_passes else []
+    of_sensors = [sensor_low_pass.remark(first.low_passes, unasked)] if first.low_passes else []
+    of_sensors += [onboard_filter.remark(unasked)] if first.circular else []
     problem, bare, refitted = first.problem, first.bare, first.refitted
     held = records_before(held, CHANNELS, first.low_passes)
     passes_before = problem.engine.filter(bare.values, bare.noise)
@@ -228,7 +236,7 @@ def diagnose(
             *passed_over,
             *double_counting(flight, vehicle),
             *([vibration_removed(lines)] if lines else []),
-            *low_passed,
+            *of_sensors,
             *remarks(problem, fit, quadratic, found),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
             *held_out_before(gain, causes, flight.run_names),

@@ -9,13 +9,19 @@ from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.vibration import Line
-from coax_env.estimation.helicopter_noise import WHITE_LEVELS
+from coax_env.estimation.helicopter_noise import (
+    WHITE_LEVELS,
+    error_level,
+    error_memory,
+    level_unit,
+)
 from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.swinging_gusts import AXES_OF_GUSTS
 from coax_env.model.effects import CATALOGUE
-from coax_env.plain_words import and_list, channel_name, plain
+from coax_env.model.layout import SENSOR_GROUPS
+from coax_env.plain_words import and_list, channel_name, plain, with_unit
 
 
 def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternatives) -> list[str]:
@@ -30,6 +36,7 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
         *_slow_rows(problem),
         *_unlike_gusts(problem),
         *_swings(problem),
+        *_lasting_errors(fit),
         *_white_noise(problem, fit),
         *_moved_base(problem, fit),
         *_resting_on_unseen(problem, fit, quadratic, found),
@@ -116,6 +123,17 @@ def _swings(problem: Problem) -> list[str]:
     of = zip(AXES_OF_GUSTS, problem.model.base.frequencies, strict=False)
     said = [f"{axis} {frequency:.2g}" for axis, frequency in of if frequency > 0.0]
     return [f"gusts have a frequency [Hz]: {', '.join(said)}"] if said else []
+
+
+def _lasting_errors(fit: Fit) -> list[str]:
+    """Which readings have errors that last, where they have some."""
+    levels, said = fit.noise.process, []
+    for group in SENSOR_GROUPS:
+        name = error_level(group)
+        if name in levels and levels[name] > fit.noise.floor[name]:
+            unit, memory = level_unit(name), levels[error_memory(group)]
+            said.append(f"{group} {with_unit(levels[name], unit, 2)} for {memory:.2g} s")
+    return [f"readings have errors that last: {', '.join(said)}"] if said else []
 
 
 def _unlike_gusts(problem: Problem) -> list[str]:

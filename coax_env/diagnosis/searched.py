@@ -8,6 +8,9 @@ three times that, as long as the model's open-loop flight over the horizon comes
 runs (the likelihood raised to a power less than 1, for a model that is wrong: Miller and Dunson 2019,
 J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Identification, ch. 8).
 
+Where attitudes are an onboard filter's (onboard_filter.py) it is done again without what they and its
+sensors say of each other, and where errors of readings last (sensor_errors.py) with these in it.
+
 Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) it is done again, with
 what was before it. Where gusts have a frequency, with that in the filter
 (estimation/swinging_gusts.py), if nothing is coloured then: what a model lacks may swing, too.
@@ -27,10 +30,12 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
+from coax_env.diagnosis.onboard_filter import CIRCULAR, of_onboard_filter
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
+from coax_env.diagnosis.sensor_errors import with_lasting_errors
 from coax_env.diagnosis.sensor_low_pass import hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_swings
@@ -62,6 +67,7 @@ class Searched:
     coarse: whether readings were taken to be no finer than LEAST_READING_STD.
     changing: with what began or changed in flight, where that has been asked already.
     low_passes: what some channels' readings were taken back through.
+    circular: whether attitudes are an onboard filter's.
     """
 
     problem: Problem
@@ -72,6 +78,7 @@ class Searched:
     coarse: bool = False
     changing: Changing | None = None
     low_passes: Mapping[str, LowPass] = field(default_factory=dict)
+    circular: bool = False
 
 
 def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Searched:
@@ -82,30 +89,42 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         clock: of all runs in the order in which they were flown.
     """
     best = _searched(problem, noise)
+    if of_onboard_filter(best.problem, best.fit):
+        problem.report("attitudes of an onboard filter: searching again without what rests on them")
+        best = _searched(problem.of_candidates(set(problem.candidates) - CIRCULAR), noise)
+        return replace(_in_unrest(best, noise, clock, False), circular=True)
+    erring = with_lasting_errors(best.problem, best.fit, noise)
+    if erring is not None:
+        problem, noise = erring
+        problem.report("searching again with errors of readings that last")
+        best = _searched(problem, noise)
     smoothed = low_passes(problem, best.fit, noise)
     if smoothed:
         problem.report("searching again with readings as they were before a low-pass")
         before = records_before(problem.engine.records, problem.model.channels, smoothed)
         asked = set(problem.candidates) - hidden_behind(smoothed, best.fit, problem)
         best = _searched(problem.with_records(before).of_candidates(asked), noise)
-    return replace(_in_unrest(best, noise, clock), low_passes=smoothed)
+    return replace(_in_unrest(best, noise, clock, erring is not None), low_passes=smoothed)
 
 
-def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap]) -> Searched:
+def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bool) -> Searched:
     """Again with shocks, jitter, readings believed less, where the first search asks for it.
 
     Args:
         best: of the first search. noise: levels to start from.
         clock: of all runs in the order in which they were flown.
+        erring: whether readings have errors that last; nothing but shocks is asked for then.
     """
-    if in_shocks(best.problem, best.fit):
+    shaken = in_shocks(best.problem, best.fit)
+    if shaken:
         best = _changed(best, clock) or _searched_in_shocks(best, noise)
-    else:
-        swinging = with_swings(best.problem, best.fit)
-        if swinging is not None:
-            problem, levels = swinging
-            problem.report("gusts have a frequency: searching again with that")
-            return _searched(problem, noise.with_levels(levels))
+    if erring:
+        return best
+    swinging = None if shaken else with_swings(best.problem, best.fit)
+    if swinging is not None:
+        problem, levels = swinging
+        problem.report("gusts have a frequency: searching again with that")
+        return _searched(problem, noise.with_levels(levels))
     problem = best.problem
     found = _with_jitter(problem, best.fit)
     if found is not None:

@@ -9,6 +9,8 @@ No level is a constant that evidence could depend on: all are fitted by maximum 
 - ``rotor_jitter``: std of speeds with a memory of their own, ``memory_rotor_jitter``, where flights
   show them (rotor_jitter.py)
 - ``trim_force_z``, ``trim_moment_z``: random walks of thrust and torque
+- ``error_attitude`` ..: std of errors of the readings that last, ``memory_error_attitude`` .., where
+  flights show them (lasting_errors.py)
 
 and each channel's name for the std of its readings.
 """
@@ -33,6 +35,7 @@ from coax_env.model.layout import (
     POSITION,
     RATE,
     ROTOR_SPEED,
+    SENSOR_GROUPS,
     SWASH,
     TRIMS,
     VELOCITY,
@@ -60,6 +63,20 @@ TRIM_LEVELS = ("trim_force_z", "trim_moment_z")
 """Intensity of the random walks of thrust and torque [N/s^1/2, N m/s^1/2] (effect `trim_drift`)."""
 TRIM_AXES = ("force_z", "moment_z")
 
+
+def error_level(group: str) -> str:
+    """Name of the std of a group's lasting errors."""
+    return f"error_{group}"
+
+
+def error_memory(group: str) -> str:
+    """Name of the correlation time of a group's lasting errors."""
+    return f"memory_error_{group}"
+
+
+ERROR_LEVELS = tuple(error_level(group) for group in SENSOR_GROUPS)
+ERROR_MEMORIES = tuple(error_memory(group) for group in SENSOR_GROUPS)
+
 _FORCE, _MOMENT = ("force_xy", "force_z"), ("moment_xy", "moment_z")
 LEVEL_UNITS = {
     **dict.fromkeys(_FORCE, "N"),
@@ -72,6 +89,8 @@ LEVEL_UNITS = {
     JITTER_MEMORY: "s",
     "trim_force_z": "N/s^1/2",
     "trim_moment_z": "N m/s^1/2",
+    **{error_level(group): CHANNEL_UNITS[own[0]] for group, own in SENSOR_GROUPS.items()},
+    **dict.fromkeys(ERROR_MEMORIES, "s"),
 }
 """Unit of each level of the process noise."""
 
@@ -186,8 +205,9 @@ SHAKEN = {
 
 def fitted_levels(noise: Noise) -> tuple[str, ...]:
     """Levels that are always fitted; white noise and trims are asked for first (noise_levels.py)."""
-    jitter = [name for name in (JITTER_LEVEL, JITTER_MEMORY) if name in noise.process]
-    return (*GUST_LEVELS, *MEMORIES, ROTOR_LEVEL, *jitter, *noise.reading)
+    some = (JITTER_LEVEL, JITTER_MEMORY, *ERROR_LEVELS, *ERROR_MEMORIES)
+    asked = [name for name in some if name in noise.process]
+    return (*GUST_LEVELS, *MEMORIES, ROTOR_LEVEL, *asked, *noise.reading)
 
 
 def starting_noise(flight: Flight, vehicle: Vehicle) -> Noise:

@@ -75,5 +75,11 @@ CHANNELS = tuple(CHANNEL_UNITS)
 N_CHANNELS = len(CHANNELS)
 ANGLES = ("phi", "theta", "psi")
 """Channels whose innovations wrap."""
+SENSOR_GROUPS = {
+    "attitude": ("phi", "theta"), "heading": ("psi",), "height": ("h",),
+    "velocity": ("vn", "ve", "vd"), "position": ("pn", "pe"), "gyros": ("p", "q", "r"),
+    "accelerometers": ("ax", "ay", "az"),
+}  # fmt: skip
+"""Channels of one kind of sensor, whose readings may have errors that last (lasting_errors.py)."""
 
 RPM_PER_RAD_S = 60.0 / (2.0 * 3.141592653589793)

@@ -78,6 +78,27 @@ ARMS = {
         "gyros and accelerometers behind low-passes: 20 Hz, first order; 35 and 25 Hz, second",
         sensors=("smooth", "autopilot"),
     ),
+    "one_sided": Arm("gusts that come from one side, log-normal", Air("one_sided")),
+    "together": Arm("gusts that push, turn and lift at once", Air("together")),
+    "days": Arm("runs of a quarter to twice the gusts, and other memories", Air("days")),
+    "flicker": Arm("errors of the readings equal in each decade of 0.03-30 s", sensors=("flicker",)),
+    "common": Arm("gyros, accelerometers and attitudes with noise in common", sensors=("common",)),
+    "fused": Arm("attitudes, velocities and height of an onboard filter", sensors=("fused",)),
+    "stamped": Arm("logged times wrong by 2 ms", sensors=("stamped",)),
+    "fast": Arm("gyros and accelerometers at 500 Hz", sensors=("fast",)),
+    "resampled": Arm("readings of 10-50 Hz on one clock by straight lines", sensors=("resampled",)),
+    "held": Arm("readings of 10-50 Hz, each written again until the next", sensors=("held",)),
+    "fifty": Arm("every second row of 100 Hz", sensors=("fifty",)),
+    "pose_steadied": Arm(
+        "CoaX class, a motion capture whose software smooths at 10 Hz, forwards and back",
+        sensors=("pose_steadied",), card=(None, 1.0), craft="coax",
+    ),
+    "camera": Arm(
+        "CoaX class, a camera: poses at 33 Hz, 3 mm and 0.6 degrees",
+        sensors=("camera",), card=(None, 1.0), craft="coax",
+    ),
+    "by_radio": Arm("a radio that loses 3 % of the commands", pilots=("by_radio",)),
+    "by_steps": Arm("commands that arrive in steps of 4 mrad and 0.4 %", pilots=("by_steps",)),
     "foreign_forms": Arm("effects in no list and of no generic term's form", listed=False),
 }  # fmt: skip
 

@@ -1,0 +1,69 @@
+"""Whether errors of readings last, as those of an onboard filter, a compass or GNSS do.
+
+Asked after a search, where innovations of attitudes, height, velocities or position stay coloured and
+gyros and accelerometers are aboard that feel the motion itself: by poses alone an error that lasts and
+what moves the body are one. Levels and memories of all readings' errors are fitted then, those of gyros
+and accelerometers too (estimation/lasting_errors.py). What a model lacks lasts as well: nothing may be
+coloured then, or none is used.
+"""
+
+from dataclasses import replace
+
+from coax_env.diagnosis.fits import fitted, noise_fitted
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation.helicopter_noise import ERROR_LEVELS, ERROR_MEMORIES
+from coax_env.estimation.lasting_errors import ErringModel, with_errors
+from coax_env.estimation.low_pass import ACCELEROMETERS, GYROS
+from coax_env.estimation.noise_levels import fit_noise
+from coax_env.estimation.state_space import Noise
+from coax_env.estimation.whiteness import is_white, whiteness
+from coax_env.model.layout import SENSOR_GROUPS
+from coax_env.plain_words import and_list
+
+FELT_BY = {"attitude": GYROS, "heading": GYROS} | dict.fromkeys(
+    ("height", "velocity", "position"), ACCELEROMETERS
+)
+"""Sensors that tell a group's motion from errors of its readings."""
+LEVELS_OF_ERRORS = (*ERROR_LEVELS, *ERROR_MEMORIES)
+
+
+def with_lasting_errors(problem: Problem, fit: Fit, noise: Noise) -> tuple[Problem, Noise] | None:
+    """The problem whose readings have errors that last, and levels to start from, where these are.
+
+    Args:
+        problem, fit: after a search. noise: levels that it started from.
+    """
+    channels = problem.model.channels
+    seen = whiteness(problem.engine.filter(fit.values, fit.noise), channels)
+    coloured = [
+        group
+        for group, felt_by in FELT_BY.items()
+        if any(c in seen and not seen[c].white for c in SENSOR_GROUPS[group])
+        and problem.aboard.issuperset(felt_by)
+    ]
+    if not coloured:
+        return None
+    wider, trial = _erring(problem, fit)
+    gained = fit.objective - trial.objective
+    problem.report(f"errors of {and_list(coloured)} that last: {gained:.1f} nats")
+    if gained < problem.settings.evidence:
+        return None
+    if not is_white(wider.engine.filter(trial.values, trial.noise), channels):
+        return None
+    levels = {name: trial.noise.level(name) for name in trial.levels if name in LEVELS_OF_ERRORS}
+    return wider, with_errors(noise).with_levels(levels)
+
+
+def _erring(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """With errors that last, all levels and numbers fitted."""
+    wider = problem.with_model(ErringModel.like(problem.model))
+    begun = with_errors(fit.noise)
+    own = [name for name in LEVELS_OF_ERRORS if name in begun.process]
+    trial = replace(fit, noise=begun, levels=(*own, *fit.levels))
+    first = fit_noise(
+        wider.engine, trial.values, trial.noise, trial.levels,
+        problem.settings.first_noise_evaluations, problem.settings.step_gain,
+        problem.noise_fit_seconds,
+    )  # fmt: skip
+    trial = replace(trial, noise=first)
+    return wider, fitted(wider, noise_fitted(wider, fitted(wider, trial)))

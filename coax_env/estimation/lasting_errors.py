@@ -1,0 +1,157 @@
+"""Errors of readings that last: what an onboard filter says, a compass near iron, GNSS.
+
+An attitude that drifts with its gyros is wrong now as it was a moment ago, and so is a velocity of
+GNSS. Fifteen states more than the helicopter's own, in the filter alone: one error of each reading but
+the rotors' speeds, with an exponential memory, which its reading has on top (Gelb, Applied Optimal
+Estimation, 1974, section 4.5; Maybeck, Stochastic Models, 1979, section 6.5). Channels of one group
+share a level and a memory. Taken for errors of a row alone, readings are believed as often as they are
+read, and numbers with them: on **synthetic** flights a tilt of the inertial sensor was 3 and 4.5 std
+off so, where it is 1.0 to 1.6 with these.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from coax_env.estimation import helicopter_noise
+from coax_env.estimation.helicopter import (
+    READ,
+    HeliModel,
+    Motion,
+    _reads_another,
+    _take_in_innovations,
+    kernel_drift,
+    kernel_measure,
+    kernel_step,
+)
+from coax_env.estimation.helicopter_noise import error_level, error_memory
+from coax_env.estimation.state_space import Noise, ProcessNoise, Record
+from coax_env.kernel.compilation import compiled
+from coax_env.model import dynamics
+from coax_env.model.layout import ANGLES, CHANNELS, N_CHANNELS, N_FULL, SENSOR_GROUPS
+
+ERRING = tuple(channel for channels in SENSOR_GROUPS.values() for channel in channels)
+"""Channels whose errors may last, in the order of their states."""
+GROUP_OF = {channel: group for group, channels in SENSOR_GROUPS.items() for channel in channels}
+ERRORS = slice(N_FULL, N_FULL + len(ERRING))
+"""Errors of the channels ERRING, in their units."""
+N_ERRING = ERRORS.stop
+MEMORY_START, MEMORY_SPREAD = 1.0, 1.5
+"""Median [s] of an error's memory and std of its logarithm; ours."""
+MEMORY_BOUNDS = (0.03, 60.0)
+"""[s]: below, it is white at 100 Hz; above, a bias."""
+START = 0.3
+SMALLEST, LARGEST = 0.01, 100.0
+"""Times the std of a reading that its lasting error's is at first, at least and at most; ours."""
+FINER = 0.1
+"""Times the least std of a reading that its white part may have beside a lasting one: an onboard filter
+has next to none; ours."""
+
+_PLACES = np.array([CHANNELS.index(channel) for channel in ERRING])
+_COUNT = len(ERRING)
+
+# of the scratch, behind the kernel's: drift and readings
+_OUT = dynamics.WORK_SIZE
+_WORK_SIZE = _OUT + N_FULL + N_CHANNELS
+
+
+@compiled()
+def _left(i, dt, p):
+    """Share that is left of the i-th error after `dt` seconds; `p` ends with their memories."""
+    return math.exp(-dt / p[p.size - _COUNT + i])
+
+
+def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """The helicopter's step; errors fade."""
+    for i in range(N_FULL):
+        out[i] = x[i]
+    _take_in_innovations(u, p, out)
+    kernel_step(out[:N_FULL], u, dt, p, work, out[:N_FULL])
+    for i in range(_COUNT):
+        out[N_FULL + i] = x[N_FULL + i] * _left(i, dt, p)
+
+
+def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
+    """The helicopter's readings with their errors."""
+    kernel_measure(x[:N_FULL], u[READ], p, work, out)
+    for i in range(_COUNT):
+        out[_PLACES[i]] += x[N_FULL + i]
+
+
+def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
+    """The helicopter's with errors; these fade exactly."""
+    own = work[_OUT:_WORK_SIZE]
+    kernel_drift(x[:N_FULL], u, dt, p, work, own)
+    if _reads_another(u):
+        kernel_measure(x[:N_FULL], u[READ], p, work, own[N_FULL:])
+    _take_in_innovations(u, p, own)
+    for i in range(N_FULL):
+        out[i] = own[i]
+    for i in range(_COUNT):
+        own[N_FULL + _PLACES[i]] += x[N_FULL + i]
+        out[N_FULL + i] = x[N_FULL + i] * (_left(i, dt, p) - 1.0)
+    for i in range(N_CHANNELS):
+        out[N_ERRING + i] = own[N_FULL + i]
+
+
+class ErringModel(HeliModel):
+    """A vehicle whose readings have errors that last, through the engine's protocol."""
+
+    motion = Motion(_step, _measure, _drift_and_readings)
+    exact = np.append(HeliModel.exact, np.ones(_COUNT, bool))
+    work_size = _WORK_SIZE
+    state_scale = np.append(HeliModel.state_scale, [1e-5 if c in ANGLES else 1e-4 for c in ERRING])
+    noise_places = np.insert(
+        HeliModel.noise_places, N_FULL, [[i, i] for i in range(ERRORS.start, ERRORS.stop)], 0
+    )
+
+    def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
+        """The helicopter's parameter vector, and behind it the errors' memories [s]."""
+        return np.append(
+            super().vector(values, noise), _by_channel(noise, error_memory, MEMORY_START)
+        )
+
+    def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
+        """First state (44,) and its covariance, without what the noise levels add."""
+        x, covariance = super().start(record)
+        return np.append(x, np.zeros(_COUNT)), np.pad(covariance, (0, _COUNT))
+
+    def start_noise(self, noise: Noise) -> np.ndarray:
+        """Variances that the noise levels add to the first state (44,)."""
+        return np.append(super().start_noise(noise), _by_channel(noise, error_level, 0.0) ** 2)
+
+    def process_noise(self, noise: Noise, vector: np.ndarray) -> ProcessNoise:
+        """What the noise adds to the covariance, by entry of `noise_places`."""
+        own = helicopter_noise.process_noise(noise, vector)
+        fades = 1.0 / vector[-_COUNT:]
+        driven = 2.0 * _by_channel(noise, error_level, 0.0) ** 2 * fades
+        return ProcessNoise(
+            np.insert(own.intensity, N_FULL, driven), np.insert(own.decay, N_FULL, fades)
+        )
+
+
+def _by_channel(noise: Noise | None, name_of: Any, otherwise: float) -> np.ndarray:
+    """A level of each of the channels ERRING, by its group's name."""
+    levels = {} if noise is None else noise.process
+    return np.array([levels.get(name_of(GROUP_OF[channel]), otherwise) for channel in ERRING])
+
+
+def with_errors(noise: Noise) -> Noise:
+    """Noise levels with those of lasting errors of the channels that it has, where their fit begins."""
+    process, prior = dict(noise.process), dict(noise.prior)
+    floor, ceiling = dict(noise.floor), dict(noise.ceiling)
+    for group, channels in SENSOR_GROUPS.items():
+        read = [channel for channel in channels if channel in noise.reading]
+        if not read:
+            continue
+        std = float(np.mean([noise.reading[channel] for channel in read]))
+        level, memory = error_level(group), error_memory(group)
+        process |= {level: START * std, memory: MEMORY_START}
+        floor |= {level: SMALLEST * std, memory: MEMORY_BOUNDS[0]}
+        floor |= {channel: FINER * noise.floor.get(channel, 0.0) for channel in read}
+        ceiling |= {level: LARGEST * std, memory: MEMORY_BOUNDS[1]}
+        prior[memory] = (MEMORY_START, MEMORY_SPREAD)
+    return replace(noise, process=process, floor=floor, ceiling=ceiling, prior=prior)

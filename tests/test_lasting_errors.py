@@ -1,0 +1,230 @@
+"""Readings whose errors last, and attitudes of an onboard filter: in the filter, and what is named.
+
+Without errors the model is the helicopter's own; with them, readings are the helicopter's plus what
+fades by its memory.
+"""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import injector
+import numpy as np
+import pytest
+from injector_air import GUSTY
+from numpy.testing import assert_allclose
+
+from coax_env import diagnose, load_vehicle
+from coax_env.diagnosis import onboard_filter, sensor_errors
+from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.engine import Engine
+from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.helicopter_noise import error_level, error_memory, starting_noise
+from coax_env.estimation.lasting_errors import ERRING, ERRORS, N_ERRING, ErringModel, with_errors
+from coax_env.estimation.noise_levels import fit_noise
+from coax_env.estimation.state_space import Noise
+from coax_env.logs.flight import read_flight
+from coax_env.model import dynamics
+from coax_env.model import state as S
+from coax_env.model.layout import CHANNELS, N_CHANNELS, N_FULL, SENSOR_GROUPS
+
+LAMA = load_vehicle("lama400d")
+PLAIN = HeliModel(LAMA)
+MODEL = ErringModel.like(PLAIN)
+STD = {group: 0.1 * (k + 1) for k, group in enumerate(SENSOR_GROUPS)}
+MEMORY = {group: 0.5 * (k + 1) for k, group in enumerate(SENSOR_GROUPS)}
+NOISE = Noise(
+    {error_level(g): s for g, s in STD.items()} | {error_memory(g): m for g, m in MEMORY.items()}
+)
+GROUP = {channel: group for group, channels in SENSOR_GROUPS.items() for channel in channels}
+HOVER, COMMAND = dynamics.hover_trim(LAMA)
+INPUT = np.tile(dynamics.kernel_input(COMMAND), 2)
+ANGLE_PAIRS = list(onboard_filter.ANGLE_OF.items())
+
+
+def state() -> np.ndarray:
+    x = np.zeros(N_ERRING)
+    x[:N_FULL] = dynamics.full_state(HOVER, COMMAND, LAMA)
+    x[S.R], x[S.U] = 0.2, 0.5
+    x[ERRORS] = 0.01 * np.arange(1, len(ERRING) + 1)
+    return x
+
+
+def read(model: HeliModel, x: np.ndarray, p: np.ndarray) -> np.ndarray:
+    out = np.zeros(N_CHANNELS)
+    model.measure.__wrapped__(x, INPUT, p, np.zeros(model.work_size), out)
+    return out
+
+
+def stepped(model: HeliModel, x: np.ndarray, p: np.ndarray, dt: float = 0.01) -> np.ndarray:
+    out = np.zeros(x.size)
+    model.step.__wrapped__(x, INPUT, dt, p, np.zeros(model.work_size), out)
+    return out
+
+
+def test_every_reading_but_the_rotors_has_its_error():
+    x, p = state(), MODEL.vector({}, NOISE)
+    more = read(MODEL, x, p) - read(PLAIN, x[:N_FULL], LAMA.vector)
+    expected = dict.fromkeys(CHANNELS, 0.0) | dict(zip(ERRING, x[ERRORS].tolist(), strict=True))
+    assert_allclose(more, list(expected.values()), atol=1e-12)
+    assert set(CHANNELS) - set(ERRING) == {"rpm_upper", "rpm_lower", "v"}
+
+
+def test_errors_fade_and_move_nothing():
+    x, p = state(), MODEL.vector({}, NOISE)
+    later = stepped(MODEL, x, p)
+    left = [math.exp(-0.01 / MEMORY[GROUP[channel]]) for channel in ERRING]
+    assert_allclose(later[ERRORS], left * x[ERRORS], rtol=1e-12)
+    assert np.array_equal(later[:N_FULL], stepped(PLAIN, x[:N_FULL], LAMA.vector))
+
+
+def test_the_drift_is_what_the_step_adds_to_first_order():
+    x, p = state(), MODEL.vector({}, NOISE)
+    out, dt = np.zeros(N_ERRING + N_CHANNELS), 1e-4
+    MODEL.drift_and_readings.__wrapped__(x, INPUT, dt, p, np.zeros(MODEL.work_size), out)
+    assert_allclose(out[:N_ERRING], stepped(MODEL, x, p, dt) - x, rtol=2e-2, atol=1e-7)
+    assert_allclose(out[N_ERRING:], read(MODEL, x, p), rtol=1e-9)
+
+
+def test_every_error_has_its_levels_variance():
+    """x' = -x / tau + w has variance q tau / 2; all else is the helicopter's noise."""
+    q, decay = MODEL.process_noise(NOISE, MODEL.vector({}, NOISE))
+    std = [STD[GROUP[channel]] for channel in ERRING]
+    assert_allclose(np.sqrt(q[ERRORS] / (2.0 * decay[ERRORS])), std)
+    assert_allclose(MODEL.start_noise(NOISE)[ERRORS], np.square(std))
+    plain = PLAIN.process_noise(Noise({}), LAMA.vector)
+    assert np.array_equal(np.delete(q, np.r_[ERRORS]), plain.intensity)
+    assert MODEL.noise_places.shape == (q.size, 2)
+    assert_allclose(MODEL.noise_places[ERRORS], np.repeat(np.r_[ERRORS], 2).reshape(-1, 2))
+
+
+@pytest.fixture(scope="module")
+def wandering(tmp_path_factory):
+    """**Synthetic**: attitudes wrong by 0.01 rad for 2 s, velocities by 0.2 m/s for 1 s, and others."""
+    folder = tmp_path_factory.mktemp("wandering") / "flight"
+    runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "hover")
+    hidden = {"imu_tilt": {"x": -0.015, "y": 0.02}}
+    return injector.fly(
+        folder, hidden, gusts=GUSTY, sensors="wandering", seed=4, runs=runs, longest=12.0
+    )
+
+
+def test_without_errors_its_likelihood_is_the_helicopters_and_planted_ones_return(wandering):
+    flight = read_flight(wandering)
+    vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
+    model, noise = HeliModel(vehicle), starting_noise(flight, vehicle)
+    values = dict(model.bare_values)
+    records = [record_of(run) for run in flight.runs]
+    own = Engine(model, records)
+    wider = Engine(ErringModel.like(model), records)
+    assert wider.log_likelihood(values, noise) == pytest.approx(
+        own.log_likelihood(values, noise), abs=1e-6
+    )
+    tilted = values | {"imu_tilt.x": -0.015, "imu_tilt.y": 0.02}
+    begun = with_errors(noise)
+    found = fit_noise(wider, tilted, begun, list(begun.process | begun.reading), 40)
+    for group, std, memory in (("attitude", 0.01, 2.0), ("velocity", 0.2, 1.0)):
+        assert found.level(error_level(group)) == pytest.approx(std, rel=0.3)
+        assert found.level(error_memory(group)) == pytest.approx(memory, rel=0.6)
+    assert found.reading["vn"] == pytest.approx(0.5, rel=0.1)
+
+
+@pytest.mark.slow
+def test_numbers_hold_the_truth_where_errors_last(wandering):
+    """Taken for errors of a row, readings moved the tilt by 3 to 4.5 std. **Synthetic**."""
+    found = diagnose(wandering)
+    (cause,) = found.findings["causes"]
+    assert cause["effect"] == "imu_tilt"
+    for name, truth in (("imu_tilt.x", -0.015), ("imu_tilt.y", 0.02)):
+        number = cause["parameters"][name]
+        assert abs(number["value"] - truth) < 2.5 * number["std"]
+    assert found.findings["unexplained"] == []
+    (said,) = [line for line in found.remarks if line.startswith("readings have errors that last")]
+    assert "attitude" in said and "velocity" in said
+    assert found.findings["noise"]["memory_error_attitude"]["unit"] == "s"
+
+
+WHITE = SimpleNamespace(white=True)
+COLOURED = SimpleNamespace(white=False)
+ABOARD = frozenset({"p", "q", "r", "ax", "ay", "az"})
+
+
+@pytest.mark.parametrize(
+    ("coloured", "aboard", "gain", "white_with", "used"),
+    [
+        ("phi", ABOARD, 100.0, True, True),
+        ("vn", ABOARD, 100.0, True, True),
+        ("q", ABOARD, 100.0, True, False),  # nothing asks for it
+        ("phi", ABOARD - {"p"}, 100.0, True, False),  # no gyro tells it from motion
+        ("h", ABOARD - {"az"}, 100.0, True, False),  # no accelerometer does
+        ("phi", ABOARD, 10.0, True, False),  # not worth the threshold
+        ("phi", ABOARD, 100.0, False, False),  # what a model lacks may last, too
+    ],
+)
+def test_errors_last_where_that_is_worth_it_and_nothing_stays_coloured(
+    monkeypatch, coloured, aboard, gain, white_with, used
+):
+    """The fits are stand-ins, which gain at once what they may."""
+    first = Noise({"force_xy": 1.0}, {"phi": 0.01, "vn": 0.5})
+    fit = Fit((), {}, first, objective=500.0)
+    gained = lambda problem, fit: replace(fit, objective=500.0 - gain)  # noqa: E731
+    seen = {channel: COLOURED if channel == coloured else WHITE for channel in CHANNELS}
+    monkeypatch.setattr(sensor_errors, "whiteness", lambda passes, channels: seen)
+    monkeypatch.setattr(sensor_errors, "is_white", lambda passes, channels: white_with)
+    monkeypatch.setattr(sensor_errors, "fit_noise", lambda engine, values, noise, *rest: noise)
+    monkeypatch.setattr(sensor_errors, "fitted", gained)
+    monkeypatch.setattr(sensor_errors, "noise_fitted", gained)
+    problem = SimpleNamespace(
+        engine=SimpleNamespace(filter=lambda values, noise: []), aboard=aboard, model=PLAIN,
+        settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
+    )  # fmt: skip
+    problem.with_model = lambda model: SimpleNamespace(**{**vars(problem), "model": model})
+    found = sensor_errors.with_lasting_errors(problem, fit, first)  # type: ignore[arg-type]
+    assert (found is not None) == used
+    if found is not None:
+        assert isinstance(found[0].model, ErringModel)
+        names = {name(g) for g in ("attitude", "velocity") for name in (error_level, error_memory)}
+        assert set(found[1].process) == {"force_xy"} | names
+        assert found[1].process[error_level("velocity")] == pytest.approx(0.15)
+
+
+def flown_with(correlation: float, missing: float = 0.3) -> SimpleNamespace:
+    """Innovations of two runs of which each rate's and its angle's are correlated in a row."""
+    rng = np.random.default_rng(1)
+    passes = []
+    for _ in range(2):
+        e = rng.standard_normal((1000, N_CHANNELS))
+        for rate, angle in ANGLE_PAIRS:
+            own = e[:, CHANNELS.index(angle)]
+            own *= math.sqrt(1.0 - correlation**2)
+            own += correlation * e[:, CHANNELS.index(rate)]
+            own[rng.random(1000) < missing] = np.nan
+        passes.append(SimpleNamespace(innovations=e))
+    engine = SimpleNamespace(filter=lambda values, noise: passes)
+    aboard = frozenset({*onboard_filter.ANGLE_OF, *onboard_filter.ANGLE_OF.values()})
+    return SimpleNamespace(engine=engine, aboard=aboard, model=SimpleNamespace(channels=CHANNELS))
+
+
+@pytest.mark.parametrize(
+    ("correlation", "carried"), [(-0.35, True), (-0.12, False), (0.0, False), (0.4, False)]
+)
+def test_attitudes_with_the_gyros_noise_are_an_onboard_filters(correlation, carried):
+    fit = Fit((), {}, Noise({}))
+    problem = flown_with(correlation)
+    assert onboard_filter.of_onboard_filter(problem, fit) == carried  # type: ignore[arg-type]
+    problem.aboard -= {"r"}
+    assert not onboard_filter.of_onboard_filter(problem, fit)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_sensors_that_speak_of_each_other_are_not_believed(tmp_path):
+    """Attitudes, velocities and height of an onboard filter: of eight such flights six had a gyro's
+    scale that is not there. What rests on motion is found. **Synthetic**."""
+    runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
+    hidden = {"motor_lag": {"upper": 0.08, "lower": 0.06}}
+    injector.fly(tmp_path, hidden, gusts=GUSTY, sensors="fused", seed=3, runs=runs, longest=10.0)
+    found = diagnose(tmp_path)
+    assert [cause["effect"] for cause in found.findings["causes"]] == ["motor_lag"]
+    (said,) = [line for line in found.remarks if "an onboard filter's" in line]
+    assert "gyro scale" in said and "not looked for" in said
