@@ -174,7 +174,7 @@ def test_errors_last_where_that_is_worth_it_and_nothing_stays_coloured(
     monkeypatch.setattr(sensor_errors, "is_white", lambda passes, channels: white_with)
     monkeypatch.setattr(sensor_errors, "fit_noise", lambda engine, values, noise, *rest: noise)
     monkeypatch.setattr(sensor_errors, "fitted", gained)
-    monkeypatch.setattr(sensor_errors, "noise_fitted", gained)
+    monkeypatch.setattr(sensor_errors, "converged", gained)
     problem = SimpleNamespace(
         engine=SimpleNamespace(filter=lambda values, noise: []), aboard=aboard, model=PLAIN,
         settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
@@ -185,8 +185,8 @@ def test_errors_last_where_that_is_worth_it_and_nothing_stays_coloured(
     if found is not None:
         assert isinstance(found[0].model, ErringModel)
         names = {name(g) for g in ("attitude", "velocity") for name in (error_level, error_memory)}
-        assert set(found[1].process) == {"force_xy"} | names
-        assert found[1].process[error_level("velocity")] == pytest.approx(0.15)
+        assert found[1].objective == 400.0 and set(found[2].process) == {"force_xy"} | names
+        assert found[2].process[error_level("velocity")] == pytest.approx(0.5)
 
 
 def flown_with(correlation: float, missing: float = 0.3) -> SimpleNamespace:

@@ -161,6 +161,16 @@ def threshold(problem: Problem, quadratic: Quadratic, active: Sequence[str]) -> 
     return max(problem.settings.evidence, problem.settings.form_error * explained)
 
 
+def cost(problem: Problem, fit: Fit, quadratic: Quadratic) -> float:
+    """Minus the log evidence of a model, to second order [nats].
+
+    Args:
+        problem, fit: with its effects. quadratic: linearised at the fit.
+    """
+    own = [n for e in fit.active for n in problem.acting_names(e)]
+    return fit.objective + (quadratic.occam(own, problem.base_names(fit.active)) if own else 0.0)
+
+
 def inflation(problem: Problem, quadratic: Quadratic, active: Sequence[str], effect: str) -> float:
     """Variance inflation by coloured innovations in an active effect's direction, at least 1.
 

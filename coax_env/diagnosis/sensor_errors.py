@@ -9,7 +9,7 @@ coloured then, or none is used.
 
 from dataclasses import replace
 
-from coax_env.diagnosis.fits import fitted, noise_fitted
+from coax_env.diagnosis.fits import converged, fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import ERROR_LEVELS, ERROR_MEMORIES
 from coax_env.estimation.lasting_errors import ErringModel, with_errors
@@ -27,11 +27,16 @@ FELT_BY = {"attitude": GYROS, "heading": GYROS} | dict.fromkeys(
 LEVELS_OF_ERRORS = (*ERROR_LEVELS, *ERROR_MEMORIES)
 
 
-def with_lasting_errors(problem: Problem, fit: Fit, noise: Noise) -> tuple[Problem, Noise] | None:
-    """The problem whose readings have errors that last, and levels to start from, where these are.
+def with_lasting_errors(
+    problem: Problem, fit: Fit, noise: Noise
+) -> tuple[Problem, Fit, Noise] | None:
+    """The problem whose readings have errors that last, where they have.
 
     Args:
         problem, fit: after a search. noise: levels that it started from.
+
+    Returns:
+        the problem, the fit in it with what had been found, and levels to start a search from.
     """
     channels = problem.model.channels
     seen = whiteness(problem.engine.filter(fit.values, fit.noise), channels)
@@ -51,7 +56,7 @@ def with_lasting_errors(problem: Problem, fit: Fit, noise: Noise) -> tuple[Probl
     if not is_white(wider.engine.filter(trial.values, trial.noise), channels):
         return None
     levels = {name: trial.noise.level(name) for name in trial.levels if name in LEVELS_OF_ERRORS}
-    return wider, with_errors(noise).with_levels(levels)
+    return wider, trial, with_errors(noise).with_levels(levels)
 
 
 def _erring(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
@@ -66,4 +71,4 @@ def _erring(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
         problem.noise_fit_seconds,
     )  # fmt: skip
     trial = replace(trial, noise=first)
-    return wider, fitted(wider, noise_fitted(wider, fitted(wider, trial)))
+    return wider, converged(wider, fitted(wider, trial))

@@ -39,11 +39,13 @@ GROUP_OF = {channel: group for group, channels in SENSOR_GROUPS.items() for chan
 ERRORS = slice(N_FULL, N_FULL + len(ERRING))
 """Errors of the channels ERRING, in their units."""
 N_ERRING = ERRORS.stop
-MEMORY_START, MEMORY_SPREAD = 1.0, 1.5
-"""Median [s] of an error's memory and std of its logarithm; ours."""
+INERTIAL = ("gyros", "accelerometers")
+"""Groups whose errors drift, small and slowly, beside those that a filter or GNSS makes."""
+MEMORY_START, MEMORY_OF_INERTIAL, MEMORY_SPREAD = 2.0, 10.0, 1.5
+"""Median [s] of an error's memory, of an inertial sensor's, and std of its logarithm; ours."""
 MEMORY_BOUNDS = (0.03, 60.0)
 """[s]: below, it is white at 100 Hz; above, a bias."""
-START = 0.3
+START, START_OF_INERTIAL = 1.0, 0.3
 SMALLEST, LARGEST = 0.01, 100.0
 """Times the std of a reading that its lasting error's is at first, at least and at most; ours."""
 FINER = 0.1
@@ -149,9 +151,11 @@ def with_errors(noise: Noise) -> Noise:
             continue
         std = float(np.mean([noise.reading[channel] for channel in read]))
         level, memory = error_level(group), error_memory(group)
-        process |= {level: START * std, memory: MEMORY_START}
+        inertial = group in INERTIAL
+        lasts = MEMORY_OF_INERTIAL if inertial else MEMORY_START
+        process |= {level: (START_OF_INERTIAL if inertial else START) * std, memory: lasts}
         floor |= {level: SMALLEST * std, memory: MEMORY_BOUNDS[0]}
         floor |= {channel: FINER * noise.floor.get(channel, 0.0) for channel in read}
         ceiling |= {level: LARGEST * std, memory: MEMORY_BOUNDS[1]}
-        prior[memory] = (MEMORY_START, MEMORY_SPREAD)
+        prior[memory] = (lasts, MEMORY_SPREAD)
     return replace(noise, process=process, floor=floor, ceiling=ceiling, prior=prior)

@@ -28,6 +28,7 @@ from coax_env.diagnosis.onsets.every_moment import Scored, scored
 from coax_env.diagnosis.onsets.growth import changing_model
 from coax_env.diagnosis.onsets.trial import fitted_change
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
+from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.shocks import ABOUT
@@ -165,19 +166,13 @@ def _searched_again(trial: Changing, bare: Fit, onsets: Mapping[str, Onset]) -> 
                         levels=trial.fit.levels)  # fmt: skip
         begun.append(fitted(problem, alone))
     ended = [search(problem, fit) for fit in begun]
-    fit, quadratic = min(ended, key=lambda e: _cost(problem, *e))
+    fit, quadratic = min(ended, key=lambda e: cost(problem, *e))
     kept = {e: onset for e, onset in onsets.items() if e in fit.active}
     return Changing(problem, fit, quadratic, kept)
 
 
 def _cost_of(state: Changing) -> float:
-    return _cost(state.problem, state.fit, state.quadratic)
-
-
-def _cost(problem: Problem, fit: Fit, quadratic: Quadratic) -> float:
-    """Minus the log evidence of a model, to second order [nats]."""
-    own = [n for e in fit.active for n in problem.acting_names(e)]
-    return fit.objective + (quadratic.occam(own, problem.base_names(fit.active)) if own else 0.0)
+    return cost(state.problem, state.fit, state.quadratic)
 
 
 def beside_onsets(
