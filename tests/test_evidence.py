@@ -67,9 +67,11 @@ class Flights:
         }  # fmt: skip
         for name, stand_in in stand_ins.items():
             monkeypatch.setattr(evidence, name, stand_in)
-        model = SimpleNamespace(moments={}, bare_values={})
+        model = SimpleNamespace(moments={}, bare_values={}, channels=("p",))
         own: dict[str, tuple[()]] = dict.fromkeys(self.worth, ())
-        engine = SimpleNamespace(threads=1, records=[SimpleNamespace(t=row * np.arange(9))])
+        engine = SimpleNamespace(
+            threads=1, records=[SimpleNamespace(t=row * np.arange(9), z=np.zeros((9, 1)))]
+        )
         problem = Problem(model, engine, (), own, unlike_gusts=unlike)  # type: ignore[arg-type]
         fit, _, found = prune(problem, Fit(tuple(self.worth), {}, noise))
         return fit, found

@@ -65,6 +65,7 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
         return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
 
     monkeypatch.setattr(searched, "_searched", one)
+    believes_its_sensors(monkeypatch)
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
     monkeypatch.setattr(searched, "with_swings", lambda problem, fit: None)
     monkeypatch.setattr(searched, "_with_jitter", lambda problem, fit: None)
@@ -81,6 +82,68 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
     assert found.fit.noise.reading["phi"] == pytest.approx(stds[kept])
 
 
+def believes_its_sensors(monkeypatch) -> None:
+    """No attitude of an onboard filter, no errors that last."""
+    monkeypatch.setattr(searched, "of_onboard_filter", lambda problem, fit: False)
+    monkeypatch.setattr(searched, "with_lasting_errors", lambda problem, fit, noise: None)
+
+
+class Asked(SimpleNamespace):
+    """A problem of some candidates, which says what it was asked."""
+
+    def of_candidates(self, names: Any) -> "Asked":
+        return Asked(**{**vars(self), "candidates": tuple(sorted(names))})
+
+
+def test_beside_an_onboard_filters_attitudes_circular_effects_are_not_asked(monkeypatch):
+    asked: list[tuple[str, ...]] = []
+
+    def one(problem: Any, noise: Noise, coarse: bool = False) -> Searched:
+        asked.append(problem.candidates)
+        fit = Fit(("gyro_scale",) if len(asked) == 1 else (), {}, noise)
+        return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(searched, "_searched", one)
+    monkeypatch.setattr(searched, "of_onboard_filter", lambda problem, fit: True)
+    monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
+    candidates = ("gyro_scale", "imu_lever_arm", "wind")
+    problem = Asked(candidates=candidates, report=lambda text: None)
+    found = searched.searched(problem, FINE, {})  # type: ignore[arg-type]
+    assert asked == [candidates, ("imu_lever_arm", "wind")]
+    assert found.circular and found.fit.active == ()
+
+
+@pytest.mark.parametrize(
+    ("had", "costs", "active"),
+    [
+        ((), {}, ("wind",)),  # nothing had been found: one search
+        (("accel_bias",), {"wind": 90.0, "accel_bias": 100.0}, ("wind",)),
+        (("accel_bias",), {"wind": 90.0, "accel_bias": 80.0}, ("accel_bias",)),
+    ],
+)
+def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had, costs, active):
+    """From it, and from none: the likelier end stands, and nothing but shocks is asked then."""
+    plain, wider = (SimpleNamespace(name=n, report=lambda text: None) for n in ("plain", "wider"))
+
+    def one(problem: Any, noise: Noise, coarse: bool = False) -> Searched:
+        fit = Fit(("wind",) if problem is wider else had, {}, noise)
+        return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(searched, "_searched", one)
+    believes_its_sensors(monkeypatch)
+    lasting = Noise({"error_gyros": 0.1}, {"phi": 0.2})
+    monkeypatch.setattr(
+        searched, "with_lasting_errors", lambda problem, fit, noise: (wider, fit, lasting)
+    )
+    monkeypatch.setattr(searched, "search", lambda problem, fit: (fit, None))
+    monkeypatch.setattr(searched, "cost", lambda problem, fit, quadratic: costs[fit.active[0]])
+    monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
+    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
+    found = searched.searched(plain, FINE, {})  # type: ignore[arg-type]
+    assert found.problem is wider and found.fit.active == active and not found.circular
+    assert found.refitted.noise is lasting
+
+
 def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkeypatch):
     """Nothing is coloured then, and nothing else is asked."""
     asked: list[tuple[Any, float]] = []
@@ -92,6 +155,7 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
 
     swinging = SimpleNamespace(report=lambda text: None)
     monkeypatch.setattr(searched, "_searched", one)
+    believes_its_sensors(monkeypatch)
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     monkeypatch.setattr(searched, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
@@ -121,7 +185,8 @@ def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypa
         return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
 
     monkeypatch.setattr(searched, "_searched", one)
-    monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock: best)
+    believes_its_sensors(monkeypatch)
+    monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {"ax": LowPass(0.008)})
     problem = Problem(
         model=model, engine=SimpleNamespace(records=[record]), report=lambda text: None,

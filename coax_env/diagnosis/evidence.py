@@ -195,7 +195,7 @@ def _only(problem: Problem, fit: Fit, causes: Collection[str]) -> Fit:
 
 def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:
     """What colour, and commands for what the filter does not see, make of a cause's variance."""
-    unseen = (problem.has_slow_rows or problem.unlike_gusts) and effect in WEAK_OR_LATE
+    unseen = (problem.reads_seldom or problem.unlike_gusts) and effect in WEAK_OR_LATE
     colour = inflation(problem, quadratic, fit.active, effect)
     return colour * problem.settings.unseen_inflation if unseen else colour
 

@@ -49,6 +49,9 @@ WEAK_OR_LATE = frozenset({
 answers gusts between the rows of a log, which holds each command until the next, or foresees them
 better than the filter does."""
 
+ROTOR_SPEEDS = ("rpm_upper", "rpm_lower")
+"""Channels that show commands, and no gust."""
+
 T = TypeVar("T")
 
 
@@ -190,6 +193,19 @@ class Problem:
     def has_slow_rows(self) -> bool:
         """Whether commands changed unseen between the rows, for all that is known."""
         return self.row > self.settings.slow_rows
+
+    @cached_property
+    def reads_seldom(self) -> bool:
+        """Whether commands may answer what no reading but a rotor's speed has shown by then."""
+        return self.between_readings > self.settings.slow_rows
+
+    @cached_property
+    def between_readings(self) -> float:
+        """s between rows with a reading that is no rotor's speed, the median; none: endless."""
+        moves = [i for i, c in enumerate(self.model.channels) if c not in ROTOR_SPEEDS]
+        steps = [np.diff(r.t[np.isfinite(r.z[:, moves]).any(1)]) for r in self.engine.records]
+        steps = [own for own in steps if own.size]
+        return float(np.median(np.concatenate(steps))) if steps else math.inf
 
     @cached_property
     def row(self) -> float:

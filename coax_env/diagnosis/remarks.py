@@ -109,12 +109,17 @@ def held_out_before(
 
 
 def _slow_rows(problem: Problem) -> list[str]:
-    if not problem.has_slow_rows:
+    if not problem.reads_seldom:
         return []
+    why = (
+        f"rows {1e3 * problem.row:.0f} ms apart: what the commands did between them is not known"
+        if problem.has_slow_rows
+        else f"readings {1e3 * problem.between_readings:.0f} ms apart: commands may answer what none"
+        " has shown yet"
+    )
     return [
-        f"rows {1e3 * problem.row:.0f} ms apart: what the commands did between "
-        "them is not known, and what looks like a weak or late answer must be worth "
-        f"{problem.settings.unseen_inflation:g} times as much"
+        f"{why}, and what looks like a weak or late answer must be worth"
+        f" {problem.settings.unseen_inflation:g} times as much"
     ]
 
 

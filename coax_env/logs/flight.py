@@ -83,6 +83,7 @@ from coax_env.logs.card_columns import Column, Quaternion
 from coax_env.logs.csv_log import CsvLog, read_csv
 from coax_env.logs.frames import place
 from coax_env.logs.repairs import repaired
+from coax_env.logs.smoothed import read_apart
 from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS, without
 from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
 
@@ -210,7 +211,7 @@ def read_flight(path: str | Path) -> Flight:
     counts: Counter[str] = Counter()
     renamed: set[str] = set()
     unread: dict[str, None] = {}  # in the order of the files
-    runs = []
+    logs = []
     origin: tuple[float, float] | None = None
     for entry in card.runs:
         file = folder / entry.file
@@ -219,23 +220,24 @@ def read_flight(path: str | Path) -> Flight:
         hashes[entry.file] = _hash(file)
         renamed |= log.renamed
         unread |= dict.fromkeys(log.unknown)
-        data = repaired(log, card.noise, counts, card.holds)
-        runs.append(
-            Run(
-                entry.name,
-                data.t,
-                data.command,
-                data.measured,
-                entry.maneuver,
-                entry.note,
-                battery=data.battery,
-                part=entry.part,
-            )
-        )
+        logs.append(repaired(log, card.noise, counts, card.holds))
     _check_columns(folder, card, renamed, unread)
+    runs = tuple(
+        Run(
+            entry.name,
+            data.t,
+            data.command,
+            data.measured,
+            entry.maneuver,
+            entry.note,
+            battery=data.battery,
+            part=entry.part,
+        )
+        for entry, data in zip(card.runs, read_apart(logs, counts, card.holds), strict=True)
+    )
     return Flight(
         vehicle=card.vehicle,
-        runs=tuple(runs),
+        runs=runs,
         air=card.air,
         noise=card.noise,
         path=folder,

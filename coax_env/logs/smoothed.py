@@ -1,0 +1,127 @@
+"""Readings that software has smoothed: by a motion capture, or by whoever prepared the log.
+
+Behind a low-pass a reading is much what the one before it was, noise included, and an estimator that
+takes each for news believes them many times over: on clean **synthetic** flights whose poses came
+through a low-pass of 10 Hz, forwards and back, four to seven false causes of up to 748 nats each. Its
+noise has no more power above the cut-off, and falls there by a power of the frequency, where that of a
+sensor is flat. Readings so far apart that their noise is flat again say all that there is.
+
+A log without noise is steep at any distance, and stays as it is; so does a log on an uneven clock.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.signal import welch
+
+from coax_env.logs.packets import stretches
+from coax_env.logs.repairs import Repaired
+from coax_env.model.layout import ANGLES, CHANNELS, SENSOR_GROUPS
+from coax_env.plain_words import and_list
+
+ASKED = tuple(
+    c
+    for c in CHANNELS
+    if any(c in SENSOR_GROUPS[g] for g in ("attitude", "heading", "height", "velocity", "position"))
+)
+"""Channels that software smooths; the low-passes of gyros and accelerometers are found with the model
+(diagnosis/sensor_low_pass.py), which feels their delay."""
+PIECE = 64
+"""Readings of which a spectrum is taken; ours."""
+PIECES = 4
+"""Spectra at least, that it is a mean of; ours."""
+MIDDLE, TOP = (0.2, 0.3), (0.4, 0.49)
+"""Bands, in shares of the rate, whose densities are compared; ours."""
+STEEP, FLAT = 30.0, 2.5
+"""Times as dense in the middle as at the top: where it is smoothed, and where noise is flat enough. A
+sensor's has 1; the real first CoaX up to 13, a vibration at 40 Hz; **synthetic** ones behind 10 Hz at
+a rate of 100 Hz have 700 to 2,800, where steps of the readings do not hide it."""
+FARTHEST = 0.1
+"""s that readings may be apart at most; ours."""
+UNEVEN = 0.1
+"""Share of a usual step by which one may differ."""
+
+
+def read_apart(
+    runs: Sequence[Repaired], counts: Counter[str], holds: Mapping[str, bool]
+) -> list[Repaired]:
+    """Runs whose smoothed channels have no more readings than say something new.
+
+    Args:
+        runs: of one flight.
+        counts: what was repaired -> how often; what is left out is added.
+        holds: channel -> what the card says; one that never holds stays as it is.
+    """
+    apart = {c: _apart(runs, c) for c in ASKED if holds.get(c) is not False}
+    smooth = [c for c, rows in apart.items() if rows > 1]
+    if not smooth:
+        return list(runs)
+    rows = max(apart.values())  # one software, one cut-off
+    found, left_out = [], 0
+    for run in runs:
+        measured = dict(run.measured)
+        for channel in smooth:
+            values = measured.get(channel, np.empty(0)).copy()
+            gone = np.delete(np.flatnonzero(np.isfinite(values)), np.s_[::rows])
+            values[gone] = np.nan
+            left_out += gone.size
+            if values.size:
+                measured[channel] = values
+        found.append(replace(run, measured=measured))
+    counts[f"smoothed readings left out, all but one in {rows} of {and_list(smooth)}"] += left_out
+    return found
+
+
+def _apart(runs: Sequence[Repaired], channel: str) -> int:
+    """Readings of which one says as much as all do."""
+    pieces, step = _even_pieces(runs, channel)
+    if not pieces or max(steepness(pieces, rows) for rows in (1, 2)) < STEEP:
+        return 1
+    for rows in range(2, int(FARTHEST / step) + 1):
+        if 0.0 < steepness(pieces, rows) < FLAT:
+            return rows
+    return 1
+
+
+def _even_pieces(runs: Sequence[Repaired], channel: str) -> tuple[list[np.ndarray], float]:
+    """Readings of a channel on even rows, and the time between two [s]."""
+    steps, series = [], []
+    for run in runs:
+        values = run.measured.get(channel, np.empty(0))
+        present = np.flatnonzero(np.isfinite(values))
+        if present.size > PIECE:
+            own = values[present]
+            series.append((run.t[present], np.unwrap(own) if channel in ANGLES else own))
+            steps.append(np.diff(run.t[present]))
+    if not series:
+        return [], 0.0
+    step = float(np.median(np.concatenate(steps)))
+    return [
+        values[first : behind + 1]
+        for t, values in series
+        for first, behind in stretches(np.abs(np.diff(t) - step) < UNEVEN * step)
+    ], step
+
+
+def steepness(pieces: Sequence[np.ndarray], rows: int) -> float:
+    """Density of a spectrum in the MIDDLE of its band over that at the TOP; 0 where it is too short.
+
+    Of second differences, which keep slow motion out of the window's leakage, and back.
+
+    Args:
+        pieces: readings, evenly in time. rows: of which every so many-th is taken.
+    """
+    taken = [piece[::rows] for piece in pieces if piece[::rows].size >= PIECE + 2]
+    if sum(piece.size for piece in taken) < PIECES * PIECE:
+        return 0.0
+    spectra = [welch(np.diff(piece, 2), nperseg=PIECE, average="median") for piece in taken]
+    frequency = spectra[0][0][1:]
+    density = np.average([d[1:] for _, d in spectra], axis=0, weights=[p.size for p in taken])
+    density = density / (2.0 * np.sin(np.pi * frequency)) ** 4
+    middle, top = (
+        float(np.mean(density[(frequency > low) & (frequency < high)]))
+        for low, high in (MIDDLE, TOP)
+    )
+    return middle / top if top > 0.0 else 0.0
