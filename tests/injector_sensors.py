@@ -109,6 +109,11 @@ SENSORS = {
         {c: 5.0 * std for c, std in POSE.items()}, step=0.01,
         steadied=dict.fromkeys(POSE, 10.0), formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"),
     ),
+    "lab": Sensors(  # poses of a motion capture, and what is on board
+        {c: std for c, std in NOISE.items() if c in FAST} | {c: 5.0 * std for c, std in POSE.items()},
+        formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"),
+    ),
+    "inertial": Sensors({c: std for c, std in NOISE.items() if c in (*FAST, "h")}),
     "camera": Sensors(
         {"phi": 0.01, "theta": 0.01, "psi": 0.01, "pn": 0.003, "pe": 0.003, "h": 0.004}, step=0.01,
         every_row=(3,), formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"),

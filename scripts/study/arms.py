@@ -93,6 +93,8 @@ ARMS = {
         "CoaX class, a motion capture whose software smooths at 10 Hz, forwards and back",
         sensors=("pose_steadied",), card=(None, 1.0), craft="coax",
     ),
+    "lab": Arm("poses of a motion capture with gyros and accelerometers", sensors=("lab",)),
+    "inertial": Arm("gyros, accelerometers and a sonar alone", sensors=("inertial",)),
     "camera": Arm(
         "CoaX class, a camera: poses at 33 Hz, 3 mm and 0.6 degrees",
         sensors=("camera",), card=(None, 1.0), craft="coax",
