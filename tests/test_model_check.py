@@ -16,6 +16,7 @@ from coax_env.diagnosis.model_check import (
     LARGE,
     SEEN,
     ModelCheck,
+    _about,
     _answers,
     _correlation,
     _late_rows,
@@ -179,13 +180,15 @@ def test_starts_are_five_seconds_apart_from_two_seconds_on():
     assert _starts(record_at(T[:22]), 0.0).size == 0
 
 
-def test_three_seconds_from_each_start_are_unseen():
+def test_three_seconds_from_a_start_are_unseen_and_eight_before_it_are_seen():
     """In the readings and in what commands show; the start's own row is seen."""
     for shown in (False, True):
-        blind = _unseen(record_at(T, shown), np.array([52.0, 60.0]))
-        there = np.isfinite(blind.z).all(axis=1)
-        hidden = ((T > 52.01) & (T < 55.01)) | ((T > 60.01) & (T < 63.01))
-        np.testing.assert_array_equal(there, ~hidden)
+        about = _about(record_at(T, shown), 60.0)
+        assert (about.t[0], about.t[-1]) == pytest.approx((52.1, 63.0)) and about.origin == T[0]
+        blind = _unseen(about, 60.0)
+        hidden = about.t > 60.01
+        np.testing.assert_array_equal(np.isfinite(blind.z).all(axis=1), ~hidden)
+        assert np.isfinite(about.z).all()
         if shown:
             assert blind.input_innovations is not None
             np.testing.assert_array_equal(blind.input_innovations[:, 2], np.where(hidden, 0.0, 1.0))
@@ -194,8 +197,8 @@ def test_three_seconds_from_each_start_are_unseen():
 
 
 def test_each_horizon_ends_at_its_row_or_not_at_all():
-    rows = _rows_ahead(T, np.array([52.0, 78.6]))
-    assert rows.tolist() == [[22, 25, 30, 40, 50], [288, 291, 296, -1, -1]]
+    assert _rows_ahead(T, 52.0).tolist() == [22, 25, 30, 40, 50]
+    assert _rows_ahead(T, 78.6).tolist() == [288, 291, 296, -1, -1]
 
 
 def test_the_last_reading_within_a_tail_counts():
