@@ -106,10 +106,10 @@ def test_beside_an_onboard_filters_attitudes_circular_effects_are_not_asked(monk
     monkeypatch.setattr(searched, "_searched", one)
     monkeypatch.setattr(searched, "of_onboard_filter", lambda problem, fit: True)
     monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
-    candidates = ("gyro_scale", "imu_lever_arm", "wind")
+    candidates = ("gyro_scale", "motor_lag", "wind")
     problem = Asked(candidates=candidates, report=lambda text: None)
     found = searched.searched(problem, FINE, {})  # type: ignore[arg-type]
-    assert asked == [candidates, ("imu_lever_arm", "wind")]
+    assert asked == [candidates, ("motor_lag", "wind")]
     assert found.circular and found.fit.active == ()
 
 

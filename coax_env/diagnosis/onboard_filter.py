@@ -20,8 +20,8 @@ CARRIED = 0.2
 """Correlation of the innovations of a rate and of its angle in a row, all three at least. Four such
 flights had 0.31 and more; others, **synthetic** and real, 0.15 and less."""
 CIRCULAR = frozenset({
-    "gyro_scale", "gyro_bias", "attitude_bias", "magnetic_field", "imu_tilt", "accel_scale",
-    "accel_bias", "sonar_scale", "sonar_tilt", "sonar_delay",
+    "gyro_scale", "gyro_bias", "attitude_bias", "magnetic_field", "imu_tilt", "imu_lever_arm",
+    "accel_scale", "accel_bias", "sonar_scale", "sonar_tilt", "sonar_delay",
 })  # fmt: skip
 """Effects that show in what the sensors of such a filter and its states say of each other."""
 ANGLE_OF = {"p": "phi", "q": "theta", "r": "psi"}
