@@ -23,7 +23,7 @@ from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import error_level, error_memory, starting_noise
 from coax_env.estimation.lasting_errors import ERRING, ERRORS, N_ERRING, ErringModel, with_errors
 from coax_env.estimation.noise_levels import fit_noise
-from coax_env.estimation.state_space import Noise
+from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.flight import read_flight
 from coax_env.model import dynamics
 from coax_env.model import state as S
@@ -217,6 +217,19 @@ def test_attitudes_with_the_gyros_noise_are_an_onboard_filters(correlation, carr
     assert not onboard_filter.of_onboard_filter(problem, fit)  # type: ignore[arg-type]
 
 
+def test_an_onboard_filters_states_are_read_once_a_second():
+    """Rows of their own where readings are missing; gyros and accelerometers in every row."""
+    t = 0.01 * np.arange(500)
+    z = np.ones((500, N_CHANNELS))
+    z[:30, CHANNELS.index("vn")] = np.nan
+    (found,) = onboard_filter.read_seldom([Record("a", t, np.zeros((500, 4)), z)], CHANNELS)
+    read = {c: np.flatnonzero(np.isfinite(found.z[:, i])) for i, c in enumerate(CHANNELS)}
+    assert read["phi"].tolist() == read["h"].tolist() == [0, 100, 200, 300, 400]
+    assert read["vn"].tolist() == [30, 130, 230, 330, 430]
+    assert all(read[c].size == 500 for c in ("p", "az", "rpm_upper"))
+    assert np.isfinite(z[30:]).all()
+
+
 @pytest.mark.slow
 def test_sensors_that_speak_of_each_other_are_not_believed(tmp_path):
     """Attitudes, velocities and height of an onboard filter: of eight such flights six had a gyro's
@@ -226,5 +239,6 @@ def test_sensors_that_speak_of_each_other_are_not_believed(tmp_path):
     injector.fly(tmp_path, hidden, gusts=GUSTY, sensors="fused", seed=3, runs=runs, longest=10.0)
     found = diagnose(tmp_path)
     assert [cause["effect"] for cause in found.findings["causes"]] == ["motor_lag"]
+    assert found.findings["verdict"] == "explained"
     (said,) = [line for line in found.remarks if "an onboard filter's" in line]
     assert "gyro scale" in said and "not looked for" in said

@@ -94,12 +94,15 @@ class Asked(SimpleNamespace):
     def of_candidates(self, names: Any) -> "Asked":
         return Asked(**{**vars(self), "candidates": tuple(sorted(names))})
 
+    def with_records(self, records: Any) -> "Asked":
+        return Asked(**{**vars(self), "engine": SimpleNamespace(records=records)})
+
 
 def test_beside_an_onboard_filters_attitudes_circular_effects_are_not_asked(monkeypatch):
-    asked: list[tuple[str, ...]] = []
+    asked: list[tuple[tuple[str, ...], list[str]]] = []
 
     def one(problem: Any, noise: Noise, coarse: bool = False) -> Searched:
-        asked.append(problem.candidates)
+        asked.append((problem.candidates, problem.engine.records))
         fit = Fit(("gyro_scale",) if len(asked) == 1 else (), {}, noise)
         return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
 
@@ -107,9 +110,13 @@ def test_beside_an_onboard_filters_attitudes_circular_effects_are_not_asked(monk
     monkeypatch.setattr(searched, "of_onboard_filter", lambda problem, fit: True)
     monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
     candidates = ("gyro_scale", "motor_lag", "wind")
-    problem = Asked(candidates=candidates, report=lambda text: None)
+    problem = Asked(
+        candidates=candidates, report=lambda text: None, model=SimpleNamespace(channels=()),
+        engine=SimpleNamespace(records=["all"]),
+    )  # fmt: skip
+    monkeypatch.setattr(searched, "read_seldom", lambda records, channels: ["few"])
     found = searched.searched(problem, FINE, {})  # type: ignore[arg-type]
-    assert asked == [candidates, ("motor_lag", "wind")]
+    assert asked == [(candidates, ["all"]), (("motor_lag", "wind"), ["few"])]
     assert found.circular and found.fit.active == ()
 
 

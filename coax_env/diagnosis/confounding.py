@@ -62,8 +62,9 @@ def alternatives(
     """
 
     def of_one(effect: str) -> dict[str, Fit]:
-        inflations = (white[c].inflation for c in channels_of(problem, fit, quadratic, effect))
-        factor = max([evidence[effect].inflation, *inflations])
+        shown_by = channels_of(problem, fit, quadratic, effect)
+        judged = [white[c].inflation for c in shown_by if c in white]  # not of a few readings
+        factor = max([evidence[effect].inflation, *judged])
         return _of_one(problem, fit, quadratic, effect, factor, evidence[effect].lost)
 
     return problem.for_each(of_one, fit.active if of is None else of)

@@ -176,6 +176,7 @@ def diagnose(
     of_sensors += [onboard_filter.remark(unasked)] if first.circular else []
     problem, bare, refitted = first.problem, first.bare, first.refitted
     held = records_before(held, CHANNELS, first.low_passes)
+    held = onboard_filter.read_seldom(held, CHANNELS) if first.circular else held
     passes_before = problem.engine.filter(bare.values, bare.noise)
     state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
-from coax_env.diagnosis.onboard_filter import CIRCULAR, of_onboard_filter
+from coax_env.diagnosis.onboard_filter import CIRCULAR, of_onboard_filter, read_seldom
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
@@ -91,8 +91,10 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     """
     best = _searched(problem, noise)
     if of_onboard_filter(best.problem, best.fit):
-        problem.report("attitudes of an onboard filter: searching again without what rests on them")
-        best = _searched(problem.of_candidates(set(problem.candidates) - CIRCULAR), noise)
+        problem.report("attitudes of an onboard filter: searching again with few of them")
+        seldom = read_seldom(problem.engine.records, problem.model.channels)
+        asked = set(problem.candidates) - CIRCULAR
+        best = _searched(problem.with_records(seldom).of_candidates(asked), noise)
         return replace(_in_unrest(best, noise, clock, False), circular=True)
     erring = with_lasting_errors(best.problem, best.fit, noise)
     if erring is not None:
