@@ -16,6 +16,7 @@ import pytest
 from coax_env import load_vehicle
 from coax_env.diagnosis import confounding, remarks
 from coax_env.diagnosis.confounding import channels_of
+from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.findings import mixtures_as_one
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import (
@@ -336,6 +337,21 @@ def test_a_lags_delay_stands_for_it_within_a_tie_of_the_refit(refits, inflation,
     slope[names.index("servo_delay.time")] = -50.0 / std[names.index("servo_delay.time")]
     found = confounding._of_one(SERVO, fit, replace(q, g=slope), "servo_lag", inflation, lost)
     assert set(found) == {"servo_delay"}
+
+
+@pytest.mark.parametrize(
+    ("judged", "factor"), [({"p": 2.0, "phi": 3.0}, 3.0), ({"p": 2.0}, 2.0), ({}, 1.5)]
+)
+def test_a_channel_of_few_readings_has_no_colour(monkeypatch, judged, factor):
+    """Whiteness is judged from 60 readings of a run on: GNSS once a second has none in a minute."""
+    white = {channel: SimpleNamespace(inflation=own) for channel, own in judged.items()}
+    monkeypatch.setattr(confounding, "channels_of", lambda *given: ["p", "phi"])
+    monkeypatch.setattr(confounding, "_of_one", lambda *given: {"used": given[-2]})
+    problem = SimpleNamespace(for_each=lambda work, of: {e: work(e) for e in of})
+    found = confounding.alternatives(
+        problem, SimpleNamespace(active=("wind",)), None, {"wind": Evidence(50.0, 1.5)}, white
+    )  # type: ignore[arg-type, call-overload]
+    assert found == {"wind": {"used": factor}}
 
 
 def test_a_servo_that_lags_and_is_late_is_one_cause():
