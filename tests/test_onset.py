@@ -19,8 +19,9 @@ from coax_env.diagnosis.onsets import every_moment, growth, search
 from coax_env.diagnosis.onsets import moment as moments
 from coax_env.diagnosis.onsets import trial as trials
 from coax_env.diagnosis.onsets.changing import Changing
-from coax_env.diagnosis.onsets.every_moment import Table, rows_of
+from coax_env.diagnosis.onsets.every_moment import Table, at_an_end, rows_of
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.beginnings import Asked, Beginning
 from coax_env.estimation.changing_model import (
@@ -520,6 +521,19 @@ def test_on_long_flights_moments_are_farther_apart():
     assert 1.49 < t[short[0]] < 1.53 and set(np.diff(short)) == {1}
 
 
+@pytest.mark.parametrize(
+    ("run", "t", "end"),
+    [("a", 8.4, True), ("a", 8.6, False), ("a", 16.9, False), ("b", 7.1, False), ("b", 15.4, False),
+     ("b", 15.6, True)],
+)  # fmt: skip
+def test_what_a_flight_begins_or_ends_with_is_no_change(run, t, end):
+    """Within 1.5 s of its first and last row, not of each run's: a moment may have moved there."""
+    own = np.arange(7.0, 17.005, 0.01)
+    none = np.zeros((own.size, 4))
+    records = [Record(name, own, none, none) for name in "ab"]
+    assert at_an_end(records, Moment(run, t)) == end
+
+
 NAMES = ("mass", "gyro_bias.x", "gyro_bias.y", "gyro_bias.z", "yaw_damping.coefficient")
 
 
@@ -867,8 +881,8 @@ def test_a_models_cost_is_its_objective_and_occams_factor():
     problem = Problem(model, None, (mass,), own)
     fit = Fit(("yaw_damping",), {}, NOISE_OF_ALL, objective=80.0)
     expected = 80.0 + q.occam(["yaw_damping.coefficient"], ["mass"])
-    assert search._cost(problem, fit, q) == pytest.approx(expected)
-    assert search._cost(problem, replace(fit, active=()), q) == 80.0
+    assert cost(problem, fit, q) == pytest.approx(expected)
+    assert cost(problem, replace(fit, active=()), q) == 80.0
 
 
 def weighed(form: str, inflation: float):
@@ -876,7 +890,9 @@ def weighed(form: str, inflation: float):
 
     Of what was there and changes, of what begins, or of what ends; Occam's factor 5 nats a number.
     """
-    engine = SimpleNamespace(filter=lambda values, noise: [])
+    clock = 0.01 * np.arange(10_000)
+    record = Record("a", clock, np.zeros((clock.size, 4)), np.zeros((clock.size, 2)))
+    engine = SimpleNamespace(filter=lambda values, noise: [], records=[record])
     names = ["gyro_bias.x", *([] if form == "begins" else [of_part("gyro_bias.x", BEFORE)])]
     problem = SimpleNamespace(
         engine=engine, model=SimpleNamespace(channels=("p", "q")), settings=SETTINGS, seconds=100.0,
@@ -917,12 +933,13 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, form, inf
     found = changes.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
     of_moment = math.log(100.0 / 2.0)
 
-    def worth(always: float = 900.0, same: float = 160.0) -> float:
+    def worth(always: float = 900.0, same: float = 160.0, t: float = 9.0) -> float:
+        at = replace(found, moment=Moment("a", t))
         rivals = trials.Rivals(
             replace(state.fit, objective=same),
             None if form == "changes" else replace(trial, objective=always),
         )
-        return trials._worth(state, problem, trial, rivals, quadratic, found).nats  # type: ignore[arg-type]
+        return trials._worth(state, problem, trial, rivals, quadratic, at).nats  # type: ignore[arg-type]
 
     expected = 60.0 / inflation - (10.0 if form == "ends" else 5.0) - of_moment
     assert worth() == pytest.approx(expected)
@@ -939,6 +956,7 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, form, inf
         made[key] = kept
     made["lasting"] = 6.0 * inflation + 0.1
     assert worth() == pytest.approx(expected)
+    assert worth(t=1.4) == -math.inf  # the flight begins
 
 
 @pytest.mark.parametrize(

@@ -121,6 +121,13 @@ def rows_of(records: Sequence[Record]) -> list[np.ndarray]:
     return found
 
 
+def at_an_end(records: Sequence[Record], moment: Moment) -> bool:
+    """Whether a moment is in the MARGIN from the first row of all, or to the last."""
+    first, last = records[0], records[-1]
+    begins = moment.run == first.whole and moment.t < first.t[0] + MARGIN
+    return begins or (moment.run == last.whole and moment.t > last.t[-1] - MARGIN)
+
+
 def _asked(problem: Problem, fit: Fit, names: Mapping[str, Sequence[str]]) -> Asked:
     """What a score takes of every row: beside what is free, and pairs of each effect's numbers."""
     places = {f.name: k for k, f in enumerate(problem.parameters)}

@@ -9,7 +9,7 @@ import numpy as np
 from coax_env.diagnosis.confounding import channels_of
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_at
 from coax_env.diagnosis.onsets.changing import Changing, Onset, before_names, beginning
-from coax_env.diagnosis.onsets.every_moment import Scored
+from coax_env.diagnosis.onsets.every_moment import Scored, at_an_end
 from coax_env.diagnosis.onsets.moment import grown_or_step, moved_to_best
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.changing_model import BEFORE, Lap
@@ -165,8 +165,8 @@ def _worth(
     """An onset with its evidence: beside no change, its numbers and its moment paid for.
 
     Minus infinity where it is within a tie of a cause that was always there, where a gust could have
-    made it, where it is too small to matter, and where the channels that show it stay coloured: a model
-    that is wrong there always finds a moment.
+    made it, or what a flight begins or ends with, where it is too small to matter, and where the
+    channels that show it stay coloured: a model that is wrong there always finds a moment.
     """
     effect, same = found.effect, rivals.same
     was = before_names(problem, effect)
@@ -187,6 +187,7 @@ def _worth(
     lasting = _lasting(without, with_it, found.moment) / inflation
     if (
         min(lasting, beside_constant) < problem.settings.tie
+        or at_an_end(problem.engine.records, found.moment)
         or not _matters(problem, trial, effect)
         or _is_coloured(problem, trial, quadratic, effect)
     ):
