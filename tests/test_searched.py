@@ -142,6 +142,7 @@ def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had,
     monkeypatch.setattr(
         searched, "with_lasting_errors", lambda problem, fit, noise: (wider, fit, lasting)
     )
+    monkeypatch.setattr(searched, "_white_since", lambda best, clock: None)
     monkeypatch.setattr(searched, "search", lambda problem, fit: (fit, None))
     monkeypatch.setattr(searched, "cost", lambda problem, fit, quadratic: costs[fit.active[0]])
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
@@ -149,6 +150,23 @@ def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had,
     found = searched.searched(plain, FINE, {})  # type: ignore[arg-type]
     assert found.problem is wider and found.fit.active == active and not found.circular
     assert found.refitted.noise is lasting
+
+
+@pytest.mark.parametrize(
+    ("onsets", "white", "used"),
+    [({"gyro_bias": None}, True, True), ({"gyro_bias": None}, False, False), ({}, True, False)],
+)
+def test_what_changed_once_is_no_error_that_lasts(monkeypatch, onsets, white, used):
+    """Where it leaves nothing coloured; such errors take up a gyro that drifts off and stays."""
+    engine = SimpleNamespace(filter=lambda values, noise: [])
+    problem = SimpleNamespace(engine=engine, model=SimpleNamespace(channels=()))
+    fit = Fit((), {}, FINE)
+    state = SimpleNamespace(problem=problem, fit=fit, onsets=onsets)
+    monkeypatch.setattr(searched, "with_onsets", lambda *given: state)
+    monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
+    first = Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
+    changed = searched._white_since(first, {})
+    assert (changed is not None) == used and (changed is None or changed.changing is state)
 
 
 def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkeypatch):

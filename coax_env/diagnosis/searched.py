@@ -98,6 +98,9 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         return replace(_in_unrest(best, noise, clock, False), circular=True)
     erring = with_lasting_errors(best.problem, best.fit, noise)
     if erring is not None:
+        changed = _white_since(best, clock)
+        if changed is not None:
+            return changed
         problem, found, noise = erring
         problem.report("searching again with errors of readings that last")
         best = _likelier(_searched(problem, noise), found)
@@ -205,6 +208,20 @@ def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
         problem.report("searching again with readings that see late commands at their own delay")
         fit, quadratic = search(problem, refitted)
     return Searched(problem, bare, refitted, fit, quadratic, coarse)
+
+
+def _white_since(found: Searched, clock: Mapping[str, Lap]) -> Searched | None:
+    """With what changed in flight, where that leaves nothing coloured: a gyro that drifts off once.
+
+    Args:
+        found: without errors that last, which would take that up.
+        clock: of all runs in the order in which they were flown.
+    """
+    state = with_onsets(found.problem, found.fit, found.quadratic, found.refitted, clock)
+    passes = state.problem.engine.filter(state.fit.values, state.fit.noise)
+    if not state.onsets or not is_white(passes, state.problem.model.channels):
+        return None
+    return replace(found, changing=state)
 
 
 def _likelier(best: Searched, found: Fit) -> Searched:
