@@ -71,6 +71,16 @@ def test_gyros_an_uneven_clock_and_a_card_that_says_so_stay_as_they_are():
     assert kept(run_of(pn=smooth), "pn") > 1
 
 
+def test_beside_smoothed_channels_one_without_noise_is_read_as_they_are():
+    b, a = butter(2, 10.0, fs=100.0)
+    smooth = MOTION + 0.01 * filtfilt(b, a, WHITE)
+    counts: Counter[str] = Counter()
+    (found,) = read_apart([run_of(phi=MOTION, theta=smooth, h=MOTION + 0.01 * WHITE)], counts, {})
+    read = {c: int(np.isfinite(x).sum()) for c, x in found.measured.items()}
+    assert read["phi"] == read["theta"] < 0.3 * T.size and read["h"] == T.size
+    assert "phi and theta" in next(iter(counts))
+
+
 def test_an_angle_that_turns_is_no_jump():
     b, a = butter(2, 10.0, fs=100.0)
     turning = 3.0 * T + 0.01 * filtfilt(b, a, WHITE)

@@ -6,7 +6,8 @@ through a low-pass of 10 Hz, forwards and back, four to seven false causes of up
 noise has no more power above the cut-off, and falls there by a power of the frequency, where that of a
 sensor is flat. Readings so far apart that their noise is flat again say all that there is.
 
-A log without noise is steep at any distance, and stays as it is; so does a log on an uneven clock.
+A log without noise is steep at any distance, and stays as it is; so does a log on an uneven clock. A
+channel that is steep at any distance beside some that are not is read as often as these.
 """
 
 from collections import Counter
@@ -34,10 +35,11 @@ PIECES = 4
 """Spectra at least, that it is a mean of; ours."""
 MIDDLE, TOP = (0.2, 0.3), (0.4, 0.49)
 """Bands, in shares of the rate, whose densities are compared; ours."""
-STEEP, FLAT = 30.0, 2.5
-"""Times as dense in the middle as at the top: where it is smoothed, and where noise is flat enough. A
-sensor's has 1; the real first CoaX up to 13, a vibration at 40 Hz; **synthetic** ones behind 10 Hz at
-a rate of 100 Hz have 700 to 2,800, where steps of the readings do not hide it."""
+STEEP, SLOPING, FLAT = 30.0, 5.0, 2.5
+"""Times as dense in the middle as at the top: where it is smoothed, where it is beside one that is, as
+steps of the readings may hide it, and where noise is flat enough. A sensor's has 1; the real first
+CoaX up to 13, a vibration at 40 Hz; **synthetic** ones behind 10 Hz at a rate of 100 Hz have 700 to
+2,800."""
 FARTHEST = 0.1
 """s that readings may be apart at most; ours."""
 UNEVEN = 0.1
@@ -54,11 +56,12 @@ def read_apart(
         counts: what was repaired -> how often; what is left out is added.
         holds: channel -> what the card says; one that never holds stays as it is.
     """
-    apart = {c: _apart(runs, c) for c in ASKED if holds.get(c) is not False}
-    smooth = [c for c, rows in apart.items() if rows > 1]
-    if not smooth:
+    pieces = {c: _even_pieces(runs, c) for c in ASKED if holds.get(c) is not False}
+    steep = {c: max(steepness(own, k) for k in (1, 2)) for c, (own, _) in pieces.items()}
+    rows = max((_apart(*pieces[c]) for c, times in steep.items() if times > STEEP), default=1)
+    if rows == 1:
         return list(runs)
-    rows = max(apart.values())  # one software, one cut-off
+    smooth = [c for c, times in steep.items() if times > SLOPING]  # one software, one cut-off
     found, left_out = [], 0
     for run in runs:
         measured = dict(run.measured)
@@ -74,12 +77,13 @@ def read_apart(
     return found
 
 
-def _apart(runs: Sequence[Repaired], channel: str) -> int:
-    """Readings of which one says as much as all do."""
-    pieces, step = _even_pieces(runs, channel)
-    if not pieces or max(steepness(pieces, rows) for rows in (1, 2)) < STEEP:
-        return 1
-    for rows in range(2, int(FARTHEST / step) + 1):
+def _apart(pieces: Sequence[np.ndarray], step: float) -> int:
+    """Readings of which one says as much as all do; 1 where they are steep at any distance.
+
+    Args:
+        pieces: readings, evenly in time. step: between two [s].
+    """
+    for rows in range(2, int(FARTHEST / step + 1e-6) + 1):
         if 0.0 < steepness(pieces, rows) < FLAT:
             return rows
     return 1
