@@ -11,6 +11,7 @@ from injector_craft import COAX
 from scipy.signal import butter, filtfilt, lfilter
 
 from coax_env import diagnose
+from coax_env.diagnosis.findings import alike_in_seldom_poses
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.logs.flight import read_flight
@@ -121,3 +122,21 @@ def test_nothing_is_named_where_poses_were_smoothed(tmp_path):
     assert found.findings["causes"] == []
     (said,) = [line for line in found.remarks if "readings 50 ms apart" in line]
     assert "3 times as much" in said
+
+
+@pytest.mark.parametrize(
+    ("effect", "seldom", "aboard", "alike"),
+    [
+        ("command_delay", True, ("phi", "pn"), ["pose_delay"]),
+        ("pose_delay", True, ("phi", "pn"), ["command_delay"]),
+        ("command_delay", False, ("phi", "pn"), []),
+        ("command_delay", True, ("phi", "az"), []),  # an accelerometer feels when a command acts
+        ("wind", True, ("phi", "pn"), []),
+    ],
+)
+def test_by_seldom_poses_alone_late_commands_and_late_poses_are_one(effect, seldom, aboard, alike):
+    problem = SimpleNamespace(
+        aboard=frozenset(aboard), reads_seldom=seldom,
+        candidates=("command_delay", "pose_delay", "wind"),
+    )  # fmt: skip
+    assert alike_in_seldom_poses(problem, effect) == alike  # type: ignore[arg-type]

@@ -15,6 +15,7 @@ from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.changing_model import BEFORE
 from coax_env.estimation.fitted_vehicle import with_timing
 from coax_env.estimation.helicopter_noise import level_unit
+from coax_env.estimation.low_pass import ACCELEROMETERS, GYROS
 from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
@@ -75,7 +76,7 @@ def causes(
                     for f, p in zip(last, effects.CATALOGUE[effect].fitted, strict=True)
                 },
                 "evidence": evidence[effect].nats,
-                "confusable_with": [*found[effect], *effects.found_by_the_name_of(effect)],
+                "confusable_with": confusable_with(problem, effect, found[effect]),
                 "channels": channels_of(problem, fit, quadratic, effect),
                 **trust[effect].entries(),
             }
@@ -87,6 +88,30 @@ def causes(
     if lines:
         entries.append(_vibration(lines))
     return sorted(mixtures_as_one(entries), key=lambda c: (c["trust"] != "sure", -c["evidence"]))
+
+
+LATE = frozenset({"command_delay", "pose_delay"})
+"""Between seldom poses one lateness: a late pose is taken from the state a row's end has, to second
+order in its delay, which loses what gusts did since. Two of two late poses that came 50 ms apart were
+named late commands, on **synthetic** flights."""
+
+
+def confusable_with(problem: Problem, effect: str, alternatives: Iterable[str]) -> list[str]:
+    """What a cause may as well be: its alternatives, and those that no flight or not this one tells.
+
+    Args:
+        problem: of the flight. effect: the cause. alternatives: that were fitted.
+    """
+    never = effects.found_by_the_name_of(effect)
+    return list(dict.fromkeys([*alternatives, *never, *alike_in_seldom_poses(problem, effect)]))
+
+
+def alike_in_seldom_poses(problem: Problem, effect: str) -> list[str]:
+    """What a cause cannot be told from by poses alone, more than Settings.slow_rows apart."""
+    felt = not problem.aboard.isdisjoint((*GYROS, *ACCELEROMETERS))
+    if effect not in LATE or felt or not problem.reads_seldom:
+        return []
+    return sorted((LATE - {effect}) & set(problem.candidates))
 
 
 def mixtures_as_one(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
