@@ -22,6 +22,9 @@ FAST = ("rpm_upper", "rpm_lower", "p", "q", "r", "ax", "ay", "az")
 POSE = {"phi": 1.4e-3, "theta": 1.6e-3, "psi": 8e-4, "pn": 1e-4, "pe": 1e-4, "h": 2e-4}
 """What third differences of the real CoaX flights show: rad and m."""
 
+FLICKERS = (0.03, 0.3, 3.0, 30.0)
+"""s, memories of an error that is equal in each decade."""
+
 TELEMETRY = {
     "p": 0.3, "q": 0.3, "r": 0.1, "ax": 0.5, "ay": 0.5, "az": 0.8,
     "phi": 1e-3, "theta": 1e-3, "psi": 2e-3, "h": 0.005,
@@ -202,29 +205,24 @@ def _logged(
 
 def err(columns: dict[str, np.ndarray], sensors: Sensors, rng: np.random.Generator) -> None:
     """Errors that last, in place, after the noise."""
-    for channel, (std, memory) in sensors.wander.items():
+    lasting = [(channel, *own) for channel, own in sensors.wander.items()]
+    lasting += [(c, std, memory) for c, std in sensors.flicker.items() for memory in FLICKERS]
+    for channel, std, memory in lasting:
         white = rng.standard_normal(len(columns[channel]))
-        white[0] /= math.sqrt(
-            1.0 - math.exp(-2.0 * sensors.step / memory)
-        )  # so before the log began
+        # so before the log began
+        white[0] /= math.sqrt(1.0 - math.exp(-2.0 * sensors.step / memory))
         columns[channel] = columns[channel] + remembered(white, std, memory, sensors.step)
-    for channel, std in sensors.flicker.items():
-        for memory in (0.03, 0.3, 3.0, 30.0):
-            white = rng.standard_normal(len(columns[channel]))
-            white[0] /= math.sqrt(1.0 - math.exp(-2.0 * sensors.step / memory))
-            columns[channel] = columns[channel] + remembered(white, std, memory, sensors.step)
     if sensors.common:
         shared = rng.standard_normal(len(columns["t"]))
         for channel in sensors.common:
             columns[channel] = columns[channel] + math.sqrt(0.5) * sensors.noise[channel] * shared
-    for channel, every in {**sensors.between, **sensors.held}.items():
-        rows = np.arange(len(columns["t"]))
-        read = rows[::every]
-        values = columns[channel][read]
-        if channel == "psi":
-            values = np.unwrap(values)
-        of_row = rows // every if channel in sensors.held else None
-        columns[channel] = np.interp(rows, read, values) if of_row is None else values[of_row]
+    rows = np.arange(len(columns["t"]))
+    for channel, every in sensors.between.items():
+        values = columns[channel][::every]
+        values = np.unwrap(values) if channel == "psi" else values
+        columns[channel] = np.interp(rows, rows[::every], values)
+    for channel, every in sensors.held.items():
+        columns[channel] = columns[channel][rows // every * every]
     for channel, cut_off in sensors.steadied.items():
         b, a = butter(2, cut_off, fs=1.0 / sensors.step)
         values = np.unwrap(columns[channel]) if channel == "psi" else columns[channel]

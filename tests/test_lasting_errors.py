@@ -27,13 +27,13 @@ from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.flight import read_flight
 from coax_env.model import dynamics
 from coax_env.model import state as S
-from coax_env.model.layout import CHANNELS, N_CHANNELS, N_FULL, SENSOR_GROUPS
+from coax_env.model.layout import CHANNELS, ERRING_GROUPS, N_CHANNELS, N_FULL, SENSOR_GROUPS
 
 LAMA = load_vehicle("lama400d")
 PLAIN = HeliModel(LAMA)
 MODEL = ErringModel.like(PLAIN)
-STD = {group: 0.1 * (k + 1) for k, group in enumerate(SENSOR_GROUPS)}
-MEMORY = {group: 0.5 * (k + 1) for k, group in enumerate(SENSOR_GROUPS)}
+STD = {group: 0.1 * (k + 1) for k, group in enumerate(ERRING_GROUPS)}
+MEMORY = {group: 0.5 * (k + 1) for k, group in enumerate(ERRING_GROUPS)}
 NOISE = Noise(
     {error_level(g): s for g, s in STD.items()} | {error_memory(g): m for g, m in MEMORY.items()}
 )
@@ -172,7 +172,7 @@ def test_errors_last_where_that_is_worth_it_and_nothing_stays_coloured(
     seen = {channel: COLOURED if channel == coloured else WHITE for channel in CHANNELS}
     monkeypatch.setattr(sensor_errors, "whiteness", lambda passes, channels: seen)
     monkeypatch.setattr(sensor_errors, "is_white", lambda passes, channels: white_with)
-    monkeypatch.setattr(sensor_errors, "fit_noise", lambda engine, values, noise, *rest: noise)
+    monkeypatch.setattr(sensor_errors, "noise_fitted", lambda problem, fit, evaluations: fit)
     monkeypatch.setattr(sensor_errors, "fitted", gained)
     monkeypatch.setattr(sensor_errors, "converged", gained)
     problem = SimpleNamespace(

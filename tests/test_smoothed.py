@@ -110,7 +110,7 @@ def test_readings_are_seldom_whatever_the_rows_are(every, seldom):
 
 @pytest.mark.slow
 def test_nothing_is_named_where_poses_were_smoothed(tmp_path):
-    """Each taken for news: four to seven false causes, of up to 748 nats. **Synthetic**."""
+    """Each taken for news: three to seven false causes, of up to 748 nats. **Synthetic**."""
     runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "forward_run")
     injector.fly(
         tmp_path, {}, gusts=GUSTY, sensors="pose_steadied", craft=COAX, seed=3, runs=runs,

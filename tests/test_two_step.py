@@ -26,7 +26,6 @@ from coax_env.identification.two_step import method, modes
 from coax_env.identification.two_step import regression as regressions
 from coax_env.identification.two_step.columns import (
     DRAWS,
-    IMU,
     Rows,
     _noise,
     columns_of,
@@ -73,6 +72,7 @@ from coax_env.identification.two_step.regression import (
 )
 from coax_env.logs.flight import Run
 from coax_env.model import dynamics
+from coax_env.model.layout import INERTIAL
 from coax_env.model.vehicle_file import vehicle_toml
 from coax_env.simulation.simulate import Gusts, fly_all
 
@@ -893,7 +893,7 @@ def clean_runs():
 
 
 def columns_of_run(run):
-    dt, t, signals = even_grid(run, (*IMU, "rpm_upper", "rpm_lower"))
+    dt, t, signals = even_grid(run, (*INERTIAL, "rpm_upper", "rpm_lower"))
     return columns_of(signals, run.command[: len(t)], dt, LAMA)
 
 
@@ -1025,13 +1025,13 @@ def test_the_noise_record_is_the_run_that_moves_least(clean_runs):
     hover = simulate(LAMA, "hover", sensors="state").runs[0]
     assert method._noise_record([*clean_runs, hover]) is hover
     still = method._still(hover, 5.0, 2.0)
-    assert set(still) == set(IMU) and {len(v) for v in still.values()} == {202}
+    assert set(still) == set(INERTIAL) and {len(v) for v in still.values()} == {202}
 
 
 def test_the_doublet_ties_what_equation_26_ties():
     """Noise-free, unfiltered, as in design/paper.md: 33, 24, 8, 1.5; and the cost of no p term."""
     (run,) = simulate(LAMA, "lon_doublet", sensors="state").runs
-    dt, t, signals = even_grid(run, IMU)
+    dt, t, signals = even_grid(run, INERTIAL)
     columns = columns_of(signals, run.command[: len(t)], dt, LAMA)
     names = ("alpha_u", "alpha_l", "q", "delta_lon")
     tied = collinearity(np.column_stack([columns[n] for n in names]), names)

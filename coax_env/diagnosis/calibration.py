@@ -19,15 +19,10 @@ from coax_env.estimation.helicopter_noise import GUST_LEVELS, WHITE_LEVELS
 from coax_env.estimation.prediction import gusts_of
 from coax_env.files import write_json
 from coax_env.logs.flight import Flight, Run
+from coax_env.model.layout import SENSOR_GROUPS
 from coax_env.model.vehicle import Vehicle
 
 PATH = Path(__file__).with_name("calibration.json")
-SENSORS = {
-    "gyros": "pqr", "accelerometers": ("ax", "ay", "az"), "attitude": ("phi", "theta"),
-    "heading": ("psi",), "height": ("h",), "velocity": ("vn", "ve", "vd"), "position": ("pn", "pe"),
-    "speed": ("v",), "rotor speeds": ("rpm_upper", "rpm_lower"),
-}  # fmt: skip
-"""Sensor -> its channels."""
 GAP = 0.1  # [s] without any reading that is a gap
 FELT = 3.0
 """Times its floor from which a level of gusts is there; ours."""
@@ -153,7 +148,7 @@ def class_of(flight: Flight, vehicle: Vehicle, fit: Fit) -> dict[str, Any]:
     weight = vehicle["mass"].value * vehicle["gravity"].value
     arm = vehicle["arm_upper"].value
     felt = [name for name in GUST_LEVELS if level[name] > FELT * floor[name]]
-    aboard = [s for s, channels in SENSORS.items() if set(channels) & set(flight.channels)]
+    aboard = [s for s, channels in SENSOR_GROUPS.items() if set(channels) & set(flight.channels)]
     return {
         "sensors": ", ".join(sorted(aboard)),
         "rate_hz": round(1.0 / float(np.median(steps)), 1),

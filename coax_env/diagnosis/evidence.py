@@ -26,9 +26,9 @@ from coax_env.diagnosis.input_innovations import has_command_gains, with_command
 from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, loss, threshold
-from coax_env.estimation.low_pass import ACCELEROMETERS, GYROS
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import is_white, whiteness
+from coax_env.model.layout import ACCELEROMETERS, INERTIAL
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def _unlike_gusts(problem: Problem, fit: Fit) -> bool:
 
 def _feels_gusts(problem: Problem) -> bool:
     """Whether gyros or accelerometers are aboard, and read before a command answers what they feel."""
-    return not problem.has_slow_rows and not problem.aboard.isdisjoint((*GYROS, *ACCELEROMETERS))
+    return not problem.has_slow_rows and not problem.aboard.isdisjoint(INERTIAL)
 
 
 def _is_white(problem: Problem, fit: Fit) -> bool:

@@ -15,14 +15,13 @@ from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.changing_model import BEFORE
 from coax_env.estimation.fitted_vehicle import with_timing
 from coax_env.estimation.helicopter_noise import level_unit
-from coax_env.estimation.low_pass import ACCELEROMETERS, GYROS
 from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.model import effects
-from coax_env.model.layout import CHANNELS
+from coax_env.model.layout import CHANNELS, INERTIAL
 from coax_env.plain_words import plain
 
 
@@ -108,7 +107,7 @@ def confusable_with(problem: Problem, effect: str, alternatives: Iterable[str]) 
 
 def alike_in_seldom_poses(problem: Problem, effect: str) -> list[str]:
     """What a cause cannot be told from by poses alone, more than Settings.slow_rows apart."""
-    felt = not problem.aboard.isdisjoint((*GYROS, *ACCELEROMETERS))
+    felt = not problem.aboard.isdisjoint(INERTIAL)
     if effect not in LATE or felt or not problem.reads_seldom:
         return []
     return sorted((LATE - {effect}) & set(problem.candidates))

@@ -136,19 +136,22 @@ def fitted(
     return replace(fit.at(estimate.values), objective=estimate.objective)
 
 
-def noise_fitted(problem: Problem, fit: Fit, seconds: float | None = None) -> Fit:
+def noise_fitted(
+    problem: Problem, fit: Fit, seconds: float | None = None, evaluations: int | None = None
+) -> Fit:
     """Noise levels fitted from where they stand.
 
     Args:
         problem, fit: where to begin; parameters stay.
         seconds: of flight that are enough; default the settings'.
+        evaluations: of the likelihood at most; default the settings'.
     """
     if isinstance(problem.engine, PartedEngine):
-        return by_parts(problem, fit, lambda p, own: noise_fitted(p, own, seconds))
+        return by_parts(problem, fit, lambda p, own: noise_fitted(p, own, seconds, evaluations))
     chosen = problem.settings
     noise = fit_noise(
         problem.engine, fit.values, fit.noise, fit.levels,
-        evaluations=chosen.noise_evaluations, tolerance=chosen.step_gain,
+        evaluations=evaluations or chosen.noise_evaluations, tolerance=chosen.step_gain,
         seconds=problem.noise_fit_seconds if seconds is None else seconds,
     )  # fmt: skip
     return replace(fit, noise=noise)

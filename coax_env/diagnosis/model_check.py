@@ -27,6 +27,7 @@ from coax_env.estimation import compiled_model
 from coax_env.estimation.prediction import TAIL
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Noise, Record, part
+from coax_env.estimation.whiteness import correlation
 from coax_env.model.layout import ANGLES, CHANNELS
 from coax_env.plain_words import channel_name
 
@@ -292,6 +293,4 @@ def _correlation(passes: Sequence[RunPass], c: int, k: int, lag: float) -> tuple
         e.append(run.innovations[there, c])
         moved.append(earlier[there])
     innovations, changes = np.concatenate(e), np.concatenate(moved)
-    power = float(changes @ changes) * float(innovations @ innovations)
-    correlation = float(innovations @ changes) / math.sqrt(power) if power > 0.0 else 0.0
-    return correlation, innovations.size
+    return correlation(innovations, changes), innovations.size

@@ -21,12 +21,7 @@ from coax_env.diagnosis.scores import lost
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
-
-SENSORS = (
-    ("rpm_upper", "rpm_lower"), ("p", "q", "r"), ("ax", "ay", "az"), ("phi", "theta"), ("psi",), ("h",),
-    ("vn", "ve", "vd"), ("pn", "pe"), ("v",),
-)  # fmt: skip
-"""Channels whose noise has one cause and is varied together."""
+from coax_env.model.layout import SENSOR_GROUPS
 
 
 @dataclass(frozen=True)
@@ -64,7 +59,7 @@ def not_holding(
 def _levels(problem: Problem, fit: Fit) -> Iterable[Level]:
     """Every level of the process noise, and every sensor's noise."""
     yield from (Level((name,), name.replace("_", " ")) for name in fit.noise.process)
-    for sensor in SENSORS:
+    for sensor in SENSOR_GROUPS.values():
         names = tuple(c for c in sensor if c in problem.aboard and c in fit.noise.reading)
         if names:
             yield Level(names, f"the noise of {', '.join(names)}")

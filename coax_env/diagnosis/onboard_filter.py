@@ -17,7 +17,8 @@ import numpy as np
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Record
-from coax_env.model.layout import SENSOR_GROUPS
+from coax_env.estimation.whiteness import correlation
+from coax_env.model.layout import MOTION
 from coax_env.plain_words import and_list, plain, seconds
 
 CARRIED = 0.2
@@ -33,10 +34,6 @@ APART = 1.0
 """s between two readings of such a filter that are taken. From row to row it says what gyros and
 accelerometers say; with all its readings inertias were 15 to 20 % too large on three clean
 **synthetic** flights and six channels coloured, with one in 0.3 s or 1 s neither; ours."""
-OF_FILTER = tuple(
-    c for g in ("attitude", "heading", "height", "velocity", "position") for c in SENSOR_GROUPS[g]
-)
-"""Channels that are taken as seldom as that."""
 
 
 def of_onboard_filter(problem: Problem, fit: Fit) -> bool:
@@ -56,14 +53,11 @@ def _carried(passes: Sequence[RunPass], channels: Sequence[str], rate: str, angl
     """Whether a gyro read too much where the filter foresaw too little of its angle, and back."""
     pairs = [run.innovations[:, [channels.index(rate), channels.index(angle)]] for run in passes]
     both = np.concatenate([pair[np.isfinite(pair).all(axis=1)] for pair in pairs])
-    of_two, one, other = np.mean(
-        [both[:, 0] * both[:, 1], both[:, 0] ** 2, both[:, 1] ** 2], axis=1
-    ) if len(both) else (0.0, 1.0, 1.0)  # fmt: skip
-    return bool(-of_two > CARRIED * np.sqrt(one * other))
+    return correlation(*both.T) < -CARRIED
 
 
 def read_seldom(records: Sequence[Record], channels: Sequence[str]) -> list[Record]:
-    """Records with readings of OF_FILTER that are APART at least.
+    """Records with readings of MOTION that are APART at least.
 
     Args:
         records: as logged. channels: of their columns.
@@ -71,7 +65,7 @@ def read_seldom(records: Sequence[Record], channels: Sequence[str]) -> list[Reco
     found = []
     for record in records:
         z = record.z.copy()
-        for channel in OF_FILTER:
+        for channel in MOTION:
             column, last = z[:, channels.index(channel)], -math.inf
             for row in np.flatnonzero(np.isfinite(column)).tolist():
                 if record.t[row] < last + APART - 1e-6:

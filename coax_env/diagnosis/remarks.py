@@ -20,7 +20,7 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.swinging_gusts import AXES_OF_GUSTS
 from coax_env.model.effects import CATALOGUE
-from coax_env.model.layout import SENSOR_GROUPS
+from coax_env.model.layout import ERRING_GROUPS
 from coax_env.plain_words import and_list, channel_name, plain, with_unit
 
 
@@ -133,7 +133,7 @@ def _swings(problem: Problem) -> list[str]:
 def _lasting_errors(fit: Fit) -> list[str]:
     """Which readings have errors that last, where they have some."""
     levels, said = fit.noise.process, []
-    for group in SENSOR_GROUPS:
+    for group in ERRING_GROUPS:
         name = error_level(group)
         if name in levels and levels[name] > fit.noise.floor[name]:
             unit, memory = level_unit(name), levels[error_memory(group)]

@@ -9,15 +9,13 @@ coloured then, or none is used.
 
 from dataclasses import replace
 
-from coax_env.diagnosis.fits import converged, fitted
+from coax_env.diagnosis.fits import converged, fitted, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import ERROR_LEVELS, ERROR_MEMORIES
 from coax_env.estimation.lasting_errors import ErringModel, with_errors
-from coax_env.estimation.low_pass import ACCELEROMETERS, GYROS
-from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import is_white, whiteness
-from coax_env.model.layout import SENSOR_GROUPS
+from coax_env.model.layout import ACCELEROMETERS, GYROS, SENSOR_GROUPS
 from coax_env.plain_words import and_list
 
 FELT_BY = {"attitude": GYROS, "heading": GYROS} | dict.fromkeys(
@@ -65,10 +63,5 @@ def _erring(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     begun = with_errors(fit.noise)
     own = [name for name in LEVELS_OF_ERRORS if name in begun.process]
     trial = replace(fit, noise=begun, levels=(*own, *fit.levels))
-    first = fit_noise(
-        wider.engine, trial.values, trial.noise, trial.levels,
-        problem.settings.first_noise_evaluations, problem.settings.step_gain,
-        problem.noise_fit_seconds,
-    )  # fmt: skip
-    trial = replace(trial, noise=first)
+    trial = noise_fitted(wider, trial, evaluations=wider.settings.first_noise_evaluations)
     return wider, converged(wider, fitted(wider, trial))

@@ -19,8 +19,6 @@ from coax_env.diagnosis.fits import fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.low_pass import (
-    ACCELEROMETERS,
-    GYROS,
     NONE,
     LowPass,
     before_low_pass,
@@ -29,6 +27,7 @@ from coax_env.estimation.low_pass import (
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Noise
+from coax_env.model.layout import ACCELEROMETERS, GYROS
 from coax_env.plain_words import and_list, channel_name, plain
 
 GROUPS = (GYROS, ACCELEROMETERS)

@@ -28,6 +28,7 @@ from coax_env.model.layout import (
     ANGLES,
     ATTITUDE,
     CHANNEL_UNITS,
+    ERRING_GROUPS,
     FLYBAR,
     GUSTS,
     LOWER_FLAP,
@@ -74,8 +75,8 @@ def error_memory(group: str) -> str:
     return f"memory_error_{group}"
 
 
-ERROR_LEVELS = tuple(error_level(group) for group in SENSOR_GROUPS)
-ERROR_MEMORIES = tuple(error_memory(group) for group in SENSOR_GROUPS)
+ERROR_LEVELS = tuple(error_level(group) for group in ERRING_GROUPS)
+ERROR_MEMORIES = tuple(error_memory(group) for group in ERRING_GROUPS)
 
 _FORCE, _MOMENT = ("force_xy", "force_z"), ("moment_xy", "moment_z")
 LEVEL_UNITS = {
@@ -89,7 +90,7 @@ LEVEL_UNITS = {
     JITTER_MEMORY: "s",
     "trim_force_z": "N/s^1/2",
     "trim_moment_z": "N m/s^1/2",
-    **{error_level(group): CHANNEL_UNITS[own[0]] for group, own in SENSOR_GROUPS.items()},
+    **{error_level(group): CHANNEL_UNITS[SENSOR_GROUPS[group][0]] for group in ERRING_GROUPS},
     **dict.fromkeys(ERROR_MEMORIES, "s"),
 }
 """Unit of each level of the process noise."""

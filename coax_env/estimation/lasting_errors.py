@@ -31,18 +31,25 @@ from coax_env.estimation.helicopter_noise import error_level, error_memory
 from coax_env.estimation.state_space import Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled
 from coax_env.model import dynamics
-from coax_env.model.layout import ANGLES, CHANNELS, N_CHANNELS, N_FULL, SENSOR_GROUPS
+from coax_env.model.layout import (
+    ANGLES,
+    CHANNELS,
+    ERRING_GROUPS,
+    MOTION_GROUPS,
+    N_CHANNELS,
+    N_FULL,
+    SENSOR_GROUPS,
+)
 
-ERRING = tuple(channel for channels in SENSOR_GROUPS.values() for channel in channels)
+GROUP_OF = {channel: group for group in ERRING_GROUPS for channel in SENSOR_GROUPS[group]}
+ERRING = tuple(GROUP_OF)
 """Channels whose errors may last, in the order of their states."""
-GROUP_OF = {channel: group for group, channels in SENSOR_GROUPS.items() for channel in channels}
 ERRORS = slice(N_FULL, N_FULL + len(ERRING))
 """Errors of the channels ERRING, in their units."""
 N_ERRING = ERRORS.stop
-INERTIAL = ("gyros", "accelerometers")
-"""Groups whose errors drift, small and slowly, beside those that a filter or GNSS makes."""
 MEMORY_START, MEMORY_OF_INERTIAL, MEMORY_SPREAD = 2.0, 10.0, 1.5
-"""Median [s] of an error's memory, of an inertial sensor's, and std of its logarithm; ours."""
+"""Median [s] of an error's memory, of an inertial sensor's, which drifts, and std of its logarithm;
+ours."""
 MEMORY_BOUNDS = (0.03, 60.0)
 """[s]: below, it is white at 100 Hz; above, a bias."""
 START, START_OF_INERTIAL = 1.0, 0.3
@@ -145,13 +152,13 @@ def with_errors(noise: Noise) -> Noise:
     """Noise levels with those of lasting errors of the channels that it has, where their fit begins."""
     process, prior = dict(noise.process), dict(noise.prior)
     floor, ceiling = dict(noise.floor), dict(noise.ceiling)
-    for group, channels in SENSOR_GROUPS.items():
-        read = [channel for channel in channels if channel in noise.reading]
+    for group in ERRING_GROUPS:
+        read = [channel for channel in SENSOR_GROUPS[group] if channel in noise.reading]
         if not read:
             continue
         std = float(np.mean([noise.reading[channel] for channel in read]))
         level, memory = error_level(group), error_memory(group)
-        inertial = group in INERTIAL
+        inertial = group not in MOTION_GROUPS
         lasts = MEMORY_OF_INERTIAL if inertial else MEMORY_START
         process |= {level: (START_OF_INERTIAL if inertial else START) * std, memory: lasts}
         floor |= {level: SMALLEST * std, memory: MEMORY_BOUNDS[0]}

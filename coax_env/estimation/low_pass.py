@@ -18,7 +18,6 @@ import numpy as np
 
 from coax_env.estimation.state_space import Record
 
-GYROS, ACCELEROMETERS = ("p", "q", "r"), ("ax", "ay", "az")
 """Channels that share one low-pass."""
 
 

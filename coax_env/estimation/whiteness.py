@@ -6,6 +6,7 @@ matter to nobody, so a channel counts as coloured only where the correlation is 
 noise that was assumed.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -77,6 +78,12 @@ def _judge(parts: Sequence[tuple[str, np.ndarray]]) -> Whiteness:
             worst = judged
     assert worst is not None
     return worst
+
+
+def correlation(one: np.ndarray, other: np.ndarray) -> float:
+    """Of two series (n,) about 0, as innovations are; 0 where one is 0 throughout."""
+    power = float(one @ one) * float(other @ other)
+    return float(one @ other) / math.sqrt(power) if power > 0.0 else 0.0
 
 
 def is_white(passes: Sequence[RunPass], channels: Sequence[str]) -> bool:

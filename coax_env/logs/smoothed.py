@@ -2,12 +2,14 @@
 
 Behind a low-pass a reading is much what the one before it was, noise included, and an estimator that
 takes each for news believes them many times over: on clean **synthetic** flights whose poses came
-through a low-pass of 10 Hz, forwards and back, four to seven false causes of up to 748 nats each. Its
+through a low-pass of 10 Hz, forwards and back, three to seven false causes of up to 748 nats each. Its
 noise has no more power above the cut-off, and falls there by a power of the frequency, where that of a
 sensor is flat. Readings so far apart that their noise is flat again say all that there is.
 
 A log without noise is steep at any distance, and stays as it is; so does a log on an uneven clock. A
-channel that is steep at any distance beside some that are not is read as often as these.
+channel that is steep at any distance beside some that are not is read as often as these. Gyros and
+accelerometers are not asked: their low-passes are found with the model, which feels their delay
+(diagnosis/sensor_low_pass.py).
 """
 
 from collections import Counter
@@ -19,16 +21,9 @@ from scipy.signal import welch
 
 from coax_env.logs.packets import stretches
 from coax_env.logs.repairs import Repaired
-from coax_env.model.layout import ANGLES, CHANNELS, SENSOR_GROUPS
+from coax_env.model.layout import ANGLES, MOTION
 from coax_env.plain_words import and_list
 
-ASKED = tuple(
-    c
-    for c in CHANNELS
-    if any(c in SENSOR_GROUPS[g] for g in ("attitude", "heading", "height", "velocity", "position"))
-)
-"""Channels that software smooths; the low-passes of gyros and accelerometers are found with the model
-(diagnosis/sensor_low_pass.py), which feels their delay."""
 PIECE = 64
 """Readings of which a spectrum is taken; ours."""
 PIECES = 4
@@ -56,7 +51,7 @@ def read_apart(
         counts: what was repaired -> how often; what is left out is added.
         holds: channel -> what the card says; one that never holds stays as it is.
     """
-    pieces = {c: _even_pieces(runs, c) for c in ASKED if holds.get(c) is not False}
+    pieces = {c: _even_pieces(runs, c) for c in MOTION if holds.get(c) is not False}
     steep = {c: max(steepness(own, k) for k in (1, 2)) for c, (own, _) in pieces.items()}
     rows = max((_apart(*pieces[c]) for c, times in steep.items() if times > STEEP), default=1)
     if rows == 1:
@@ -65,13 +60,12 @@ def read_apart(
     found, left_out = [], 0
     for run in runs:
         measured = dict(run.measured)
-        for channel in smooth:
-            values = measured.get(channel, np.empty(0)).copy()
+        for channel in measured.keys() & set(smooth):
+            values = measured[channel].copy()
             gone = np.delete(np.flatnonzero(np.isfinite(values)), np.s_[::rows])
             values[gone] = np.nan
             left_out += gone.size
-            if values.size:
-                measured[channel] = values
+            measured[channel] = values
         found.append(replace(run, measured=measured))
     counts[f"smoothed readings left out, all but one in {rows} of {and_list(smooth)}"] += left_out
     return found

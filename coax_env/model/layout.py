@@ -75,11 +75,18 @@ CHANNELS = tuple(CHANNEL_UNITS)
 N_CHANNELS = len(CHANNELS)
 ANGLES = ("phi", "theta", "psi")
 """Channels whose innovations wrap."""
+GYROS, ACCELEROMETERS = ("p", "q", "r"), ("ax", "ay", "az")
+INERTIAL = (*GYROS, *ACCELEROMETERS)
 SENSOR_GROUPS = {
+    "rotor speeds": ("rpm_upper", "rpm_lower"), "gyros": GYROS, "accelerometers": ACCELEROMETERS,
     "attitude": ("phi", "theta"), "heading": ("psi",), "height": ("h",),
-    "velocity": ("vn", "ve", "vd"), "position": ("pn", "pe"), "gyros": ("p", "q", "r"),
-    "accelerometers": ("ax", "ay", "az"),
+    "velocity": ("vn", "ve", "vd"), "position": ("pn", "pe"), "speed": ("v",),
 }  # fmt: skip
-"""Channels of one kind of sensor, whose readings may have errors that last (lasting_errors.py)."""
+"""Sensor -> its channels: their noise has one cause."""
+MOTION_GROUPS = ("attitude", "heading", "height", "velocity", "position")
+"""Sensors that say how the machine moves, as inertial ones feel it."""
+MOTION = tuple(channel for group in MOTION_GROUPS for channel in SENSOR_GROUPS[group])
+ERRING_GROUPS = (*MOTION_GROUPS, "gyros", "accelerometers")
+"""Sensors whose readings may have errors that last (lasting_errors.py)."""
 
 RPM_PER_RAD_S = 60.0 / (2.0 * 3.141592653589793)

@@ -19,13 +19,13 @@ from coax_env.identification.two_step.processing import even_grid, lagrange_deri
 from coax_env.identification.two_step.reconstruction import flapping
 from coax_env.logs.flight import Run
 from coax_env.model import inputs as U
+from coax_env.model.layout import INERTIAL
 from coax_env.model.vehicle import Vehicle
 
 EDGE = 0.5
 """Seconds at either end of a run that are left out: the filter's and the flap angles' transients."""
 DRAWS = 60
 """Of the sensors' noise, per run."""
-IMU = ("p", "q", "r", "ax", "ay", "az")
 Columns = dict[str, np.ndarray]
 EXACT = ("1", "delta_lon", "delta_lat")
 """Columns without error: the intercept and the swash commands."""
@@ -54,7 +54,7 @@ def rows_of(
         noise: std of each channel. cutoff: of the low-pass [Hz]. seed: of the draws of the noise.
     """
     rng = np.random.default_rng(seed)
-    dt, t, signals = even_grid(run, (*IMU, "rpm_upper", "rpm_lower"))
+    dt, t, signals = even_grid(run, (*INERTIAL, "rpm_upper", "rpm_lower"))
     held = np.searchsorted(run.t, t + 1e-9, side="right") - 1
     command = run.command[held]
     edge = round(EDGE / dt)

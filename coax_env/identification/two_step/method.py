@@ -20,7 +20,7 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.estimation.helicopter_noise import sensor_std
-from coax_env.identification.two_step.columns import IMU, joined, rows_of
+from coax_env.identification.two_step.columns import joined, rows_of
 from coax_env.identification.two_step.modes import (
     LEAST_MOVEMENT,
     MODES,
@@ -42,6 +42,7 @@ from coax_env.identification.two_step.processing import (
 from coax_env.identification.two_step.reconstruction import Longitudinal, longitudinal
 from coax_env.identification.two_step.regression import Regression
 from coax_env.logs.flight import Flight, Run
+from coax_env.model.layout import INERTIAL
 from coax_env.model.sensors import suite
 from coax_env.model.vehicle import Parameter, Vehicle
 from coax_env.progress import Progress
@@ -112,7 +113,7 @@ def two_step(
         InputError: no run has gyros, accelerometers and a height.
     """
     report_progress = progress or (lambda text: None)
-    usable = [run for run in flight.runs if all(c in run.measured for c in IMU)]
+    usable = [run for run in flight.runs if all(c in run.measured for c in INERTIAL)]
     if not usable:
         raise InputError(
             "the paper's method needs gyros and accelerometers (p q r ax ay az); this flight has "
@@ -120,7 +121,7 @@ def two_step(
         )
     noise = {
         c: flight.noise.get(c) or _noise_of(flight, c)
-        for c in (*IMU, "h", "rpm_upper", "rpm_lower")
+        for c in (*INERTIAL, "h", "rpm_upper", "rpm_lower")
         if c in flight.channels
     }
     remarks = []
@@ -181,7 +182,7 @@ def _noise_record(runs: Sequence[Run]) -> Run:
 
 def _still(run: Run, cutoff: float, seconds: float = math.inf) -> dict[str, np.ndarray]:
     """The IMU of a run's first so many seconds, low-passed: what it reads while nothing is flown."""
-    dt, t, raw = even_grid(run, IMU)
+    dt, t, raw = even_grid(run, INERTIAL)
     kept = t - t[0] <= seconds + dt
     return {c: low_pass(values[kept], dt, cutoff) for c, values in raw.items()}
 
@@ -208,10 +209,10 @@ def _reconstruct(
     noise: Mapping[str, float],
     cutoff: float,
 ) -> Reconstructed:
-    dt, t, raw = even_grid(run, (*IMU, "h", "theta"))
+    dt, t, raw = even_grid(run, (*INERTIAL, "h", "theta"))
     smooth = {c: low_pass(values, dt, cutoff) for c, values in raw.items()}
     spectral = {}
-    for c in IMU:
+    for c in INERTIAL:
         try:
             spectral[c] = spectral_amplitude_filter(smooth[c], still[c], dt)
         except InputError:  # no noise record of a segment's length
