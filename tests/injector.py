@@ -44,6 +44,7 @@ from injector_craft import (
     yaw_authority,
 )
 from injector_sensors import (
+    MIXED,
     SENSORS,
     Sensors,
     blunt,
@@ -51,6 +52,7 @@ from injector_sensors import (
     clock,
     csv_text,
     err,
+    kit,
     smoothed,
     thin,
 )
@@ -879,7 +881,7 @@ def fly(
     Args:
         effects: name -> parameters; ``{}`` takes the usual size, a number sets the first one.
         gusts: True: force (0.2 N) and moment (6 mN m) with a memory of 0.5 s; or any air.
-        sensors: a key of ``SENSORS``.
+        sensors: a key of ``SENSORS``; ``MIXED`` is drawn from the seed.
         runs: names in ``MANEUVERS``; all where None.
         craft: what flies. known_as: what its vehicle file says; the same where None. One that is
             not shipped gets a file beside the card.
@@ -897,7 +899,7 @@ def fly(
     hidden = Hidden(**{EFFECTS[e][p][0]: value for (e, p), value in values.items()})
     values |= chosen_values(later or {})
     at_last = Hidden(**{EFFECTS[e][p][0]: value for (e, p), value in values.items()})
-    kit = SENSORS[sensors]
+    aboard = kit(sensors, seed)
     names = list(MANEUVERS) if runs is None else list(runs)
     for i, name in enumerate(names):
         rng = np.random.default_rng([seed, list(MANEUVERS).index(name)])
@@ -907,18 +909,18 @@ def fly(
             flown = names[names.index(since[0]) : i]
             begins = since[1] - sum(min(MANEUVERS[run], longest) for run in flown)
         course = Course(hidden, at_last, begins, growing)
-        columns = _fly_run(name, length, course, air, kit, craft, PILOTS[pilot], rng)
-        columns = _read_along(columns, kit, course, rng)
+        columns = _fly_run(name, length, course, air, aboard, craft, PILOTS[pilot], rng)
+        columns = _read_along(columns, aboard, course, rng)
         columns = thin(
-            columns, kit, rng, lost_echoes=lost_echoes, radio_gaps=radio_gaps, first=i == 0
+            columns, aboard, rng, lost_echoes=lost_echoes, radio_gaps=radio_gaps, first=i == 0
         )
-        (folder / f"{name}.csv").write_text(csv_text(columns, kit))
+        (folder / f"{name}.csv").write_text(csv_text(columns, aboard))
     known_as = known_as or craft
     vehicle = SHIPPED.get(known_as)
     if vehicle is None:
         write_vehicle(known_as, folder / "vehicle.toml")
         vehicle = str(folder.resolve() / "vehicle.toml")
-    said = {} if card_noise is None else {c: card_noise * std for c, std in kit.noise.items()}
+    said = {} if card_noise is None else {c: card_noise * std for c, std in aboard.noise.items()}
     card = card_text(names, vehicle, (known_as.density, known_as.gravity), said)
     (folder / "card.toml").write_text(card)
     full = {f"{effect}.{parameter}": value for (effect, parameter), value in values.items()}
@@ -1179,7 +1181,7 @@ def _main() -> None:
     parser.add_argument("--gusts", action="store_true")
     parser.add_argument("--air", choices=GUSTS, help="other gusts than --gusts flies in")
     parser.add_argument("--memory", type=float, default=0.5, help="s, of the gusts")
-    parser.add_argument("--sensors", choices=SENSORS, default="full")
+    parser.add_argument("--sensors", choices=[*SENSORS, MIXED], default="full")
     parser.add_argument("--craft", choices=CRAFTS, default="lama")
     parser.add_argument("--pilot", choices=PILOTS, default="usual")
     parser.add_argument("--card-noise", type=float, default=1.0, help="factor; 0: not on the card")

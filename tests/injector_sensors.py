@@ -141,6 +141,72 @@ SENSORS = {
 }  # fmt: skip
 
 
+MIXED = "mixed"
+"""Name of sensors that are drawn: each channel of `NOISE`, with several of the faults above at once."""
+INERTIAL = ("p", "q", "r", "ax", "ay", "az")
+GROUPS = (
+    ("rpm_upper", "rpm_lower"), ("p", "q", "r"), ("ax", "ay", "az"), ("phi", "theta", "psi"), ("h",),
+    ("vn", "ve", "vd"),
+)  # fmt: skip
+"""Channels of one sensor."""
+
+
+def kit(name: str, seed: int) -> Sensors:
+    """A set of sensors by its name; `MIXED` is drawn from the seed."""
+    return mixed(np.random.default_rng([seed, 1])) if name == MIXED else SENSORS[name]
+
+
+def mixed(rng: np.random.Generator) -> Sensors:
+    """Sensors as real ones are: the faults above by chance, three at once in the mean.
+
+    Noise between a third and three times `NOISE`, each sensor its own; slower sensors at 10 to 50 Hz in
+    three of five; errors that last 0.5 to 20 s, up to twice the noise.
+    """
+
+    def some(share: float) -> list[tuple[str, ...]]:
+        return [group for group in GROUPS[1:] if rng.random() < share]
+
+    def between(low: float, high: float) -> float:
+        return math.exp(rng.uniform(math.log(low), math.log(high)))
+
+    noise = dict(NOISE)
+    for group in GROUPS:
+        factor = between(1.0 / 3.0, 3.0)
+        noise |= {channel: factor * noise[channel] for channel in group}
+    slow = dict.fromkeys(("phi", "theta", "psi"), 2) | dict.fromkeys(("vn", "ve", "vd"), 10)
+    slow["h"] = int(rng.integers(2, 6))
+    put = rng.choice(["each row", "every", "held", "between"], p=[0.4, 0.4, 0.1, 0.1])
+    drawn = Sensors(noise, **({} if put == "each row" else {str(put): slow}))
+    if rng.random() < 0.4:
+        lasting = {}
+        for group in some(0.5):
+            share, memory = between(0.2, 2.0), between(0.5, 20.0)
+            lasting |= {channel: (share * noise[channel], memory) for channel in group}
+        drawn = drawn._replace(wander=lasting)
+    if rng.random() < 0.15:
+        flickering = sum(some(0.5), ())
+        drawn = drawn._replace(flicker={c: between(0.1, 0.5) * noise[c] for c in flickering})
+    if rng.random() < 0.4:
+        cut_off = between(12.0, 80.0)
+        order = int(rng.integers(1, 3))
+        channels = INERTIAL if rng.random() < 0.7 else INERTIAL[:3]
+        drawn = drawn._replace(smooth=dict.fromkeys(channels, (cut_off, order)))
+    if rng.random() < 0.15:
+        drawn = drawn._replace(common=(*INERTIAL, "phi", "theta", "psi"))
+    if rng.random() < 0.15 and not drawn.wander:
+        drawn = drawn._replace(fused=between(0.5, 3.0))
+    if rng.random() < 0.2:
+        drawn = drawn._replace(stamps=rng.uniform(0.0005, 0.003))
+    if rng.random() < 0.25:
+        drawn = drawn._replace(outliers=rng.uniform(0.001, 0.005))
+    if rng.random() < 0.3:
+        stepped = sum(some(0.5), ())
+        drawn = drawn._replace(quanta={c: rng.uniform(0.5, 2.0) * noise[c] for c in stepped})
+    if rng.random() < 0.25:
+        drawn = drawn._replace(lost=rng.uniform(0.002, 0.02))
+    return drawn._replace(formats={"t": "%.5f"} if drawn.stamps else {})
+
+
 # --- when ---------------------------------------------------------------------------------------------
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from injector_air import DISTURBANCES, GUSTS, Air, disturbances
 from injector_craft import COAX, LAMA, Craft, draw, rotors_of, spread, write_vehicle
-from injector_sensors import NOISE, POSE, SENSORS
+from injector_sensors import MIXED, NOISE, POSE, SENSORS, kit
 from shared_flights import shared_flight
 
 import coax_env
@@ -428,6 +428,24 @@ def test_telemetry_is_slow_and_has_gaps(tmp_path: Path) -> None:
     seen = height[~np.isnan(height)]
     np.testing.assert_allclose(seen, np.round(seen, 2), atol=1e-9)
     assert 0.3 < len(seen) / len(height) < 0.7
+
+
+def test_mixed_sensors_have_several_faults_of_every_kind() -> None:
+    drawn = [kit(MIXED, seed) for seed in range(200)]
+    assert kit(MIXED, 7) == kit(MIXED, 7) != kit(MIXED, 8)
+    plain = SENSORS["full"]._replace(every={}, formats={})._asdict()
+    faults = [
+        {fault for fault, x in of_one._asdict().items() if x != plain[fault]} for of_one in drawn
+    ]
+    faults = [of_one - {"noise", "formats"} for of_one in faults]
+    assert set().union(*faults) == {
+        "every", "held", "between", "wander", "flicker", "smooth", "common", "fused", "stamps",
+        "outliers", "quanta", "lost",
+    }  # fmt: skip
+    assert 2.0 < np.mean([len(of_one) for of_one in faults]) < 4.0
+    for of_one in drawn:
+        assert of_one.noise.keys() == NOISE.keys()
+        assert all(1.0 / 3.0 <= std / NOISE[c] <= 3.0 for c, std in of_one.noise.items())
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])

@@ -19,7 +19,7 @@ import pytest
 import study_diagnosis
 from injector_air import GUSTS, GUSTY, Air
 from injector_craft import COAX, LAMA, draw
-from injector_sensors import SENSORS
+from injector_sensors import kit
 from study import (
     arm_table,
     arms,
@@ -467,7 +467,7 @@ def test_every_arm_hides_every_effect_that_its_sensors_can_see() -> None:
         if not arm.listed:
             assert {e for f in flights for e in f.effects} == set(plan.FOREIGN)
             continue
-        channels = set.intersection(*(set(SENSORS[s].noise) for s in arm.sensors))
+        channels = set.intersection(*(set(kit(s, 0).noise) for s in arm.sensors))
         blind = {e for e in plan.ALONE if e not in hidden}
         assert ("gyro_bias" in blind) == ("p" not in channels)
         assert ("accel_bias" in blind) == ("ax" not in channels)

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from injector_air import GUSTY, STILL, Air
-from injector_sensors import SENSORS
+from injector import PILOTS
+from injector_air import GUSTS, GUSTY, STILL, Air
+from injector_sensors import MIXED, kit
 
 from study.plan import ALONE, FOREIGN, RICH, PlannedFlight, several, sizes_of
 
@@ -28,6 +29,7 @@ class Arm:
     words: what it is. air: its gusts; memory: s, bounds of log-uniform memories of forces and of
     moments. sensors, pilots, craft: the generator's. card: factors on the card's noise; None: none.
     size: factor on the effects' usual sizes. listed: whether the effects are in the catalogue.
+    mixed: whether air and vehicle are drawn from those of all arms.
     """
 
     words: str
@@ -39,6 +41,7 @@ class Arm:
     pilots: tuple[str, ...] = ("usual",)
     size: float = 1.0
     listed: bool = True
+    mixed: bool = False
 
 
 ARMS = {
@@ -101,6 +104,10 @@ ARMS = {
     ),
     "by_radio": Arm("a radio that loses 3 % of the commands", pilots=("by_radio",)),
     "by_steps": Arm("commands that arrive in steps of 4 mrad and 0.4 %", pilots=("by_steps",)),
+    "mixed": Arm(
+        "air, sensors, pilot, card and vehicle of all other arms at once, each drawn",
+        sensors=(MIXED,), card=(1.0, 0.5, 2.0, None), pilots=tuple(PILOTS), mixed=True,
+    ),
     "foreign_forms": Arm("effects in no list and of no generic term's form", listed=False),
 }  # fmt: skip
 
@@ -160,6 +167,9 @@ def planned(name: str, kind: str, number: int, seed: int) -> PlannedFlight:
         low, high = (float(np.log(bound)) for bound in arm.memory)
         force, moment = np.exp(rng.uniform(low, high, 2)).tolist()
         air = air._replace(memory=(force, moment))
+    craft = arm.craft
+    if arm.mixed:
+        air, craft = _mixed(rng)
     if air.gusts == "shedding":
         swings = np.exp(rng.uniform(np.log(0.3), np.log(1.5), 6)).tolist()
         air = air._replace(frequency=tuple(swings))
@@ -173,11 +183,31 @@ def planned(name: str, kind: str, number: int, seed: int) -> PlannedFlight:
         runs=RICH,
         arm=name,
         air=air._asdict(),
-        craft=arm.craft,
+        craft=craft,
         pilot=_turn(arm.pilots, number // len(arm.sensors)),
         card_noise=_turn(arm.card, number // len(arm.sensors)),
         longest=LONGEST,
     )
+
+
+def _mixed(rng: np.random.Generator) -> tuple[Air, str]:
+    """Air of any kind, from a third to one and a half times as strong as usual, beside drifting trims
+    and jittering rotors in two of five each; and a vehicle."""
+    memory = np.exp(rng.uniform(np.log(0.05), np.log(4.0), 2)).tolist()
+    strength = float(np.exp(rng.uniform(np.log(0.3), np.log(1.5))))
+    air = Air(
+        str(rng.choice(list(GUSTS))),
+        *(strength * level for level in (GUSTY.force, GUSTY.moment_xy, GUSTY.moment_z)),
+        memory=(memory[0], memory[1]),
+        wind=float(rng.uniform(1.5, 5.0)),
+    )
+    if rng.random() < 0.4:
+        air = air._replace(
+            trim_thrust=float(rng.uniform(0.0, 0.002)), trim_torque=float(rng.uniform(0.0, 0.003))
+        )
+    if rng.random() < 0.4:
+        air = air._replace(jitter=float(rng.uniform(0.0, 0.5)))
+    return air, str(rng.choice(["lama", "lama", "spread", "drawn"]))
 
 
 def _turn(options: Sequence[T], number: int) -> T:
@@ -186,7 +216,7 @@ def _turn(options: Sequence[T], number: int) -> T:
 
 def _unseen(sensors: str) -> set[str]:
     """Effects of sensors that are not on board."""
-    channels = SENSORS[sensors].noise
+    channels = kit(sensors, 0).noise
     blind = {effect for effect, channel in SENSED.items() if channel not in channels}
     return blind | (ECHO if "pn" in channels else set())
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from injector_air import Air, disturbances
 from injector_craft import Craft
-from injector_sensors import SENSORS
+from injector_sensors import kit
 
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.shocks import in_shocks, with_shocks
@@ -111,7 +111,7 @@ def true_noise(
         planned: how it was flown. flight: its log. vehicle: its file's.
         values: of the hidden effects: gusts shake what is heavier than the file says less.
     """
-    own = SENSORS[planned.sensors].noise
+    own = kit(planned.sensors, planned.seed).noise
     noise = still_air(starting_noise(replace(flight, noise=dict(own)), vehicle))
     if not planned.gusts:
         return noise
