@@ -263,6 +263,36 @@ def test_any_slower_sensor_written_on_every_row_is_held(rate):
     assert np.mean(found == again) > 0.99
 
 
+@pytest.mark.parametrize("every", [2, 5, 10])
+@pytest.mark.parametrize("step", [0.02, 0.1])
+def test_a_slow_coarse_sensor_has_readings_when_it_may_change(every, step):
+    """Most of its next readings are the last one again; a burst of rows is missing."""
+    rng = np.random.default_rng(8)
+    t = np.arange(0.0, 20.0, 0.01)
+    readings = step * np.round(
+        (0.2 * np.sin(t[::every]) + rng.normal(0.0, 0.03, t[::every].size)) / step
+    )
+    y = np.repeat(readings, every)[: t.size]
+    kept = np.ones(t.size, bool)
+    kept[[500, 501, 502, 1203]] = False
+    new = np.arange(t.size) % every == 0
+    found = repeats(y[kept], None, t[kept])
+    assert np.mean(found == ~new[kept]) > 0.995
+    coarse = step * np.round((0.2 * np.sin(t) + rng.normal(0.0, 0.03, t.size)) / step)
+    assert not repeats(coarse, None, t).any()
+
+
+def test_a_line_between_readings_on_a_clock_that_was_logged_wrong_is_none():
+    rng = np.random.default_rng(9)
+    t = np.arange(0.0, 20.0, 0.01)
+    readings = np.sin(0.7 * t[::5]) + rng.normal(0.0, 0.02, t[::5].size)
+    y = np.round(np.interp(t, t[::5], readings), 4)
+    new = np.zeros(t.size, bool)
+    new[::5] = True
+    logged = t + rng.uniform(-0.003, 0.003, t.size)
+    assert np.mean(interpolated(logged, y)[:-5] == ~new[:-5]) > 0.97
+
+
 @pytest.mark.parametrize("rounded", [None, 4])
 @pytest.mark.parametrize("every", [2, 5, 10])
 def test_a_line_between_readings_is_no_reading(every, rounded):
@@ -275,6 +305,21 @@ def test_a_line_between_readings_is_no_reading(every, rounded):
     new = np.zeros(t.size, bool)
     new[::every] = True
     assert np.mean(found[:-every] == ~new[:-every]) > 0.97
+
+
+@pytest.mark.parametrize(("unit", "digits"), [(1.0, 4), (np.pi / 180.0, 2)])
+def test_a_line_between_headings_is_no_reading_where_they_turn_through_north(unit, digits):
+    """Rounded in rad or in deg, before the log's reader made rad of it."""
+    rng = np.random.default_rng(9)
+    t = np.arange(0.0, 20.0, 0.01)
+    readings = 0.9 * t[::5] + rng.normal(0.0, 0.02, t[::5].size)
+    logged = (
+        np.round((np.interp(t, t[::5], readings) + np.pi) % (2.0 * np.pi) / unit, digits) * unit
+    )
+    new = np.zeros(t.size, bool)
+    new[::5] = True
+    assert np.ptp(logged) > 6.0
+    assert np.mean(interpolated(t, logged, angle=True)[:-5] == ~new[:-5]) > 0.97
 
 
 @pytest.mark.parametrize("curve", [CubicSpline, PchipInterpolator, Akima1DInterpolator])

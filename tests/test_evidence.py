@@ -6,9 +6,9 @@ what its noise levels have not converged by.
 Two clean flights of the study had names that stood by one of the two likelihoods alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,11 @@ class Flights:
         return replace(fit, active=fit.rest(effect))
 
     def pruned(
-        self, monkeypatch: pytest.MonkeyPatch, noise: Noise, row: float = 0.01, unlike: bool = False
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        noise: Noise,
+        row: float = 0.01,
+        unseen: Mapping[str, bool] = MappingProxyType({}),
     ) -> tuple[Fit, dict[str, evidence.Evidence]]:
         def loss(problem, quadratic, active, effect, inflation):
             return self.worth[effect] / inflation
@@ -72,20 +76,24 @@ class Flights:
         engine = SimpleNamespace(
             threads=1, records=[SimpleNamespace(t=row * np.arange(9), z=np.zeros((9, 1)))]
         )
-        problem = Problem(model, engine, (), own, unlike_gusts=unlike)  # type: ignore[arg-type]
+        problem = Problem(model, engine, (), own, **unseen)  # type: ignore[arg-type]
         fit, _, found = prune(problem, Fit(tuple(self.worth), {}, noise))
         return fit, found
 
 
-@pytest.mark.parametrize(("row", "unlike"), [(0.01, False), (0.04, False), (0.01, True)])
+@pytest.mark.parametrize(
+    ("row", "seen"),
+    [(0.01, {}), (0.04, {}), (0.01, {"unlike_gusts": True}), (0.01, {"smoothed": True})],
+)
 def test_a_weak_or_late_answer_to_what_the_filter_does_not_see_must_be_worth_more(
-    monkeypatch, row, unlike
+    monkeypatch, row, seen
 ):
-    """Three times: a pilot who answers gusts between slow rows, or foresees them, makes it so."""
+    """Three times: a pilot who answers gusts between slow rows, or foresees them, makes it so, and
+    what is left of a sensor's low-pass."""
     worth = {"motor_droop": 2.9, "gyro_bias": 2.9, "rate_damping": 3.1}
     flights = Flights({effect: times * THRESHOLD for effect, times in worth.items()})
-    fit, found = flights.pruned(monkeypatch, GOOD, row, unlike)
-    unseen = unlike or row > 0.02
+    fit, found = flights.pruned(monkeypatch, GOOD, row, seen)
+    unseen = seen or row > 0.02
     stay = {"gyro_bias", "rate_damping"} | (set() if unseen else {"motor_droop"})
     assert set(fit.active) == set(found) == stay
     assert found["gyro_bias"].nats == pytest.approx(2.9 * THRESHOLD)

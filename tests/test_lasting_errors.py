@@ -24,10 +24,17 @@ from coax_env.estimation.helicopter_noise import error_level, error_memory, star
 from coax_env.estimation.lasting_errors import ERRING, ERRORS, N_ERRING, ErringModel, with_errors
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.state_space import Noise, Record
-from coax_env.logs.flight import read_flight
+from coax_env.logs.flight import Run, read_flight
 from coax_env.model import dynamics
 from coax_env.model import state as S
-from coax_env.model.layout import CHANNELS, ERRING_GROUPS, N_CHANNELS, N_FULL, SENSOR_GROUPS
+from coax_env.model.layout import (
+    CHANNELS,
+    ERRING_GROUPS,
+    GYROS,
+    N_CHANNELS,
+    N_FULL,
+    SENSOR_GROUPS,
+)
 
 LAMA = load_vehicle("lama400d")
 PLAIN = HeliModel(LAMA)
@@ -40,7 +47,7 @@ NOISE = Noise(
 GROUP = {channel: group for group, channels in SENSOR_GROUPS.items() for channel in channels}
 HOVER, COMMAND = dynamics.hover_trim(LAMA)
 INPUT = np.tile(dynamics.kernel_input(COMMAND), 2)
-ANGLE_PAIRS = list(onboard_filter.ANGLE_OF.items())
+ANGLE_PAIRS = list(zip(GYROS, onboard_filter.ATTITUDES, strict=True))
 
 
 def state() -> np.ndarray:
@@ -151,27 +158,30 @@ ABOARD = frozenset({"p", "q", "r", "ax", "ay", "az"})
 
 
 @pytest.mark.parametrize(
-    ("coloured", "aboard", "gain", "white_with", "used"),
+    ("coloured", "aboard", "gain", "left", "used"),
     [
-        ("phi", ABOARD, 100.0, True, True),
-        ("vn", ABOARD, 100.0, True, True),
-        ("q", ABOARD, 100.0, True, False),  # nothing asks for it
-        ("phi", ABOARD - {"p"}, 100.0, True, False),  # no gyro tells it from motion
-        ("h", ABOARD - {"az"}, 100.0, True, False),  # no accelerometer does
-        ("phi", ABOARD, 10.0, True, False),  # not worth the threshold
-        ("phi", ABOARD, 100.0, False, False),  # what a model lacks may last, too
+        ("phi", ABOARD, 100.0, "", True),
+        ("vn", ABOARD, 100.0, "", True),
+        ("q", ABOARD, 100.0, "", False),  # nothing asks for it
+        ("phi", ABOARD - {"p"}, 100.0, "", False),  # no gyro tells it from motion
+        ("h", ABOARD - {"az"}, 100.0, "", False),  # no accelerometer does
+        ("phi", ABOARD, 10.0, "", False),  # not worth the threshold
+        ("phi", ABOARD, 100.0, "psi", False),  # what a model lacks may last, too
+        ("phi", ABOARD, 100.0, "p", True),  # gusts of another law
     ],
 )
-def test_errors_last_where_that_is_worth_it_and_nothing_stays_coloured(
-    monkeypatch, coloured, aboard, gain, white_with, used
+def test_errors_last_where_that_is_worth_it_and_no_motion_stays_coloured(
+    monkeypatch, coloured, aboard, gain, left, used
 ):
     """The fits are stand-ins, which gain at once what they may."""
     first = Noise({"force_xy": 1.0}, {"phi": 0.01, "vn": 0.5})
     fit = Fit((), {}, first, objective=500.0)
     gained = lambda problem, fit: replace(fit, objective=500.0 - gain)  # noqa: E731
-    seen = {channel: COLOURED if channel == coloured else WHITE for channel in CHANNELS}
-    monkeypatch.setattr(sensor_errors, "whiteness", lambda passes, channels: seen)
-    monkeypatch.setattr(sensor_errors, "is_white", lambda passes, channels: white_with)
+    answers = [
+        {channel: COLOURED if channel == one else WHITE for channel in CHANNELS}
+        for one in (coloured, left)
+    ]
+    monkeypatch.setattr(sensor_errors, "whiteness", lambda passes, channels: answers.pop(0))
     monkeypatch.setattr(sensor_errors, "noise_fitted", lambda problem, fit, evaluations: fit)
     monkeypatch.setattr(sensor_errors, "fitted", gained)
     monkeypatch.setattr(sensor_errors, "converged", gained)
@@ -189,32 +199,55 @@ def test_errors_last_where_that_is_worth_it_and_nothing_stays_coloured(
         assert found[2].process[error_level("velocity")] == pytest.approx(0.5)
 
 
-def flown_with(correlation: float, missing: float = 0.3) -> SimpleNamespace:
-    """Innovations of two runs of which each rate's and its angle's are correlated in a row."""
-    rng = np.random.default_rng(1)
-    passes = []
-    for _ in range(2):
-        e = rng.standard_normal((1000, N_CHANNELS))
-        for rate, angle in ANGLE_PAIRS:
-            own = e[:, CHANNELS.index(angle)]
-            own *= math.sqrt(1.0 - correlation**2)
-            own += correlation * e[:, CHANNELS.index(rate)]
-            own[rng.random(1000) < missing] = np.nan
-        passes.append(SimpleNamespace(innovations=e))
-    engine = SimpleNamespace(filter=lambda values, noise: passes)
-    aboard = frozenset({*onboard_filter.ANGLE_OF, *onboard_filter.ANGLE_OF.values()})
-    return SimpleNamespace(engine=engine, aboard=aboard, model=SimpleNamespace(channels=CHANNELS))
+def turning(seed: int, carried: str, every: int = 1, common: float = 0.0) -> Run:
+    """A body that turns, its gyros, and angles: of a sensor of their own ("no"), or carried by the
+    logged gyros, as a row begins ("begin") or by the "mean" of both ends, and back to it in 1 s.
+
+    Attitudes stay small, so that each angle is the integral of its rate.
+    """
+    rng = np.random.default_rng(seed)
+    t = 0.01 * np.arange(1500)
+    measured: dict[str, np.ndarray] = {}
+    for k, (rate, angle) in enumerate(ANGLE_PAIRS):
+        true = 0.02 * np.sin((1.0 + k) * t) + 0.01 * np.sin(7.0 * t)
+        noise = rng.normal(0.0, 0.03, t.size)
+        gyro = np.gradient(true, t) + noise
+        own = true + rng.normal(0.0, 0.008, t.size) + common * noise
+        if carried != "no":
+            turns = 0.01 * (gyro[:-1] if carried == "begin" else 0.5 * (gyro[:-1] + gyro[1:]))
+            aided = own.copy()
+            for i in range(1, t.size):
+                aided[i] = aided[i - 1] + turns[i - 1] + 0.01 * (own[i - 1] - aided[i - 1])
+            own = aided
+        own[np.arange(t.size) % every != 0] = np.nan
+        measured |= {rate: gyro, angle: own}
+    return Run("run", t, np.zeros((t.size, 4)), measured)
 
 
-@pytest.mark.parametrize(
-    ("correlation", "carried"), [(-0.35, True), (-0.12, False), (0.0, False), (0.4, False)]
-)
-def test_attitudes_with_the_gyros_noise_are_an_onboard_filters(correlation, carried):
-    fit = Fit((), {}, Noise({}))
-    problem = flown_with(correlation)
-    assert onboard_filter.of_onboard_filter(problem, fit) == carried  # type: ignore[arg-type]
-    problem.aboard -= {"r"}
-    assert not onboard_filter.of_onboard_filter(problem, fit)  # type: ignore[arg-type]
+@pytest.mark.parametrize("every", [1, 2, 5])
+@pytest.mark.parametrize("carried", ["begin", "mean"])
+def test_attitudes_that_the_logged_gyros_carry_are_an_onboard_filters(carried, every):
+    runs = [turning(seed, carried, every) for seed in (1, 2)]
+    assert onboard_filter.of_onboard_filter(runs)
+    blind = [
+        replace(run, measured={c: x for c, x in run.measured.items() if c != "r"}) for run in runs
+    ]
+    assert not onboard_filter.of_onboard_filter(blind)
+
+
+@pytest.mark.parametrize("every", [1, 2, 5])
+@pytest.mark.parametrize("common", [0.0, 0.2])
+def test_attitudes_of_a_sensor_of_their_own_are_not(every, common):
+    """Nor where both have noise in common from row to row, as of one supply."""
+    for seed in range(20):
+        assert not onboard_filter.of_onboard_filter([turning(seed, "no", every, common)])
+
+
+def test_two_angles_of_three_are_no_onboard_filters():
+    """Telemetry's heading turns as its gyro says, aliases and all; roll and pitch do not."""
+    fused, own = turning(1, "begin"), turning(2, "no")
+    mixed = {c: (own if c == "phi" else fused).measured[c] for c in fused.measured}
+    assert not onboard_filter.of_onboard_filter([replace(fused, measured=mixed)])
 
 
 def test_an_onboard_filters_states_are_read_once_a_second():

@@ -83,41 +83,8 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
 
 
 def believes_its_sensors(monkeypatch) -> None:
-    """No attitude of an onboard filter, no errors that last."""
-    monkeypatch.setattr(searched, "of_onboard_filter", lambda problem, fit: False)
+    """No errors that last."""
     monkeypatch.setattr(searched, "with_lasting_errors", lambda problem, fit, noise: None)
-
-
-class Asked(SimpleNamespace):
-    """A problem of some candidates, which says what it was asked."""
-
-    def of_candidates(self, names: Any) -> "Asked":
-        return Asked(**{**vars(self), "candidates": tuple(sorted(names))})
-
-    def with_records(self, records: Any) -> "Asked":
-        return Asked(**{**vars(self), "engine": SimpleNamespace(records=records)})
-
-
-def test_beside_an_onboard_filters_attitudes_circular_effects_are_not_asked(monkeypatch):
-    asked: list[tuple[tuple[str, ...], list[str]]] = []
-
-    def one(problem: Any, noise: Noise, coarse: bool = False) -> Searched:
-        asked.append((problem.candidates, problem.engine.records))
-        fit = Fit(("gyro_scale",) if len(asked) == 1 else (), {}, noise)
-        return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(searched, "_searched", one)
-    monkeypatch.setattr(searched, "of_onboard_filter", lambda problem, fit: True)
-    monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
-    candidates = ("gyro_scale", "motor_lag", "wind")
-    problem = Asked(
-        candidates=candidates, report=lambda text: None, model=SimpleNamespace(channels=()),
-        engine=SimpleNamespace(records=["all"]),
-    )  # fmt: skip
-    monkeypatch.setattr(searched, "read_seldom", lambda records, channels: ["few"])
-    found = searched.searched(problem, FINE, {})  # type: ignore[arg-type]
-    assert asked == [(candidates, ["all"]), (("motor_lag", "wind"), ["few"])]
-    assert found.circular and found.fit.active == ()
 
 
 @pytest.mark.parametrize(
@@ -148,7 +115,7 @@ def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had,
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     found = searched.searched(plain, FINE, {})  # type: ignore[arg-type]
-    assert found.problem is wider and found.fit.active == active and not found.circular
+    assert found.problem is wider and found.fit.active == active
     assert found.refitted.noise is lasting
 
 
@@ -196,8 +163,9 @@ def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypa
     model = SimpleNamespace(channels=("ax", "h"), vehicle=SimpleNamespace(effects=()))
 
     class Problem(SimpleNamespace):
-        def with_records(self, records: Any) -> "Problem":
-            return Problem(**{**vars(self), "engine": SimpleNamespace(records=records)})
+        def with_records(self, records: Any, smoothed: bool) -> "Problem":
+            engine = SimpleNamespace(records=records)
+            return Problem(**{**vars(self), "engine": engine, "smoothed": smoothed})
 
         def of_candidates(self, names: Any) -> "Problem":
             return Problem(**{**vars(self), "candidates": tuple(sorted(names))})
@@ -220,6 +188,7 @@ def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypa
     found = searched.searched(problem, FINE, {})  # type: ignore[arg-type]
     assert found.low_passes == {"ax": LowPass(0.008)}
     assert asked[0] is problem and asked[1].candidates == ("wind",)
+    assert asked[1].smoothed
     searched_on = asked[1].engine.records[0].z
     share = np.exp(-0.01 / 0.008)
     ahead = smooth[2:] + share / (1.0 - share) / 29.0  # of a ramp, by its slope times the delay

@@ -158,6 +158,7 @@ def diagnose(
     lines, calm, calm_vehicle = (
         ((), flight, vehicle) if "vibration" in exclude else vibration.calmed(flight, vehicle)
     )
+    circular = onboard_filter.of_onboard_filter(calm.runs)
     flight, calm = decimated(flight), decimated(calm)
     new_lines = lines if "vibration" not in vehicle.effects else ()
     model = HeliModel(vehicle, stated(flight))
@@ -166,17 +167,21 @@ def diagnose(
     report = reporter(progress)
     report("choosing the runs to hold out")
     records = [record_of(run) for run in calm.runs]
+    of_sensors = []
+    if circular:
+        asked = tuple(e for e in candidates if e not in onboard_filter.CIRCULAR)
+        of_sensors.append(onboard_filter.remark(set(candidates) - set(asked)))
+        records, candidates = onboard_filter.read_seldom(records, CHANNELS), asked
     used, held = split(model, records, noise, hold_out, candidates, settings)
 
     problem = Problem.of(model, used, candidates, settings, report)
     clock = clock_of(flight.runs)
     first = searched(problem, noise, clock)
-    unasked = set(candidates) - set(first.problem.candidates)
-    of_sensors = [sensor_low_pass.remark(first.low_passes, unasked)] if first.low_passes else []
-    of_sensors += [onboard_filter.remark(unasked)] if first.circular else []
+    if first.low_passes:
+        unasked = set(candidates) - set(first.problem.candidates)
+        of_sensors.append(sensor_low_pass.remark(first.low_passes, unasked))
     problem, bare, refitted = first.problem, first.bare, first.refitted
     held = records_before(held, CHANNELS, first.low_passes)
-    held = onboard_filter.read_seldom(held, CHANNELS) if first.circular else held
     passes_before = problem.engine.filter(bare.values, bare.noise)
     state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)

@@ -3,57 +3,141 @@
 A filter on board carries its attitudes from row to row by the gyros, velocities and height by the
 accelerometers. What they say of each other is then said twice, and no evidence: of eight clean
 **synthetic** flights whose log had such a filter's states, six had a false name, a gyro's scale of 15
-to 45 nats. It shows in the innovations: where the noise of a rate is in its angle too, the two are
-correlated in one row, while two sensors of their own never are. Then the filter's states are read once
-a second, sensors' effects that rest on them are not asked for, and a remark says so.
+to 45 nats; where nothing but the gyros carried the attitudes, one had six false names, up to 750 nats.
+
+It shows in the log alone, before any model: how far an angle turns from one reading to the next is the
+integral of the gyros' readings between them *with their noise*. The two vary together by the motion,
+and by as much more as the gyros' noise is in the angle, which of two sensors of their own is nothing.
+Then the filter's states are read once a second, sensors' effects that rest on them are not asked for,
+and a remark says so.
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Record
-from coax_env.estimation.whiteness import correlation
-from coax_env.model.layout import MOTION
+from coax_env.logs.flight import Run
+from coax_env.model.layout import GYROS, MOTION
 from coax_env.plain_words import and_list, plain, seconds
 
-CARRIED = 0.2
-"""Correlation of the innovations of a rate and of its angle in a row, all three at least. Four such
-flights had 0.31 and more; others, **synthetic** and real, 0.15 and less."""
+SHARES = (0.6, 1.4)
+"""Of the gyros' noise that is in an angle carried by them, all three angles. Fused flights had 0.94 to
+1.02; others, **synthetic** and real, 0.5 at most on one of the three at least; noise that gyros and
+attitudes have in common from row to row 20 and more; ours."""
+CERTAIN = 5.0
+"""std of its own scatter that a share must be; ours."""
+FEWEST = 100
+"""Turns between readings that are enough; ours."""
+ORDER = 2
+"""Differences of turns that are compared: what lasts longer than two readings is gone; ours."""
+OF_NOISE = 3
+"""Differences of a gyro's readings that are nearly noise alone; ours."""
 CIRCULAR = frozenset({
     "gyro_scale", "gyro_bias", "attitude_bias", "magnetic_field", "imu_tilt", "accel_scale",
     "accel_bias", "sonar_scale", "sonar_tilt", "sonar_delay",
 })  # fmt: skip
 """Effects that show in what the sensors of such a filter and its states say of each other."""
-ANGLE_OF = {"p": "phi", "q": "theta", "r": "psi"}
+ATTITUDES = ("phi", "theta", "psi")
 APART = 1.0
 """s between two readings of such a filter that are taken. From row to row it says what gyros and
 accelerometers say; with all its readings inertias were 15 to 20 % too large on three clean
 **synthetic** flights and six channels coloured, with one in 0.3 s or 1 s neither; ours."""
 
 
-def of_onboard_filter(problem: Problem, fit: Fit) -> bool:
+class Turns(NamedTuple):
+    """Of one angle: differences of how far it turned, by its own readings and by the gyros', and the
+    variance that the gyros' noise has in the latter."""
+
+    read: np.ndarray
+    carried: np.ndarray
+    noise: float
+
+
+def of_onboard_filter(runs: Iterable[Run]) -> bool:
     """Whether attitudes have the noise of the gyros.
 
     Args:
-        problem, fit: after a search.
+        runs: as logged.
     """
-    if not problem.aboard.issuperset({*ANGLE_OF, *ANGLE_OF.values()}):
+    runs = [run for run in runs if run.measured.keys() >= {*GYROS, *ATTITUDES}]
+    return any(
+        all(_has_noise([_turns(run, angle, begin, end) for run in runs]) for angle in ATTITUDES)
+        for begin, end in ((1.0, 0.0), (0.0, 1.0), (0.5, 0.5))
+    )
+
+
+def _has_noise(turns: Sequence[Turns | None]) -> bool:
+    """Whether an angle has the gyros' noise: the share of it that is in both is nearly all."""
+    known = [own for own in turns if own is not None and own.noise > 0.0]
+    count = sum(own.read.size for own in known)
+    if count < FEWEST:
         return False
-    passes = problem.engine.filter(fit.values, fit.noise)
-    channels = problem.model.channels
-    return all(_carried(passes, channels, c, angle) for c, angle in ANGLE_OF.items())
+    read, carried = (
+        np.concatenate([getattr(own, which) / math.sqrt(own.noise) for own in known])
+        for which in ("read", "carried")
+    )
+    share = 1.0 - float(carried @ (carried - read)) / count
+    scatter = math.sqrt(float(read @ read) * float(carried @ carried)) / count**1.5
+    return SHARES[0] < share < SHARES[1] and share > CERTAIN * scatter
 
 
-def _carried(passes: Sequence[RunPass], channels: Sequence[str], rate: str, angle: str) -> bool:
-    """Whether a gyro read too much where the filter foresaw too little of its angle, and back."""
-    pairs = [run.innovations[:, [channels.index(rate), channels.index(angle)]] for run in passes]
-    both = np.concatenate([pair[np.isfinite(pair).all(axis=1)] for pair in pairs])
-    return correlation(*both.T) < -CARRIED
+def _turns(run: Run, angle: str, begin: float, end: float) -> Turns | None:
+    """Turns of one angle between its readings.
+
+    Args:
+        run: as logged. angle: one of ATTITUDES.
+        begin, end: weights of the gyro's readings as a row begins and ends, with which a filter
+            carries its angle over the row.
+    """
+    rows = np.flatnonzero(np.isfinite(run.measured[angle]))
+    if rows.size < FEWEST // 2 or min(np.isfinite(run.measured[c]).sum() for c in GYROS) < FEWEST:
+        return None
+    rate = _rate(run, angle)
+    steps = np.diff(run.t)
+    turned = np.append(0.0, np.cumsum((begin * rate[:-1] + end * rate[1:]) * steps))
+    between = np.diff(rows)
+    usual = int(np.median(between))
+    read = np.diff(np.unwrap(run.measured[angle][rows]))
+    carried = np.diff(turned[rows])
+    whole = np.convolve(between == usual, np.ones(ORDER + 1), "valid") == ORDER + 1
+    weights = np.append(np.full(usual, begin), 0.0) + np.append(0.0, np.full(usual, end))
+    for _ in range(ORDER):
+        apart = np.zeros(usual)
+        weights = np.append(apart, weights) - np.append(weights, apart)
+    row = float(np.median(steps))
+    noise = row**2 * _noise(run.measured[GYROS[ATTITUDES.index(angle)]]) * float(weights @ weights)
+    read, carried = (np.diff(x, ORDER)[whole] for x in (read, carried))
+    sound = np.abs(read - carried) < 8.0 * np.median(np.abs(read - carried)) + 1e-12
+    return Turns(read[sound], carried[sound], noise)
+
+
+def _rate(run: Run, angle: str) -> np.ndarray:
+    """How fast an angle turns by the gyros, (n,) [rad/s]."""
+    p, q, r, phi, theta = (_filled(run, c) for c in (*GYROS, "phi", "theta"))
+    across = np.sin(phi) * q + np.cos(phi) * r
+    if angle == "phi":
+        return p + np.tan(theta) * across
+    return across / np.cos(theta) if angle == "psi" else np.cos(phi) * q - np.sin(phi) * r
+
+
+def _filled(run: Run, channel: str) -> np.ndarray:
+    values = run.measured[channel]
+    there = np.isfinite(values)
+    return np.interp(run.t, run.t[there], values[there])
+
+
+def _noise(readings: np.ndarray) -> float:
+    """Variance of the noise of a gyro, of which differences from row to row are nearly all."""
+    differences = np.diff(readings, OF_NOISE)
+    differences = differences[np.isfinite(differences)]
+    if differences.size < FEWEST:
+        return 0.0
+    spread = 1.4826 * float(np.median(np.abs(differences)))  # outliers apart
+    return spread**2 / math.comb(2 * OF_NOISE, OF_NOISE)
 
 
 def read_seldom(records: Sequence[Record], channels: Sequence[str]) -> list[Record]:

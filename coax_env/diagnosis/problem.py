@@ -74,6 +74,7 @@ class Problem:
         settings: what decides.
         progress: called with a line of text.
         unlike_gusts: whether gusts turned out not to be as the filter has them (evidence.py).
+        smoothed: whether readings were taken back through a low-pass (sensor_low_pass.py).
     """
 
     model: HeliModel
@@ -84,6 +85,7 @@ class Problem:
     settings: Settings = SETTINGS
     progress: Progress | None = None
     unlike_gusts: bool = False
+    smoothed: bool = False
 
     @classmethod
     def of(
@@ -142,9 +144,14 @@ class Problem:
             self, model=model, engine=Engine(model, self.engine.records, self.engine.threads)
         )
 
-    def with_records(self, records: Sequence[Record]) -> "Problem":
-        """On other records."""
-        return replace(self, engine=Engine(self.model, records, self.engine.threads))
+    def with_records(self, records: Sequence[Record], smoothed: bool = False) -> "Problem":
+        """On other records.
+
+        Args:
+            records: of the same runs. smoothed: whether they were taken back through a low-pass.
+        """
+        engine = Engine(self.model, records, self.engine.threads)
+        return replace(self, engine=engine, smoothed=smoothed or self.smoothed)
 
     # --- what is free with some effects active --------------------------------------------------------
 

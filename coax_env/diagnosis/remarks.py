@@ -35,6 +35,7 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
     return [
         *_slow_rows(problem),
         *_unlike_gusts(problem),
+        *_smoothed(problem),
         *_swings(problem),
         *_lasting_errors(fit),
         *_white_noise(problem, fit),
@@ -147,6 +148,15 @@ def _unlike_gusts(problem: Problem) -> list[str]:
     return [
         "no accelerometer's innovations are white: gusts are not as the filter has them, who flies may"
         " foresee them better, and what looks like a weak or late answer must be worth"
+        f" {problem.settings.unseen_inflation:g} times as much"
+    ]
+
+
+def _smoothed(problem: Problem) -> list[str]:
+    if not problem.smoothed:
+        return []
+    return [
+        "what is left of a low-pass looks like a late answer: such a cause must be worth"
         f" {problem.settings.unseen_inflation:g} times as much"
     ]
 

@@ -8,8 +8,7 @@ three times that, as long as the model's open-loop flight over the horizon comes
 runs (the likelihood raised to a power less than 1, for a model that is wrong: Miller and Dunson 2019,
 J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Identification, ch. 8).
 
-Where attitudes are an onboard filter's (onboard_filter.py) it is done again without what they and its
-sensors say of each other, and where errors of readings last (sensor_errors.py) with these in it.
+Where errors of readings last (sensor_errors.py) it is done again with these in it.
 
 Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) it is done again, with
 what was before it. Where gusts have a frequency, with that in the filter
@@ -30,7 +29,6 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
-from coax_env.diagnosis.onboard_filter import CIRCULAR, of_onboard_filter, read_seldom
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
@@ -68,7 +66,6 @@ class Searched:
     coarse: whether readings were taken to be no finer than LEAST_READING_STD.
     changing: with what began or changed in flight, where that has been asked already.
     low_passes: what some channels' readings were taken back through.
-    circular: whether attitudes are an onboard filter's.
     """
 
     problem: Problem
@@ -79,7 +76,6 @@ class Searched:
     coarse: bool = False
     changing: Changing | None = None
     low_passes: Mapping[str, LowPass] = field(default_factory=dict)
-    circular: bool = False
 
 
 def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Searched:
@@ -90,12 +86,6 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         clock: of all runs in the order in which they were flown.
     """
     best = _searched(problem, noise)
-    if of_onboard_filter(best.problem, best.fit):
-        problem.report("attitudes of an onboard filter: searching again with few of them")
-        seldom = read_seldom(problem.engine.records, problem.model.channels)
-        asked = set(problem.candidates) - CIRCULAR
-        best = _searched(problem.with_records(seldom).of_candidates(asked), noise)
-        return replace(_in_unrest(best, noise, clock, False), circular=True)
     erring = with_lasting_errors(best.problem, best.fit, noise)
     if erring is not None:
         changed = _white_since(best, clock)
@@ -109,7 +99,7 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         problem.report("searching again with readings as they were before a low-pass")
         before = records_before(problem.engine.records, problem.model.channels, smoothed)
         asked = set(problem.candidates) - hidden_behind(smoothed, best.fit, problem)
-        best = _searched(problem.with_records(before).of_candidates(asked), noise)
+        best = _searched(problem.with_records(before, True).of_candidates(asked), noise)
     return replace(_in_unrest(best, noise, clock, erring is not None), low_passes=smoothed)
 
 

@@ -18,16 +18,20 @@ LEAST_LEAPS = 0.5
 """Share of a held channel's changes that are larger than that; ours."""
 MOST_REPEATED = 0.05
 """Share of values shown more than once, up to which a channel never repeats by chance; ours."""
+MISSING = 1.8  # usual steps from which on a row is missing; ours
 FROZEN = 5
 """Equal readings in such a channel that are no chance: less than one in a million; ours."""
 
 
-def repeats(values: np.ndarray, hold: bool | None = None) -> np.ndarray:
+def repeats(
+    values: np.ndarray, hold: bool | None = None, t: np.ndarray | None = None
+) -> np.ndarray:
     """Where a channel's cells hold no new reading, (n,) bool.
 
     Args:
         values: (n,) readings, NaN where there is none.
         hold: what the card says: every repeat is one, or none is; None: by the pattern.
+        t: (n,) time [s]; None: no row is missing.
     """
     found = np.zeros(values.size, bool)
     present = np.flatnonzero(~np.isnan(values))
@@ -41,6 +45,10 @@ def repeats(values: np.ndarray, hold: bool | None = None) -> np.ndarray:
     starts = np.flatnonzero(~again)
     inner = np.diff(starts)[1:]  # times that each value shows, without the first and the last one
     if inner.size < FEWEST:
+        return found
+    off_beat = _off_beat(_row_numbers(present, t), starts[1:])
+    if off_beat is not None:
+        found[present[again & off_beat]] = True
         return found
     if _is_held(inner, np.abs(np.diff(y[starts]))) or _beyond_chance(y):
         found[present[again]] = True
@@ -57,6 +65,41 @@ def _is_held(times: np.ndarray, steps: np.ndarray) -> bool:
     """Whether nearly every value shows more than once, and the next one is not just a step away."""
     leaps = np.mean(steps > COARSE_STEP * steps.min())
     return bool(np.mean(times > 1) >= LEAST_HELD and leaps >= LEAST_LEAPS)
+
+
+ON_THE_BEAT = 0.95
+"""Share of a channel's changes that come at the same one of every few rows, from which on nothing is
+read at the others; ours."""
+FEWEST_ON_IT = 25  # changes: of two rows in turn, chance makes so many in 3 million logs one; ours
+SLOWEST_BEAT = 50  # rows from one reading to the next; ours
+
+
+def _row_numbers(present: np.ndarray, t: np.ndarray | None) -> np.ndarray:
+    """Of each row with a reading, its number were none missing."""
+    if t is None:
+        return present
+    step = np.diff(t)
+    usual = float(np.median(step))
+    missing = np.where(step > MISSING * usual, np.round(step / usual) - 1.0, 0.0)
+    return present + np.append(0.0, np.cumsum(missing)).astype(int)[present]
+
+
+def _off_beat(rows: np.ndarray, changes: np.ndarray) -> np.ndarray | None:
+    """Rows at which a sensor that is read every so many rows has no reading; None: there is no beat.
+
+    A coarse sensor's next reading is often the last one again, so that how long values show says
+    little; when they change says all.
+
+    Args:
+        rows: (n,) numbers of the rows. changes: places of those with another value than the one before.
+    """
+    if changes.size < FEWEST_ON_IT:
+        return None
+    for beat in range(SLOWEST_BEAT, 1, -1):
+        counts = np.bincount(rows[changes] % beat, minlength=beat)
+        if counts.max() >= ON_THE_BEAT * changes.size:
+            return np.asarray(rows % beat != counts.argmax())
+    return None
 
 
 MOST_BY_CHANCE = 5.0
@@ -89,26 +132,29 @@ interpolated..."""
 LEAST_KINK = 3.0
 """...if the others are off it by so many roundings; ours."""
 MOST_DIGITS = 9  # behind the point, in which a rounding is looked for
+MOST_APART = 8  # roundings between the two numbers that are next to each other
+OFF_GRID = 0.05  # of a rounding: more is no number of that grid
 A_FEW = 32  # numbers that are asked first: where they have more decimals, so have all
 
 
-def interpolated(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+def interpolated(t: np.ndarray, values: np.ndarray, angle: bool = False) -> np.ndarray:
     """Where a channel's cells lie on a line or a cubic between readings, and are none, (n,) bool.
 
     Resampling that puts no row at a reading is found in part (a line) or not at all (a cubic).
 
     Args:
-        t: (n,) time [s]. values: (n,) readings, angles without jumps of a turn, NaN where there is
-        none.
+        t: (n,) time [s]. values: (n,) readings, NaN where there is none.
+        angle: whether they are angles [rad], which may jump by a turn.
     """
     found = np.zeros(values.size, bool)
     present = np.flatnonzero(~np.isnan(values))
     if present.size < 3 * FEWEST:
         return found
     at, y = t[present], values[present]
-    share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
-    off = np.abs(y[1:-1] - (1.0 - share) * y[:-2] - share * y[2:])
     rounding = max(_rounding(y), 1e-9 * float(np.abs(y).max()))
+    y = np.unwrap(y) if angle else y
+    # by the times as they are logged, or by the even clock that there was before these were wrong
+    off = min((_off_line(x, y) for x in (at, present)), key=np.median)
     # three numbers are rounded, each by half a unit at most
     straight = (off <= 1.01 * rounding) & (y[2:] != y[:-2])
     kinks = off[off > 1.01 * rounding]
@@ -123,6 +169,12 @@ def interpolated(t: np.ndarray, values: np.ndarray) -> np.ndarray:
             if behind - first >= FROZEN:
                 found[present[1 + first : 1 + behind]] = True
     return found
+
+
+def _off_line(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """How far each number is from the line between its neighbours, (n - 2,)."""
+    share = (x[1:-1] - x[:-2]) / (x[2:] - x[:-2])
+    return np.asarray(np.abs(y[1:-1] - (1.0 - share) * y[:-2] - share * y[2:]))
 
 
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
@@ -162,12 +214,22 @@ def _inside_cubics(t: np.ndarray, y: np.ndarray, rounding: float) -> np.ndarray:
 
 
 def _rounding(y: np.ndarray) -> float:
-    """Unit of the last decimal that any number has; 0 where there are too many."""
+    """Unit of the last decimal that any number has, in the unit it was logged in (deg: all numbers are
+    multiples of one); 0 where there are too many."""
     largest = float(np.abs(y).max())
     for digits in range(MOST_DIGITS + 1):
         most = 1e-6 * max(1.0, largest * 10.0**digits * 1e-6)
         if all(_off_whole(some * 10.0**digits) < most for some in (y[:A_FEW], y)):
             return float(10.0**-digits)
+    apart = np.diff(np.unique(y))
+    apart = apart[apart > 1e-9 * largest]
+    if not apart.size:
+        return 0.0
+    whole = float(np.ptp(y))
+    for parts in range(1, MOST_APART + 1):
+        unit = whole / round(parts * whole / float(apart.min()))
+        if _off_whole((y - y.min()) / unit) < OFF_GRID:
+            return unit
     return 0.0
 
 

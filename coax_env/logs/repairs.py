@@ -217,25 +217,17 @@ def _without_repeats(
     found = dict(data)
     for channel in CHANNELS:
         if channel in data:
-            again = repeats(data[channel], holds.get(channel))
+            again = repeats(data[channel], holds.get(channel), data["t"])
             if again.any():
                 counts[f"held samples of {channel}, no new readings"] += int(again.sum())
                 found[channel] = np.where(again, np.nan, data[channel])
             if holds.get(channel) is False:
                 continue
             values = found[channel]
-            unwrapped = _unwrapped(values) if channel in ANGLES else values
-            between = interpolated(data["t"], unwrapped)
+            between = interpolated(data["t"], values, channel in ANGLES)
             if between.any():
                 counts[f"interpolated samples of {channel}, no readings"] += int(between.sum())
                 found[channel] = np.where(between, np.nan, values)
-    return found
-
-
-def _unwrapped(angles: np.ndarray) -> np.ndarray:
-    given = ~np.isnan(angles)
-    found = angles.copy()
-    found[given] = np.unwrap(angles[given])
     return found
 
 
