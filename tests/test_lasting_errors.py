@@ -243,6 +243,12 @@ def test_attitudes_of_a_sensor_of_their_own_are_not(every, common):
         assert not onboard_filter.of_onboard_filter([turning(seed, "no", every, common)])
 
 
+def test_an_onboard_filter_is_seen_beside_times_that_were_logged_wrong():
+    run = turning(1, "begin")
+    wrong = np.random.default_rng(2).uniform(-0.003, 0.003, run.t.size)
+    assert onboard_filter.of_onboard_filter([replace(run, t=run.t + wrong)])
+
+
 def test_two_angles_of_three_are_no_onboard_filters():
     """Telemetry's heading turns as its gyro says, aliases and all; roll and pitch do not."""
     fused, own = turning(1, "begin"), turning(2, "no")
