@@ -109,7 +109,7 @@ def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had,
     monkeypatch.setattr(
         searched, "with_lasting_errors", lambda problem, fit, noise: (wider, fit, lasting)
     )
-    monkeypatch.setattr(searched, "_white_since", lambda best, clock: None)
+    monkeypatch.setattr(searched, "_white_since", lambda best, clock, gained: None)
     monkeypatch.setattr(searched, "search", lambda problem, fit: (fit, None))
     monkeypatch.setattr(searched, "cost", lambda problem, fit, quadratic: costs[fit.active[0]])
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
@@ -120,10 +120,15 @@ def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had,
 
 
 @pytest.mark.parametrize(
-    ("onsets", "white", "used"),
-    [({"gyro_bias": None}, True, True), ({"gyro_bias": None}, False, False), ({}, True, False)],
+    ("onsets", "white", "worth", "used"),
+    [
+        ({"gyro_bias": None}, True, 90.0, True),
+        ({"gyro_bias": None}, False, 90.0, False),
+        ({}, True, 90.0, False),
+        ({"gyro_bias": None}, True, 10.0, False),  # errors are worth ten times as much
+    ],
 )
-def test_what_changed_once_is_no_error_that_lasts(monkeypatch, onsets, white, used):
+def test_what_changed_once_is_no_error_that_lasts(monkeypatch, onsets, white, worth, used):
     """Where it leaves nothing coloured; such errors take up a gyro that drifts off and stays."""
     engine = SimpleNamespace(filter=lambda values, noise: [])
     problem = SimpleNamespace(engine=engine, model=SimpleNamespace(channels=()))
@@ -132,7 +137,8 @@ def test_what_changed_once_is_no_error_that_lasts(monkeypatch, onsets, white, us
     monkeypatch.setattr(searched, "with_onsets", lambda *given: state)
     monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
     first = Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
-    changed = searched._white_since(first, {})
+    monkeypatch.setattr(searched, "most_by_change", lambda *found: worth)
+    changed = searched._white_since(first, {}, 100.0)
     assert (changed is not None) == used and (changed is None or changed.changing is state)
 
 

@@ -25,8 +25,8 @@ from coax_env.model.layout import GYROS, MOTION
 from coax_env.plain_words import and_list, plain, seconds
 
 SHARES = (0.6, 1.4)
-"""Of the gyros' noise that is in an angle carried by them, all three angles. Fused flights had 0.94 to
-1.02; others, **synthetic** and real, 0.5 at most on one of the three at least; noise that gyros and
+"""Of the gyros' noise that is in an angle carried by them, all three angles. Fused flights had 0.90 to
+1.03; others, **synthetic** and real, 0.5 at most on one of the three at least; noise that gyros and
 attitudes have in common from row to row 20 and more; ours."""
 CERTAIN = 5.0
 """std of its own scatter that a share must be; ours."""

@@ -81,6 +81,16 @@ def with_onsets(
     return state
 
 
+def most_by_change(problem: Problem, fit: Fit, quadratic: Quadratic) -> float:
+    """nats that any one change is worth at most by its score, as a step, before it is fitted.
+
+    Args:
+        problem, fit: after the search. quadratic: linearised at the fit.
+    """
+    _, found = scored(Changing(problem, fit, quadratic, {}))
+    return max((s.nats for s in found), default=0.0)
+
+
 def _next(
     state: Changing, clock: Mapping[str, Lap], about: Moment | None
 ) -> tuple[Changing, Onset] | None:
