@@ -45,6 +45,7 @@ from injector_craft import (
 )
 from injector_sensors import (
     MIXED,
+    MIXED_POSES,
     SENSORS,
     Sensors,
     blunt,
@@ -881,7 +882,7 @@ def fly(
     Args:
         effects: name -> parameters; ``{}`` takes the usual size, a number sets the first one.
         gusts: True: force (0.2 N) and moment (6 mN m) with a memory of 0.5 s; or any air.
-        sensors: a key of ``SENSORS``; ``MIXED`` is drawn from the seed.
+        sensors: a key of ``SENSORS``; ``MIXED`` and ``MIXED_POSES`` are drawn from the seed.
         runs: names in ``MANEUVERS``; all where None.
         craft: what flies. known_as: what its vehicle file says; the same where None. One that is
             not shipped gets a file beside the card.
@@ -1181,7 +1182,7 @@ def _main() -> None:
     parser.add_argument("--gusts", action="store_true")
     parser.add_argument("--air", choices=GUSTS, help="other gusts than --gusts flies in")
     parser.add_argument("--memory", type=float, default=0.5, help="s, of the gusts")
-    parser.add_argument("--sensors", choices=[*SENSORS, MIXED], default="full")
+    parser.add_argument("--sensors", choices=[*SENSORS, MIXED, MIXED_POSES], default="full")
     parser.add_argument("--craft", choices=CRAFTS, default="lama")
     parser.add_argument("--pilot", choices=PILOTS, default="usual")
     parser.add_argument("--card-noise", type=float, default=1.0, help="factor; 0: not on the card")

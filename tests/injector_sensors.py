@@ -141,8 +141,9 @@ SENSORS = {
 }  # fmt: skip
 
 
-MIXED = "mixed"
-"""Name of sensors that are drawn: each channel of `NOISE`, with several of the faults above at once."""
+MIXED, MIXED_POSES = "mixed", "mixed_poses"
+"""Names of sensors that are drawn, with several of the faults above at once: with each channel of
+`NOISE`, and with those of `POSE`."""
 INERTIAL = ("p", "q", "r", "ax", "ay", "az")
 GROUPS = (
     ("rpm_upper", "rpm_lower"), ("p", "q", "r"), ("ax", "ay", "az"), ("phi", "theta", "psi"), ("h",),
@@ -152,8 +153,36 @@ GROUPS = (
 
 
 def kit(name: str, seed: int) -> Sensors:
-    """A set of sensors by its name; `MIXED` is drawn from the seed."""
-    return mixed(np.random.default_rng([seed, 1])) if name == MIXED else SENSORS[name]
+    """A set of sensors by its name; `MIXED` and `MIXED_POSES` are drawn from the seed."""
+    drawn = {MIXED: mixed, MIXED_POSES: mixed_poses}
+    return drawn[name](np.random.default_rng([seed, 1])) if name in drawn else SENSORS[name]
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    """Log-uniform."""
+    return math.exp(rng.uniform(math.log(low), math.log(high)))
+
+
+def mixed_poses(rng: np.random.Generator) -> Sensors:
+    """A motion capture of 60 to 240 Hz, one to ten times as coarse as `POSE`, other faults by chance."""
+    turned, placed = _between(rng, 1.0, 10.0), _between(rng, 1.0, 10.0)
+    noise = {c: std * (placed if c in ("pn", "pe", "h") else turned) for c, std in POSE.items()}
+    formats = dict.fromkeys(("t", "phi", "theta", "psi", "h", "pn", "pe"), "%.5f")
+    drawn = Sensors(noise, step=1.0 / rng.choice([60.0, 100.0, 150.0, 240.0]), formats=formats)
+    if rng.random() < 0.4:
+        drawn = drawn._replace(unrest=rng.uniform(0.05, 0.25))
+    elif rng.random() < 0.3:
+        drawn = drawn._replace(stamps=rng.uniform(0.05, 0.2) * drawn.step)
+    if rng.random() < 0.5:
+        drawn = drawn._replace(lost=rng.uniform(0.002, 0.02))
+    if rng.random() < 0.5:
+        drawn = drawn._replace(outliers=rng.uniform(0.0005, 0.004))
+    if rng.random() < 0.25:
+        drawn = drawn._replace(steadied=dict.fromkeys(noise, _between(rng, 6.0, 25.0)))
+    if rng.random() < 0.3:
+        share, memory = _between(rng, 0.3, 3.0), _between(rng, 0.5, 20.0)
+        drawn = drawn._replace(wander={c: (share * std, memory) for c, std in noise.items()})
+    return drawn
 
 
 def mixed(rng: np.random.Generator) -> Sensors:
@@ -166,12 +195,9 @@ def mixed(rng: np.random.Generator) -> Sensors:
     def some(share: float) -> list[tuple[str, ...]]:
         return [group for group in GROUPS[1:] if rng.random() < share]
 
-    def between(low: float, high: float) -> float:
-        return math.exp(rng.uniform(math.log(low), math.log(high)))
-
     noise = dict(NOISE)
     for group in GROUPS:
-        factor = between(1.0 / 3.0, 3.0)
+        factor = _between(rng, 1.0 / 3.0, 3.0)
         noise |= {channel: factor * noise[channel] for channel in group}
     slow = dict.fromkeys(("phi", "theta", "psi"), 2) | dict.fromkeys(("vn", "ve", "vd"), 10)
     slow["h"] = int(rng.integers(2, 6))
@@ -180,21 +206,21 @@ def mixed(rng: np.random.Generator) -> Sensors:
     if rng.random() < 0.4:
         lasting = {}
         for group in some(0.5):
-            share, memory = between(0.2, 2.0), between(0.5, 20.0)
+            share, memory = _between(rng, 0.2, 2.0), _between(rng, 0.5, 20.0)
             lasting |= {channel: (share * noise[channel], memory) for channel in group}
         drawn = drawn._replace(wander=lasting)
     if rng.random() < 0.15:
         flickering = sum(some(0.5), ())
-        drawn = drawn._replace(flicker={c: between(0.1, 0.5) * noise[c] for c in flickering})
+        drawn = drawn._replace(flicker={c: _between(rng, 0.1, 0.5) * noise[c] for c in flickering})
     if rng.random() < 0.4:
-        cut_off = between(12.0, 80.0)
+        cut_off = _between(rng, 12.0, 80.0)
         order = int(rng.integers(1, 3))
         channels = INERTIAL if rng.random() < 0.7 else INERTIAL[:3]
         drawn = drawn._replace(smooth=dict.fromkeys(channels, (cut_off, order)))
     if rng.random() < 0.15:
         drawn = drawn._replace(common=(*INERTIAL, "phi", "theta", "psi"))
     if rng.random() < 0.15 and not drawn.wander:
-        drawn = drawn._replace(fused=between(0.5, 3.0))
+        drawn = drawn._replace(fused=_between(rng, 0.5, 3.0))
     if rng.random() < 0.2:
         drawn = drawn._replace(stamps=rng.uniform(0.0005, 0.003))
     if rng.random() < 0.25:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from injector_air import DISTURBANCES, GUSTS, Air, disturbances
 from injector_craft import COAX, LAMA, Craft, draw, rotors_of, spread, write_vehicle
-from injector_sensors import MIXED, NOISE, POSE, SENSORS, kit
+from injector_sensors import MIXED, MIXED_POSES, NOISE, POSE, SENSORS, kit
 from shared_flights import shared_flight
 
 import coax_env
@@ -446,6 +446,15 @@ def test_mixed_sensors_have_several_faults_of_every_kind() -> None:
     for of_one in drawn:
         assert of_one.noise.keys() == NOISE.keys()
         assert all(1.0 / 3.0 <= std / NOISE[c] <= 3.0 for c, std in of_one.noise.items())
+
+
+def test_mixed_poses_are_of_every_rate_and_fault() -> None:
+    drawn = [kit(MIXED_POSES, seed) for seed in range(200)]
+    assert {round(1.0 / of_one.step) for of_one in drawn} == {60, 100, 150, 240}
+    for fault in ("unrest", "stamps", "lost", "outliers", "steadied", "wander"):
+        assert 20 < sum(bool(getattr(of_one, fault)) for of_one in drawn) < 150
+    for of_one in drawn:
+        assert all(1.0 <= std / POSE[c] <= 10.0 for c, std in of_one.noise.items())
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from injector import PILOTS
 from injector_air import GUSTS, GUSTY, STILL, Air
-from injector_sensors import MIXED, kit
+from injector_sensors import MIXED, MIXED_POSES, kit
 
 from study.plan import ALONE, FOREIGN, RICH, PlannedFlight, several, sizes_of
 
@@ -29,7 +29,7 @@ class Arm:
     words: what it is. air: its gusts; memory: s, bounds of log-uniform memories of forces and of
     moments. sensors, pilots, craft: the generator's. card: factors on the card's noise; None: none.
     size: factor on the effects' usual sizes. listed: whether the effects are in the catalogue.
-    mixed: whether air and vehicle are drawn from those of all arms.
+    mixed: vehicles that are drawn from, and air of any kind with them; empty: as above.
     """
 
     words: str
@@ -41,7 +41,7 @@ class Arm:
     pilots: tuple[str, ...] = ("usual",)
     size: float = 1.0
     listed: bool = True
-    mixed: bool = False
+    mixed: tuple[str, ...] = ()
 
 
 ARMS = {
@@ -106,7 +106,13 @@ ARMS = {
     "by_steps": Arm("commands that arrive in steps of 4 mrad and 0.4 %", pilots=("by_steps",)),
     "mixed": Arm(
         "air, sensors, pilot, card and vehicle of all other arms at once, each drawn",
-        sensors=(MIXED,), card=(1.0, 0.5, 2.0, None), pilots=tuple(PILOTS), mixed=True,
+        sensors=(MIXED,), card=(1.0, 0.5, 2.0, None), pilots=tuple(PILOTS),
+        mixed=("lama", "lama", "spread", "drawn"),
+    ),
+    "mixed_poses": Arm(
+        "motion captures of any rate and fault; air, pilot, card and vehicle drawn as well",
+        sensors=(MIXED_POSES,), card=(None, 1.0, 0.5, 2.0), pilots=tuple(PILOTS),
+        mixed=("coax", "coax", "drawn"),
     ),
     "foreign_forms": Arm("effects in no list and of no generic term's form", listed=False),
 }  # fmt: skip
@@ -169,7 +175,7 @@ def planned(name: str, kind: str, number: int, seed: int) -> PlannedFlight:
         air = air._replace(memory=(force, moment))
     craft = arm.craft
     if arm.mixed:
-        air, craft = _mixed(rng)
+        air, craft = _mixed(arm.mixed, rng)
     if air.gusts == "shedding":
         swings = np.exp(rng.uniform(np.log(0.3), np.log(1.5), 6)).tolist()
         air = air._replace(frequency=tuple(swings))
@@ -190,7 +196,7 @@ def planned(name: str, kind: str, number: int, seed: int) -> PlannedFlight:
     )
 
 
-def _mixed(rng: np.random.Generator) -> tuple[Air, str]:
+def _mixed(crafts: Sequence[str], rng: np.random.Generator) -> tuple[Air, str]:
     """Air of any kind, from a third to one and a half times as strong as usual, beside drifting trims
     and jittering rotors in two of five each; and a vehicle."""
     memory = np.exp(rng.uniform(np.log(0.05), np.log(4.0), 2)).tolist()
@@ -207,7 +213,7 @@ def _mixed(rng: np.random.Generator) -> tuple[Air, str]:
         )
     if rng.random() < 0.4:
         air = air._replace(jitter=float(rng.uniform(0.0, 0.5)))
-    return air, str(rng.choice(["lama", "lama", "spread", "drawn"]))
+    return air, str(rng.choice(crafts))
 
 
 def _turn(options: Sequence[T], number: int) -> T:
