@@ -164,7 +164,7 @@ def _between(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def mixed_poses(rng: np.random.Generator) -> Sensors:
-    """A motion capture of 60 to 240 Hz, one to ten times as coarse as `POSE`, other faults by chance."""
+    """A motion capture of 60 to 240 Hz, up to ten times as coarse as `POSE`, other faults by chance."""
     turned, placed = _between(rng, 1.0, 10.0), _between(rng, 1.0, 10.0)
     noise = {c: std * (placed if c in ("pn", "pe", "h") else turned) for c, std in POSE.items()}
     formats = dict.fromkeys(("t", "phi", "theta", "psi", "h", "pn", "pe"), "%.5f")
