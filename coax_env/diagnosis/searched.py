@@ -8,11 +8,11 @@ three times that, as long as the model's open-loop flight over the horizon comes
 runs (the likelihood raised to a power less than 1, for a model that is wrong: Miller and Dunson 2019,
 J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Identification, ch. 8).
 
-Where errors of readings last (sensor_errors.py) it is done again with these in it.
-
 Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) it is done again, with
-what was before it. Where gusts have a frequency, with that in the filter
-(estimation/swinging_gusts.py), if nothing is coloured then: what a model lacks may swing, too.
+what was before it. This comes first: errors that last would take a part of it up. Where errors of
+readings last (sensor_errors.py) it is done again with these in it. Where gusts have a frequency, with
+that in the filter (estimation/swinging_gusts.py), if nothing is coloured then: what a model lacks may
+swing, too.
 
 And where innovations that rotors' jitter would colour stay so, it is done again with that noise in the
 filter (estimation/rotor_jitter.py), if its levels are worth more than a tie: after a search, since a
@@ -90,20 +90,20 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         clock: of all runs in the order in which they were flown.
     """
     best = _searched(problem, noise)
-    erring = with_lasting_errors(best.problem, best.fit, noise)
-    if erring is not None:
-        changed = _white_since(best, clock, best.fit.objective - erring[1].objective)
-        if changed is not None:
-            return changed
-        problem, found, noise = erring
-        problem.report("searching again with errors of readings that last")
-        best = _likelier(_searched(problem, noise), found)
     smoothed = low_passes(problem, best.fit, noise)
     if smoothed:
         problem.report("searching again with readings as they were before a low-pass")
         before = records_before(problem.engine.records, problem.model.channels, smoothed)
         asked = set(problem.candidates) - hidden_behind(smoothed, best.fit, problem)
         best = _searched(problem.with_records(before, True).of_candidates(asked), noise)
+    erring = with_lasting_errors(best.problem, best.fit, noise)
+    if erring is not None:
+        changed = _white_since(best, clock, best.fit.objective - erring[1].objective)
+        if changed is not None:
+            return replace(changed, low_passes=smoothed)
+        problem, found, noise = erring
+        problem.report("searching again with errors of readings that last")
+        best = _likelier(_searched(problem, noise), found)
     return replace(_in_unrest(best, noise, clock, erring is not None), low_passes=smoothed)
 
 

@@ -52,6 +52,9 @@ MEMORY_START, MEMORY_OF_INERTIAL, MEMORY_SPREAD = 2.0, 10.0, 1.5
 ours."""
 MEMORY_BOUNDS = (0.03, 60.0)
 """[s]: below, it is white at 100 Hz; above, a bias."""
+LEAST_OF_INERTIAL = 0.5
+"""[s] that an inertial sensor's error lasts at least: one of a few rows is no drift, but what a
+low-pass leaves (0.07 s for one of 15 Hz on a **synthetic** flight); ours."""
 START, START_OF_INERTIAL = 1.0, 0.3
 SMALLEST, LARGEST = 0.01, 100.0
 """Times the std of a reading that its lasting error's is at first, at least and at most; ours."""
@@ -161,7 +164,8 @@ def with_errors(noise: Noise) -> Noise:
         inertial = group not in MOTION_GROUPS
         lasts = MEMORY_OF_INERTIAL if inertial else MEMORY_START
         process |= {level: (START_OF_INERTIAL if inertial else START) * std, memory: lasts}
-        floor |= {level: SMALLEST * std, memory: MEMORY_BOUNDS[0]}
+        floor |= {level: SMALLEST * std}
+        floor |= {memory: LEAST_OF_INERTIAL if inertial else MEMORY_BOUNDS[0]}
         floor |= {channel: FINER * noise.floor.get(channel, 0.0) for channel in read}
         ceiling |= {level: LARGEST * std, memory: MEMORY_BOUNDS[1]}
         prior[memory] = (lasts, MEMORY_SPREAD)
