@@ -186,6 +186,7 @@ def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypa
     monkeypatch.setattr(searched, "_searched", one)
     believes_its_sensors(monkeypatch)
     monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
+    monkeypatch.setattr(searched, "_is_white_inside", lambda found: True)
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {"ax": LowPass(0.008)})
     problem = Problem(
         model=model, engine=SimpleNamespace(records=[record]), report=lambda text: None,
@@ -282,3 +283,40 @@ def test_one_shock_may_be_what_changed_in_flight(monkeypatch, shock, onsets, sha
     state = searched._changed(searched.Searched(none, none, none, none, none), {})
     assert (state is not None) == changed and (state is None or state.changing.onsets == onsets)
     assert asked == ([shock] if shock else [])
+
+
+@pytest.mark.parametrize(
+    ("white", "names", "lost", "taken"),
+    [
+        (True, (), 10.0, "behind"),
+        (False, (), 10.0, "without"),  # errors of every memory look like a low-pass
+        (False, (), 90.0, "behind"),
+        (False, ("thrust_exponent",), 10.0, "behind"),  # likelier by a name alone
+        (False, ("wind",), 10.0, "without"),
+    ],
+)
+def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
+    monkeypatch, white, names, lost, taken
+):
+    """Where gyros and accelerometers stay coloured behind it, and nothing more is named."""
+    levels, wider = Noise({}, {"phi": 0.1}), Noise({"error_gyros": 0.1}, {"phi": 0.1})
+
+    def one(problem: str, active: tuple[str, ...]) -> Searched:
+        fit = Fit(active, {}, levels)
+        return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
+
+    behind, without = one("behind", ("wind",)), one("without", names)
+    monkeypatch.setattr(searched, "_searched", lambda problem, noise: one("first", ()))
+    monkeypatch.setattr(searched, "_before_low_passes", lambda problem, first, noise: behind)
+    monkeypatch.setattr(
+        searched, "_with_errors",
+        lambda found, noise, clock: (found if found is behind else without, wider),
+    )  # fmt: skip
+    monkeypatch.setattr(searched, "_is_white_inside", lambda found: white)
+    of_each = {"behind": 50.0, "without": lost}
+    monkeypatch.setattr(searched, "_lost", lambda problem, found: of_each[found.problem])
+    monkeypatch.setattr(
+        searched, "_in_unrest", lambda best, noise, clock, erring: (best, noise is wider, erring)
+    )
+    found, begun, erring = searched.searched("as given", levels, {})  # type: ignore
+    assert found.problem == taken and begun and erring

@@ -10,7 +10,9 @@ J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Ident
 
 Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) it is done again, with
 what was before it. This comes first: errors that last would take a part of it up. Where errors of
-readings last (sensor_errors.py) it is done again with these in it. Where gusts have a frequency, with
+readings last (sensor_errors.py) it is done again with these in it; where inertial sensors stay coloured
+behind a low-pass, without it too, and that stands if it is likelier and has no name more: errors of
+every memory at once look like a low-pass. Where gusts have a frequency, with
 that in the filter (estimation/swinging_gusts.py), if nothing is coloured then: what a model lacks may
 swing, too.
 
@@ -40,13 +42,14 @@ from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_swings
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
-from coax_env.estimation.low_pass import LowPass, records_before
+from coax_env.estimation.low_pass import LowPass, before_low_pass, records_before
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import REACTION, JitteryModel, with_jitter
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import is_white, whiteness
+from coax_env.model.layout import INERTIAL
 
 COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
@@ -89,22 +92,70 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         problem: what may be free. noise: levels to start from.
         clock: of all runs in the order in which they were flown.
     """
-    best = _searched(problem, noise)
-    smoothed = low_passes(problem, best.fit, noise)
-    if smoothed:
-        problem.report("searching again with readings as they were before a low-pass")
-        before = records_before(problem.engine.records, problem.model.channels, smoothed)
-        asked = set(problem.candidates) - hidden_behind(smoothed, best.fit, problem)
-        best = _searched(problem.with_records(before, True).of_candidates(asked), noise)
-    erring = with_lasting_errors(best.problem, best.fit, noise)
-    if erring is not None:
-        changed = _white_since(best, clock, best.fit.objective - erring[1].objective)
-        if changed is not None:
-            return replace(changed, low_passes=smoothed)
-        problem, found, noise = erring
-        problem.report("searching again with errors of readings that last")
-        best = _likelier(_searched(problem, noise), found)
-    return replace(_in_unrest(best, noise, clock, erring is not None), low_passes=smoothed)
+    first = _searched(problem, noise)
+    smoothed = _before_low_passes(problem, first, noise)
+    best, begun = _with_errors(smoothed or first, noise, clock)
+    if smoothed is not None and not _is_white_inside(best):
+        other, begun_so = _with_errors(first, noise, clock)
+        no_more = set(other.fit.active) <= set(best.fit.active)
+        if other is not first and no_more and _lost(problem, other) < _lost(problem, best):
+            best, begun = other, begun_so
+    if best.changing is not None:
+        return best
+    return _in_unrest(best, begun, clock, erring=begun is not noise)
+
+
+def _before_low_passes(problem: Problem, first: Searched, noise: Noise) -> Searched | None:
+    """The search with readings as they were before a low-pass, where there is one.
+
+    Args:
+        problem: as given. first: the search in it. noise: levels to start from.
+    """
+    smoothed = low_passes(problem, first.fit, noise)
+    if not smoothed:
+        return None
+    problem.report("searching again with readings as they were before a low-pass")
+    before = records_before(problem.engine.records, problem.model.channels, smoothed)
+    asked = set(problem.candidates) - hidden_behind(smoothed, first.fit, problem)
+    found = _searched(problem.with_records(before, True).of_candidates(asked), noise)
+    return replace(found, low_passes=smoothed)
+
+
+def _with_errors(found: Searched, noise: Noise, clock: Mapping[str, Lap]) -> tuple[Searched, Noise]:
+    """The search with errors of readings that last, where they do, and the levels that it started from.
+
+    Args:
+        found: without such errors. noise: levels that it started from.
+        clock: of all runs in the order in which they were flown.
+    """
+    erring = with_lasting_errors(found.problem, found.fit, noise)
+    if erring is None:
+        return found, noise
+    problem, trial, begun = erring
+    changed = _white_since(found, clock, found.fit.objective - trial.objective)
+    if changed is not None:
+        return changed, noise
+    problem.report("searching again with errors of readings that last")
+    best = _likelier(_searched(problem, begun), trial)
+    return replace(best, low_passes=found.low_passes), begun
+
+
+def _is_white_inside(found: Searched) -> bool:
+    """Whether gyros and accelerometers are white."""
+    passes = found.problem.engine.filter(found.fit.values, found.fit.noise)
+    seen = whiteness(passes, found.problem.model.channels)
+    return all(seen[channel].white for channel in INERTIAL if channel in seen)
+
+
+def _lost(problem: Problem, found: Searched) -> float:
+    """Cost of what was found to the readings as logged [nats].
+
+    Args:
+        problem: as given, with these.
+    """
+    channels = problem.model.channels
+    back = (before_low_pass(r, channels, found.low_passes)[1] for r in problem.engine.records)
+    return cost(found.problem, found.fit, found.quadratic) - sum(back)
 
 
 def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bool) -> Searched:
