@@ -1,5 +1,6 @@
 """When a search is done again: with readings believed less, as long as that flies better."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -306,6 +307,7 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
     behind, without = one("behind", ("wind",)), one("without", names)
+    behind = replace(behind, low_passes={"p": LowPass(0.01)})
     monkeypatch.setattr(searched, "_searched", lambda problem, noise: one("first", ()))
     monkeypatch.setattr(searched, "_before_low_passes", lambda problem, first, noise: behind)
     monkeypatch.setattr(
@@ -315,8 +317,13 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     monkeypatch.setattr(searched, "_is_white_inside", lambda found: white)
     of_each = {"behind": 50.0, "without": lost}
     monkeypatch.setattr(searched, "_lost", lambda problem, found: of_each[found.problem])
-    monkeypatch.setattr(
-        searched, "_in_unrest", lambda best, noise, clock, erring: (best, noise is wider, erring)
-    )
-    found, begun, erring = searched.searched("as given", levels, {})  # type: ignore
-    assert found.problem == taken and begun and erring
+    asked = []
+
+    def in_unrest(best: Searched, noise: Noise, clock: Any, erring: bool) -> Searched:
+        asked.append((noise is wider, erring))
+        return replace(best, low_passes={})
+
+    monkeypatch.setattr(searched, "_in_unrest", in_unrest)
+    found = searched.searched("as given", levels, {})  # type: ignore[arg-type]
+    assert found.problem == taken and asked == [(True, True)]
+    assert found.low_passes == ({"p": LowPass(0.01)} if taken == "behind" else {})

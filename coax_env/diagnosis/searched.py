@@ -12,9 +12,10 @@ Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) i
 what was before it. This comes first: errors that last would take a part of it up. Where errors of
 readings last (sensor_errors.py) it is done again with these in it; where inertial sensors stay coloured
 behind a low-pass, without it too, and that stands if it is likelier and has no name more: errors of
-every memory at once look like a low-pass. Where gusts have a frequency, with
-that in the filter (estimation/swinging_gusts.py), if nothing is coloured then: what a model lacks may
-swing, too.
+every memory at once look like a low-pass.
+
+Where gusts have a frequency it is done again with that in the filter (estimation/swinging_gusts.py), if
+nothing is coloured then: what a model lacks may swing, too.
 
 And where innovations that rotors' jitter would colour stay so, it is done again with that noise in the
 filter (estimation/rotor_jitter.py), if its levels are worth more than a tie: after a search, since a
@@ -102,7 +103,8 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
             best, begun = other, begun_so
     if best.changing is not None:
         return best
-    return _in_unrest(best, begun, clock, erring=begun is not noise)
+    found = _in_unrest(best, begun, clock, erring=begun is not noise)
+    return replace(found, low_passes=best.low_passes)
 
 
 def _before_low_passes(problem: Problem, first: Searched, noise: Noise) -> Searched | None:

@@ -18,11 +18,11 @@ class Settings:
     """s between rows beyond which what a command did before the next one is not known; ours, between
     the 10 ms and the 38 ms that were measured."""
     unseen_inflation: float = 3.0
-    """Times that what looks like a weak or late answer must then be worth more, and where gusts are
-    not as the filter has them. Measured by 26 Hz telemetry (`study_diagnosis.py --arms telemetry`,
-    seeds 70 and 71): 5 of 71 clean flights had a name, motor_droop four times, worth 31 nats at most;
-    true ones that should show 51 to 196. In gusts with a frequency, taken for gusts that fade: a play
-    or a lag of the servos on 5 of 8 clean flights, 23 to 41 nats."""
+    """Times that what looks like a weak or late answer must then be worth more, where gusts are not as
+    the filter has them, and behind a low-pass. Measured by 26 Hz telemetry (`study_diagnosis.py --arms
+    telemetry`, seeds 70 and 71): 5 of 71 clean flights had a name, motor_droop four times, worth 31
+    nats at most; true ones that should show 51 to 196. In gusts with a frequency, taken for gusts that
+    fade: a play or a lag of the servos on 5 of 8 clean flights, 23 to 41 nats."""
     tie: float = 6.0
     """nats within which alternatives are confounded: odds of 400 to 1, ours."""
     form_share: float = 0.1

@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from coax_env.logs.flight import Flight, Run
+from coax_env.logs.held import MISSING
 from coax_env.logs.held_signal import integral_of_held
 from coax_env.logs.packets import stretches
 from coax_env.logs.repairs import GAP, hold_last
@@ -31,8 +32,6 @@ A swash command that is 0.05 rad off turns a machine of this size by half a radi
 radio links that are shorter cost less by a held command than by a filter that starts anew; ours.
 """
 BELIEVED_STEPS = 5.0
-MISSING = 1.8
-"""Usual steps from which on a row is missing; ours."""
 JUMP = 3.0
 """Times the rms of what a command does in the time of a gap, over all runs, from which on it jumped.
 
