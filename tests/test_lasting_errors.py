@@ -28,6 +28,7 @@ from coax_env.logs.flight import Run, read_flight
 from coax_env.model import dynamics
 from coax_env.model import state as S
 from coax_env.model.layout import (
+    ANGLES,
     CHANNELS,
     ERRING_GROUPS,
     GYROS,
@@ -47,7 +48,7 @@ NOISE = Noise(
 GROUP = {channel: group for group, channels in SENSOR_GROUPS.items() for channel in channels}
 HOVER, COMMAND = dynamics.hover_trim(LAMA)
 INPUT = np.tile(dynamics.kernel_input(COMMAND), 2)
-ANGLE_PAIRS = list(zip(GYROS, onboard_filter.ATTITUDES, strict=True))
+ANGLE_PAIRS = list(zip(GYROS, ANGLES, strict=True))
 
 
 def state() -> np.ndarray:
@@ -247,6 +248,18 @@ def test_an_onboard_filter_is_seen_beside_times_that_were_logged_wrong():
     run = turning(1, "begin")
     wrong = np.random.default_rng(2).uniform(-0.003, 0.003, run.t.size)
     assert onboard_filter.of_onboard_filter([replace(run, t=run.t + wrong)])
+
+
+def test_a_run_without_readings_of_one_angle_says_nothing():
+    """A column that is empty in one run is data: the other runs decide. So are uneven readings."""
+    fused = turning(1, "begin")
+    empty = {c: np.full(x.size, np.nan) if c == "phi" else x for c, x in fused.measured.items()}
+    assert onboard_filter.of_onboard_filter([fused, replace(fused, measured=empty)])
+    assert not onboard_filter.of_onboard_filter([replace(fused, measured=empty)])
+    uneven = np.isin(np.arange(fused.t.size), np.cumsum(np.tile([1, 2, 3], 250)))
+    thinned = {c: np.where(uneven, x, np.nan) if c in ("phi", "theta", "psi") else x
+               for c, x in fused.measured.items()}  # fmt: skip
+    assert not onboard_filter.of_onboard_filter([replace(fused, measured=thinned)])
 
 
 def test_two_angles_of_three_are_no_onboard_filters():

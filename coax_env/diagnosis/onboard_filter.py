@@ -21,7 +21,7 @@ import numpy as np
 
 from coax_env.estimation.state_space import Record
 from coax_env.logs.flight import Run
-from coax_env.model.layout import GYROS, MOTION
+from coax_env.model.layout import ANGLES, GYROS, MOTION
 from coax_env.plain_words import and_list, plain, seconds
 
 SHARES = (0.6, 1.4)
@@ -41,7 +41,6 @@ CIRCULAR = frozenset({
     "accel_bias", "sonar_scale", "sonar_tilt", "sonar_delay",
 })  # fmt: skip
 """Effects that show in what the sensors of such a filter and its states say of each other."""
-ATTITUDES = ("phi", "theta", "psi")
 APART = 1.0
 """s between two readings of such a filter that are taken. From row to row it says what gyros and
 accelerometers say; with all its readings inertias were 15 to 20 % too large on three clean
@@ -63,10 +62,10 @@ def of_onboard_filter(runs: Iterable[Run]) -> bool:
     Args:
         runs: as logged.
     """
-    timed = [run for run in runs if run.measured.keys() >= {*GYROS, *ATTITUDES}]
+    timed = [run for run in runs if run.measured.keys() >= {*GYROS, *ANGLES}]
     even = [replace(run, t=_even(run.t)) for run in timed]  # where times were logged wrong
     return any(
-        all(_has_noise([_turns(run, angle, begin, end) for run in own]) for angle in ATTITUDES)
+        all(_has_noise([_turns(run, angle, begin, end) for run in own]) for angle in ANGLES)
         for own in (timed, even)
         for begin, end in ((1.0, 0.0), (0.0, 1.0), (0.5, 0.5))
     )
@@ -96,13 +95,13 @@ def _turns(run: Run, angle: str, begin: float, end: float) -> Turns | None:
     """Turns of one angle between its readings.
 
     Args:
-        run: as logged. angle: one of ATTITUDES.
+        run: as logged. angle: one of ANGLES.
         begin, end: weights of the gyro's readings as a row begins and ends, with which a filter
             carries its angle over the row.
     """
-    rows = np.flatnonzero(np.isfinite(run.measured[angle]))
-    if rows.size < FEWEST // 2 or min(np.isfinite(run.measured[c]).sum() for c in GYROS) < FEWEST:
+    if min(np.isfinite(run.measured[c]).sum() for c in (*GYROS, *ANGLES)) < FEWEST // 2:
         return None
+    rows = np.flatnonzero(np.isfinite(run.measured[angle]))
     rate = _rate(run, angle)
     steps = np.diff(run.t)
     turned = np.append(0.0, np.cumsum((begin * rate[:-1] + end * rate[1:]) * steps))
@@ -111,12 +110,14 @@ def _turns(run: Run, angle: str, begin: float, end: float) -> Turns | None:
     read = np.diff(np.unwrap(run.measured[angle][rows]))
     carried = np.diff(turned[rows])
     whole = np.convolve(between == usual, np.ones(ORDER + 1), "valid") == ORDER + 1
+    if not whole.any():
+        return None
     weights = np.append(np.full(usual, begin), 0.0) + np.append(0.0, np.full(usual, end))
     for _ in range(ORDER):
         apart = np.zeros(usual)
         weights = np.append(apart, weights) - np.append(weights, apart)
     row = float(np.median(steps))
-    noise = row**2 * _noise(run.measured[GYROS[ATTITUDES.index(angle)]]) * float(weights @ weights)
+    noise = row**2 * _noise(run.measured[GYROS[ANGLES.index(angle)]]) * float(weights @ weights)
     read, carried = (np.diff(x, ORDER)[whole] for x in (read, carried))
     sound = np.abs(read - carried) < 8.0 * np.median(np.abs(read - carried)) + 1e-12
     return Turns(read[sound], carried[sound], noise)
