@@ -21,8 +21,9 @@ from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import error_level, error_memory, starting_noise
-from coax_env.estimation.lasting_errors import ERRING, ERRORS, N_ERRING, ErringModel, with_errors
+from coax_env.estimation.lasting_errors import ERRING, ErringModel, with_errors, with_inner
 from coax_env.estimation.noise_levels import fit_noise
+from coax_env.estimation.rotor_jitter import JitteryModel
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.flight import Run, read_flight
 from coax_env.model import dynamics
@@ -39,7 +40,6 @@ from coax_env.model.layout import (
 
 LAMA = load_vehicle("lama400d")
 PLAIN = HeliModel(LAMA)
-MODEL = ErringModel.like(PLAIN)
 STD = {group: 0.1 * (k + 1) for k, group in enumerate(ERRING_GROUPS)}
 MEMORY = {group: 0.5 * (k + 1) for k, group in enumerate(ERRING_GROUPS)}
 NOISE = Noise(
@@ -51,11 +51,18 @@ INPUT = np.tile(dynamics.kernel_input(COMMAND), 2)
 ANGLE_PAIRS = list(zip(GYROS, ANGLES, strict=True))
 
 
-def state() -> np.ndarray:
-    x = np.zeros(N_ERRING)
+@pytest.fixture(params=[HeliModel, JitteryModel])
+def model(request) -> ErringModel:
+    """Errors around the helicopter, and around one whose rotor speeds jitter."""
+    return ErringModel(request.param.like(PLAIN))
+
+
+def state(model: ErringModel) -> np.ndarray:
+    x = np.zeros(model.exact.size)
     x[:N_FULL] = dynamics.full_state(HOVER, COMMAND, LAMA)
     x[S.R], x[S.U] = 0.2, 0.5
-    x[ERRORS] = 0.01 * np.arange(1, len(ERRING) + 1)
+    x[N_FULL : model.states] = 1.5
+    x[model.errors] = 0.01 * np.arange(1, len(ERRING) + 1)
     return x
 
 
@@ -71,40 +78,52 @@ def stepped(model: HeliModel, x: np.ndarray, p: np.ndarray, dt: float = 0.01) ->
     return out
 
 
-def test_every_reading_but_the_rotors_has_its_error():
-    x, p = state(), MODEL.vector({}, NOISE)
-    more = read(MODEL, x, p) - read(PLAIN, x[:N_FULL], LAMA.vector)
-    expected = dict.fromkeys(CHANNELS, 0.0) | dict(zip(ERRING, x[ERRORS].tolist(), strict=True))
+def test_every_reading_but_the_rotors_has_its_error(model):
+    x, p, inner = state(model), model.vector({}, NOISE), model.inner
+    more = read(model, x, p) - read(inner, x[: model.states], inner.vector({}, NOISE))
+    own = x[model.errors].tolist()
+    expected = dict.fromkeys(CHANNELS, 0.0) | dict(zip(ERRING, own, strict=True))
     assert_allclose(more, list(expected.values()), atol=1e-12)
     assert set(CHANNELS) - set(ERRING) == {"rpm_upper", "rpm_lower", "v"}
 
 
-def test_errors_fade_and_move_nothing():
-    x, p = state(), MODEL.vector({}, NOISE)
-    later = stepped(MODEL, x, p)
+def test_errors_fade_and_move_nothing(model):
+    x, p, inner = state(model), model.vector({}, NOISE), model.inner
+    later = stepped(model, x, p)
     left = [math.exp(-0.01 / MEMORY[GROUP[channel]]) for channel in ERRING]
-    assert_allclose(later[ERRORS], left * x[ERRORS], rtol=1e-12)
-    assert np.array_equal(later[:N_FULL], stepped(PLAIN, x[:N_FULL], LAMA.vector))
+    assert_allclose(later[model.errors], left * x[model.errors], rtol=1e-12)
+    alone = stepped(inner, x[: model.states], inner.vector({}, NOISE))
+    assert np.array_equal(later[: model.states], alone)
 
 
-def test_the_drift_is_what_the_step_adds_to_first_order():
-    x, p = state(), MODEL.vector({}, NOISE)
-    out, dt = np.zeros(N_ERRING + N_CHANNELS), 1e-4
-    MODEL.drift_and_readings.__wrapped__(x, INPUT, dt, p, np.zeros(MODEL.work_size), out)
-    assert_allclose(out[:N_ERRING], stepped(MODEL, x, p, dt) - x, rtol=2e-2, atol=1e-7)
-    assert_allclose(out[N_ERRING:], read(MODEL, x, p), rtol=1e-9)
+def test_the_drift_is_what_the_step_adds_to_first_order(model):
+    x, p = state(model), model.vector({}, NOISE)
+    out, dt = np.zeros(x.size + N_CHANNELS), 1e-4
+    model.drift_and_readings.__wrapped__(x, INPUT, dt, p, np.zeros(model.work_size), out)
+    assert_allclose(out[: x.size], stepped(model, x, p, dt) - x, rtol=2e-2, atol=1e-7)
+    assert_allclose(out[x.size :], read(model, x, p), rtol=1e-9)
 
 
-def test_every_error_has_its_levels_variance():
-    """x' = -x / tau + w has variance q tau / 2; all else is the helicopter's noise."""
-    q, decay = MODEL.process_noise(NOISE, MODEL.vector({}, NOISE))
+def test_every_error_has_its_levels_variance(model):
+    """x' = -x / tau + w has variance q tau / 2; all else is the inner model's noise."""
+    errors, p = model.errors, model.vector({}, NOISE)
+    q, decay = model.process_noise(NOISE, p)
     std = [STD[GROUP[channel]] for channel in ERRING]
-    assert_allclose(np.sqrt(q[ERRORS] / (2.0 * decay[ERRORS])), std)
-    assert_allclose(MODEL.start_noise(NOISE)[ERRORS], np.square(std))
-    plain = PLAIN.process_noise(Noise({}), LAMA.vector)
-    assert np.array_equal(np.delete(q, np.r_[ERRORS]), plain.intensity)
-    assert MODEL.noise_places.shape == (q.size, 2)
-    assert_allclose(MODEL.noise_places[ERRORS], np.repeat(np.r_[ERRORS], 2).reshape(-1, 2))
+    assert_allclose(np.sqrt(q[errors] / (2.0 * decay[errors])), std)
+    assert_allclose(model.start_noise(NOISE)[errors], np.square(std))
+    alone = model.inner.process_noise(NOISE, model.inner.vector({}, NOISE))
+    assert np.array_equal(np.delete(q, np.r_[errors]), alone.intensity)
+    assert model.noise_places.shape == (q.size, 2)
+    assert_allclose(model.noise_places[errors], np.repeat(np.r_[errors], 2).reshape(-1, 2))
+
+
+def test_another_motion_keeps_the_errors_and_when_commands_are_read():
+    late = ErringModel(PLAIN).reading_after(0.03)
+    other = with_inner(late, JitteryModel)
+    assert isinstance(other, ErringModel) and isinstance(other.inner, JitteryModel)
+    assert other.read_delay == 0.03 and other.exact.size == late.exact.size + 2
+    alone = with_inner(PLAIN.reading_after(0.02), JitteryModel)
+    assert isinstance(alone, JitteryModel) and alone.read_delay == 0.02
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +144,7 @@ def test_without_errors_its_likelihood_is_the_helicopters_and_planted_ones_retur
     values = dict(model.bare_values)
     records = [record_of(run) for run in flight.runs]
     own = Engine(model, records)
-    wider = Engine(ErringModel.like(model), records)
+    wider = Engine(ErringModel(model), records)
     assert wider.log_likelihood(values, noise) == pytest.approx(
         own.log_likelihood(values, noise), abs=1e-6
     )

@@ -417,6 +417,38 @@ def test_what_grows_is_flown_with_every_size_between():
     assert injector.Course(early, late, 4.0).shares(t).tolist() == [0.0, 0.0, 0.0, 1.0, 1.0]
 
 
+@pytest.mark.parametrize(
+    ("without", "with_it", "other_noise", "left"),
+    [
+        (0.4, 0.3, 0.3, True),
+        (0.4, 0.15, 0.3, False),  # in its own noise it takes most of the colour
+        (0.4, 0.3, 0.15, False),  # in that without the change
+        (0.4, 0.0, 0.0, False),
+        (0.0, 0.3, 0.3, False),  # noise had made it white: nothing is known by colour
+    ],
+)
+def test_a_step_that_leaves_most_of_the_colour_is_no_change(
+    monkeypatch, without, with_it, other_noise, left
+):
+    """Shares of the colour of q, where the effect shows; r is coloured whatever is done."""
+    shares = iter([without, with_it, other_noise])
+
+    def whiteness(passes, channels):
+        of = {"q": next(shares), "r": 0.5}
+        return {c: SimpleNamespace(white=x == 0.0, coloured_share=x) for c, x in of.items()}
+
+    monkeypatch.setattr(trials, "whiteness", whiteness)
+    monkeypatch.setattr(trials, "quadratic_at", lambda *of: (None, None))
+    monkeypatch.setattr(trials, "channels_of", lambda *of: ["q"])
+    problem = SimpleNamespace(
+        engine=SimpleNamespace(filter=lambda *of: []), model=SimpleNamespace(channels=("q", "r")),
+        own={"cg_offset": ()},
+    )  # fmt: skip
+    fit = Fit((), {}, Noise({}))
+    state = Changing(problem, fit, None, {})  # type: ignore[arg-type]
+    assert trials._leaves_colour(state, problem, fit, "cg_offset") == left  # type: ignore[arg-type]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "later",

@@ -461,6 +461,24 @@ def test_a_finger_turns_the_flight(seen):
             },
             "Unexplained structure is left in pitch rate",
         ),
+        (
+            {
+                "verdict": "unexplained",
+                "causes": [],
+                "unexplained": [
+                    {
+                        "channel": "r",
+                        "depends_on": [],
+                        "share": 0.1,
+                        "form": "as yaw damping would",
+                        "like": "yaw_damping",
+                        "evidence": 75.2,
+                        "why": ["it is at its limit"],
+                    }
+                ],
+            },
+            "worth 75 nats. The model has it, but it has no name: it is at its limit.",
+        ),
         ({"verdict": "partly explained"}, "explain a part of what the simulation got wrong"),
         ({"gain": None}, "how well this predicts is not known"),
         (

@@ -16,6 +16,7 @@ from coax_env.estimation.sparse import add_gram, find_non_zeros, padded, with_pl
 from coax_env.estimation.state_space import part
 from coax_env.estimation.swinging_gusts import SwingingModel
 from coax_env.model import effects
+from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 
 ACTIVE = {"motor_lag.upper": 0.07, "motor_lag.lower": 0.06, "servo_rate.limit": 3.0,
@@ -34,6 +35,18 @@ def one_by_one(model: HeliModel) -> HeliModel:
 
 def same(model: HeliModel) -> HeliModel:
     return model
+
+
+def erring(vehicle: Vehicle) -> HeliModel:
+    return ErringModel(HeliModel(vehicle))
+
+
+def erring_and_jittery(vehicle: Vehicle) -> HeliModel:
+    return ErringModel(JitteryModel(vehicle))
+
+
+def swinging(vehicle: Vehicle) -> HeliModel:
+    return SwingingModel(vehicle).swinging_at((0.6, 0.8, 1.1, 0.5, 0.0, 0.7))
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +73,9 @@ def flown():
         (HeliModel, LATE),
         (JitteryModel, ACTIVE),
         (JitteryModel, LATE),
-        (SwingingModel, ACTIVE),
-        (ErringModel, ACTIVE),
+        (swinging, ACTIVE),
+        (erring, ACTIVE),
+        (erring_and_jittery, LATE),
     ],
     ids=[
         "bare",
@@ -71,22 +85,20 @@ def flown():
         "jitter, late commands",
         "swings, six effects",
         "errors that last, six effects",
+        "errors that last and jitter, late commands",
     ],
 )
 def test_derivatives_in_lanes_are_those_one_by_one(flown, kind, active):
     """Likelihood and signatures to the rounding of their differences, effects on or off."""
     vehicle, record, noise, free, values = flown
-    if kind is JitteryModel:
+    if kind in (JitteryModel, erring_and_jittery):
         noise = with_jitter(noise, HeliModel(vehicle))
         free, values = [*free, REACTION], {**values, REACTION.name: 0.7}
+    if kind in (erring, erring_and_jittery):
+        noise = with_errors(noise)
     both = []
     for lanes in (same, one_by_one):
-        model = lanes(kind(vehicle))
-        if kind is ErringModel:
-            noise = with_errors(noise)
-        if kind is SwingingModel:
-            model = model.swinging_at((0.6, 0.8, 1.1, 0.5, 0.0, 0.7))
-        engine = Engine(model, [record])
+        engine = Engine(lanes(kind(vehicle)), [record])
         assert engine.compiled.has_lanes == (lanes is same)
         (run,), lin = engine.linearise({**values, **active}, noise, free)
         both.append((run.log_likelihood, lin))

@@ -15,6 +15,7 @@ from scipy.stats import binom, norm
 
 from coax_env.diagnosis import moves
 from coax_env.diagnosis import trust as trust_module
+from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.hold_out import fair_part
 from coax_env.diagnosis.moves import Proposal, accepted
 from coax_env.diagnosis.problem import Fit, Problem
@@ -296,6 +297,47 @@ def test_what_shows_where_another_stands_at_its_limit_is_doubted(size, channels,
     found = list(trust_module._beside_limits("servo_delay", channels, limited))
     assert bool(found) == doubted and all("gyro bias" in text for text in found)
     assert not list(trust_module._beside_limits("gyro_bias", ["p", "q"], limited))
+
+
+@pytest.mark.parametrize(
+    ("limited", "coloured", "falls", "beside", "kept", "named"),
+    [
+        (False, False, False, False, 1.0, True),
+        (False, True, False, False, 1.0, True),  # a doubt alone is a doubtful name
+        (False, False, True, False, 1.0, True),
+        (False, False, False, True, 1.0, True),
+        (False, True, True, False, 1.0, False),
+        (False, True, False, True, 1.0, False),
+        (False, True, False, False, 0.7, False),  # 30 % of the halves are without it
+        (False, False, False, False, 0.7, True),
+        (False, True, False, False, None, True),  # none could tell
+        (True, False, False, False, 1.0, False),
+    ],
+)
+def test_what_stands_for_something_else_has_no_name(
+    monkeypatch, limited, coloured, falls, beside, kept, named
+):
+    """An effect that shows in q, beside another that shows where it is told to."""
+    one, other = EFFECTS[:2]
+    parts = {one: Replication(1.0, kept, ()), other: Replication(1.0, 1.0, ())}
+    stand_ins = {
+        "replications": lambda *of: parts,
+        "not_holding": lambda *of: {one: ["half of all"] if falls else [], other: []},
+        "in_shocks": lambda *of: False,
+        "channels_of": lambda p, f, q, e: ["q"] if e == one or beside else ["h"],
+        "at_limit": lambda p, f, e: limited if e == one else True,
+        "determined": lambda *of: {},
+        "_sizes": lambda *of: [],
+        "_undetermined": lambda *of: [],
+    }
+    for name, stand_in in stand_ins.items():
+        monkeypatch.setattr(trust_module, name, stand_in)
+    white = {c: SimpleNamespace(white=not (c == "q" and coloured)) for c in ("q", "h")}
+    fit = Fit((one, other), {}, Noise({}))
+    worth = dict.fromkeys((one, other), Evidence(100.0, 1.0))
+    nothing: dict[str, tuple[str, ...]] = {one: (), other: ()}
+    found = trust_module.trusts(problem_of(8), fit, None, worth, nothing, white)  # type: ignore[arg-type]
+    assert found[one].named == named and not found[other].named
 
 
 def test_a_size_is_that_beyond_the_off_value():

@@ -200,7 +200,8 @@ def diagnose(
     causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)
-    unexplained = described + findings.unexplained(white["after"], speaking_for)
+    unnamed = findings.without_a_name(problem, fit, quadratic, evidence, trust, white["after"])
+    unexplained = described + unnamed + findings.unexplained(white["after"], speaking_for)
 
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     replays, gain = _gain(problem, (bare, refitted, fit), held, sensors, ceiling)
@@ -243,7 +244,7 @@ def diagnose(
             *double_counting(flight, vehicle),
             *([vibration_removed(lines)] if lines else []),
             *of_sensors,
-            *remarks(problem, fit, quadratic, found),
+            *remarks(problem, fit, quadratic, {e: found[e] for e in found if trust[e].named}),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
             *held_out_before(gain, causes, flight.run_names),
             *check.remarks,

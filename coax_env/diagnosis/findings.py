@@ -45,7 +45,7 @@ def causes(
         quadratic: linearised at the fit.
         evidence: of each cause.
         found: the confounded alternatives of each cause.
-        trust: what speaks for and against each name.
+        trust: what speaks for and against each name; one without a name is not among the causes.
         lines: of a vibration that the vehicle file does not have.
         onsets: of causes that began or changed.
     """
@@ -59,7 +59,7 @@ def causes(
         spread = stated_std(fit, f, std[f.name], inflation, dt)
         return {"value": float(fit.values[f.name]), "std": spread}
 
-    for effect in fit.active:
+    for effect in (e for e in fit.active if trust[e].named):
         known = {f.name: f for f in problem.own[effect]}
         last = [f for f in known.values() if AT not in f.name]
         factor = evidence[effect].inflation
@@ -186,6 +186,37 @@ def unexplained(white: Mapping[str, Whiteness], described: Collection[str]) -> l
         for c, w in white.items()
         if not w.white and c not in described
     ]
+
+
+def without_a_name(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    evidence: Mapping[str, Evidence],
+    trust: Mapping[str, Trust],
+    white: Mapping[str, Whiteness],
+) -> list[dict[str, Any]]:
+    """Entries of `unexplained` for what the model has and no name is given to.
+
+    Args:
+        problem, fit, quadratic, evidence, trust: as of `causes`.
+        white: whiteness of the innovations, by channel.
+    """
+    entries = []
+    for effect in (e for e in fit.active if not trust[e].named):
+        first = channels_of(problem, fit, quadratic, effect)[0]
+        entries.append(
+            {
+                "channel": first,
+                "depends_on": [],
+                "share": round(white[first].coloured_share, 3) if first in white else 0.0,
+                "form": f"as {plain(effect)} would",
+                "like": effect,
+                "evidence": evidence[effect].nats,
+                "why": list(trust[effect].doubts),
+            }
+        )
+    return entries
 
 
 def verdict(causes: Collection[Any], unexplained: Collection[Any]) -> str:

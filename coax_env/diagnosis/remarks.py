@@ -30,7 +30,7 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
     Args:
         problem, fit: with the causes.
         quadratic: linearised at the fit.
-        found: the confounded alternatives of each cause.
+        found: the confounded alternatives of each cause that is named.
     """
     return [
         *_slow_rows(problem),
@@ -196,14 +196,14 @@ def _resting_on_unseen(
     An interval covers what is in the model. A usual accelerometer scale is worth nothing on flights
     that never leave 1 g, and is then in the accelerometer's bias.
     """
-    if not fit.active:
+    if not found:
         return []
     chosen = problem.settings
     free = problem.free_names(fit.active)
     std = np.sqrt(np.diag(quadratic.covariance(free)))
     unseen = list(_not_named(problem, fit, found))
     information, regression = quadratic.projected([f.name for f in unseen], free)
-    of_cause = np.array([name.partition(".")[0] in fit.active for name in free], bool)
+    of_cause = np.array([name.partition(".")[0] in found for name in free], bool)
     worst: dict[str, tuple[float, str]] = {}
     for f, known, weights in zip(unseen, np.diag(information), regression.T, strict=True):
         if 0.5 * known * f.std**2 > chosen.evidence:

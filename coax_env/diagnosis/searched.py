@@ -43,6 +43,7 @@ from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_swings
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
+from coax_env.estimation.lasting_errors import with_inner
 from coax_env.estimation.low_pass import LowPass, before_low_pass, records_before
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import pooled_rms, replay_runs
@@ -166,14 +167,12 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
     Args:
         best: of the first search. noise: levels to start from.
         clock: of all runs in the order in which they were flown.
-        erring: whether readings have errors that last; nothing but shocks is asked for then.
+        erring: whether readings have errors that last; nothing but shocks and jitter is asked for then.
     """
     shaken = in_shocks(best.problem, best.fit)
     if shaken:
         best = _changed(best, clock) or _searched_in_shocks(best, noise)
-    if erring:
-        return best
-    swinging = None if shaken else with_swings(best.problem, best.fit)
+    swinging = None if shaken or erring else with_swings(best.problem, best.fit)
     if swinging is not None:
         problem, levels = swinging
         problem.report("gusts have a frequency: searching again with that")
@@ -186,6 +185,8 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
         noise = with_jitter(noise, problem.model).with_levels(levels)
         best = _searched(problem, noise)
         problem = best.problem
+    if erring:
+        return best
     coarser = _coarser(best.fit.noise)
     passes = problem.engine.filter(best.fit.values, best.fit.noise)
     if not coarser or is_white(passes, problem.model.channels):
@@ -317,7 +318,7 @@ def _with_jitter(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]]
     if all(shown[channel].white for channel in SHOWN_BY if channel in shown):
         return None
     chosen = problem.settings
-    wider = problem.with_model(JitteryModel.like(problem.model)).with_free([REACTION])
+    wider = problem.with_model(with_inner(problem.model, JitteryModel)).with_free([REACTION])
     start = with_jitter(fit.noise, wider.model)
     levels = (*fit.levels, JITTER_LEVEL, JITTER_MEMORY)
     trial = replace(fit.at({REACTION.name: REACTION.value}), levels=levels)

@@ -62,7 +62,7 @@ def with_lasting_errors(
 
 def _erring(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     """With errors that last, all levels and numbers fitted."""
-    wider = problem.with_model(ErringModel.like(problem.model))
+    wider = problem.with_model(ErringModel(problem.model))
     begun = with_errors(fit.noise)
     own = [name for name in LEVELS_OF_ERRORS if name in begun.process]
     trial = replace(fit, noise=begun, levels=(*own, *fit.levels))

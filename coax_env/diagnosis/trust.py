@@ -5,6 +5,10 @@ on halves of the flights (replication.py), with white innovations where it shows
 cause at its limit beside it, a number that the flights determine, no other effect that would do as
 well, and more evidence than something that no list has, or a single gust (shocks.py), gives a wrong
 name. A doubtful cause still improves the model, and stays in it.
+
+No name at all has what stands at the limit of what is believed, since something else is behind it; and
+where the model leaves more than noise, what is beside such a one or does not hold under other noise or
+on parts of the flights. The model keeps it, findings tell it among what is unexplained.
 """
 
 import math
@@ -43,6 +47,7 @@ class Trust:
         kept: share of halves in which it returns; None where none could tell.
         determined: parameter -> whether the flights say more of it than its prior did.
         doubts: reasons against the name, in plain words; none: it is sure.
+        named: whether it is stated as a cause; what is not is told among the unexplained.
     """
 
     noise: bool
@@ -50,6 +55,7 @@ class Trust:
     kept: float | None
     determined: Mapping[str, bool]
     doubts: tuple[str, ...]
+    named: bool = True
 
     @property
     def word(self) -> str:
@@ -93,19 +99,23 @@ def trusts(
     result = {}
     for effect in fit.active:
         known = determined(problem, fit, quadratic, effect, evidence[effect].inflation)
+        coloured = list(_not_white(channels[effect], white))
+        beside = list(_beside_limits(effect, channels[effect], limited))
         doubts = (
-            *_not_white(channels[effect], white),
+            *coloured,
             *_under_noise(falling[effect]),
             *on_parts(replicated[effect], runs, problem.settings),
             *_sizes(problem, fit, effect),
-            *_beside_limits(effect, channels[effect], limited),
+            *beside,
             *_undetermined(problem, effect, known),
             *_alternatives(found[effect]),
             *_weak(worth[effect], shaken, problem.settings),
         )
         of_parts = replicated[effect]
+        falls = falling[effect] or not _returns(of_parts, runs, problem.settings)
+        named = effect not in limited and not (coloured and (falls or beside))
         result[effect] = Trust(
-            not falling[effect], of_parts.runs, of_parts.kept, known, tuple(doubts)
+            not falling[effect], of_parts.runs, of_parts.kept, known, tuple(doubts), named
         )
     return result
 
@@ -195,6 +205,12 @@ def on_parts(of_parts: Replication, runs: int, chosen: Settings) -> Iterable[str
         yield "no half of the flights could tell"
     elif of_parts.kept < chosen.least_kept:
         yield f"it returns in {100.0 * of_parts.kept:.0f} % of the halves of the flights"
+
+
+def _returns(of_parts: Replication, runs: int, chosen: Settings) -> bool:
+    """Whether a name returns on enough parts of the flights, as far as these can tell."""
+    enough = runs < 2 or of_parts.runs >= chosen.least_runs
+    return enough and (of_parts.kept is None or of_parts.kept >= chosen.least_kept)
 
 
 def _sizes(problem: Problem, fit: Fit, effect: str) -> Iterable[str]:

@@ -24,6 +24,7 @@ from coax_env.estimation.helicopter import (
     HeliModel,
     Moment,
     Motion,
+    compiled_motion,
     side_by_side,
 )
 from coax_env.estimation.parted_engine import AT, of_part
@@ -81,11 +82,9 @@ def _pointers(motion: Motion, name: str) -> tuple[Any, Any, Any]:
     """`step`, `measure` and `drift_and_readings` that fly each row as a model does with its block.
 
     Args:
-        motion: the model's. name: its class', by which numba's cache tells them apart.
+        motion: the model's. name: its kind, by which numba's cache tells them apart.
     """
-    step, measure, drift = (
-        compiled()(under_names(function, {}, f"of_{name}")) for function in motion
-    )
+    step, measure, drift = compiled_motion(motion, {}, f"of_{name}")
     kind = f"changing_{name}"
     return (
         pointer(STEP)(under_names(_step, {"step_of": step}, kind)),
@@ -211,9 +210,7 @@ class ChangingModel(HeliModel):
     ) -> None:
         super().__init__(base.vehicle, base.bare_values)
         self._base, self.moments, self.clock = base, dict(moments), dict(clock)
-        self.step, self.measure, self.drift_and_readings = _pointers(
-            base.motion, type(base).__name__
-        )
+        self.step, self.measure, self.drift_and_readings = _pointers(base.motion, base.kind)
         at_once = {m: e for e, m in self.moments.items() if m.grows == 0.0}
         self._changes = [*at_once.values(), *(e for e, m in self.moments.items() if m.grows > 0.0)]
         self._size = base.vector(base.bare_values).size
@@ -231,7 +228,7 @@ class ChangingModel(HeliModel):
         """The base's own, block by block; None where it has none."""
         if self.base.side_by_side is None:
             return None
-        return side_by_side(self.base.motion, f"changing_{type(self.base).__name__}", OF_LANES)
+        return side_by_side(self.base.motion, f"changing_{self.base.kind}", OF_LANES)
 
     def time(self, moment: Moment) -> float:
         """A moment on the clock [s]."""

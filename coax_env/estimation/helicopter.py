@@ -139,17 +139,47 @@ def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) 
 
 
 class Motion(NamedTuple):
-    """A model's `step`, `measure` and `drift_and_readings`, not compiled."""
+    """A model's `step`, `measure` and `drift_and_readings`, not compiled.
+
+    inner: those of the model that they call as `inner_step` and its like, if they call one.
+    """
 
     step: Any
     measure: Any
     drift_and_readings: Any
+    inner: "Motion | None" = None
+
+
+def _around(motion: Motion, names: Mapping[str, Any], kind: str) -> dict[str, Any]:
+    """The inner model's three, compiled, by the names that a motion calls them by.
+
+    Args:
+        motion: with an inner one or without. names, kind: as of `compiled_motion`.
+    """
+    if motion.inner is None:
+        return {}
+    inner = compiled_motion(motion.inner, names, kind)
+    return dict(zip(("inner_step", "inner_measure", "inner_drift"), inner, strict=True))
+
+
+def compiled_motion(motion: Motion, names: Mapping[str, Any], kind: str) -> tuple[Any, Any, Any]:
+    """A model's three, compiled, for other compiled code to call.
+
+    Args:
+        motion: the model's. names: what some global names mean in them. kind: see `under_names`.
+    """
+    known = {**names, **_around(motion, names, f"in_{kind}")}
+    step, measure, drift = (compiled()(under_names(f, known, kind)) for f in motion[:3])
+    return step, measure, drift
 
 
 @cache
 def pointers(motion: Motion) -> tuple[Any, Any, Any]:
     """A model's three, as the engine takes them: compiled when a model of its kind is first made."""
-    step, measure, drift = motion
+    step, measure, drift = motion[:3]
+    if motion.inner is not None:
+        known = _around(motion, {}, f"in_{step.__qualname__}")
+        step, measure, drift = (under_names(f, known, "around") for f in motion[:3])
     return pointer(STEP)(step), pointer(MEASURE)(measure), pointer(STEP)(drift)
 
 
@@ -202,13 +232,13 @@ def side_by_side(motion: Motion, kind: str, of_lanes: Motion = OF_LANES) -> Any:
     """
     step, measure, drift = dynamics.motion_of_registers()
     kernel = {"kernel_step": step, "kernel_measure": measure, "kernel_drift": drift}
-    own = [compiled()(under_names(f, kernel, f"of_registers_{kind}")) for f in motion]
+    own = compiled_motion(motion, kernel, f"of_registers_{kind}")
     names = dict(zip(("step_of", "measure_of", "drift_of"), own, strict=True))
     signatures = (LANES_STEP, LANES_MEASURE, LANES_STEP)
     try:
         return tuple(
             pointer(signature.signature)(under_names(f, names, kind))
-            for signature, f in zip(signatures, of_lanes, strict=True)
+            for signature, f in zip(signatures, of_lanes[:3], strict=True)
         )
     except numba.core.errors.NumbaError:
         return None
@@ -247,7 +277,12 @@ class HeliModel:
     @property
     def side_by_side(self) -> Any:
         """`step`, `measure` and `drift_and_readings` of SIMD_WIDTH at once, or None."""
-        return side_by_side(self.motion, type(self).__name__)
+        return side_by_side(self.motion, self.kind)
+
+    @property
+    def kind(self) -> str:
+        """The name by which numba's cache tells its compiled functions from another model's."""
+        return type(self).__name__
 
     def __init__(self, vehicle: Vehicle, held: Mapping[str, float] | None = None) -> None:
         """Of a vehicle; ``held``: values that effects which it does not have would take as stated."""

@@ -188,12 +188,18 @@ LOADS = {
 def _unexplained(findings: Findings, vehicle: Vehicle) -> list[str]:
     """Structure beyond the causes, what the fitted model does not make, and the gusts."""
     with_form = [u for u in findings["unexplained"] if u["depends_on"]]
-    without = [u for u in findings["unexplained"] if not u["depends_on"]]
+    unnamed = [u for u in findings["unexplained"] if "like" in u]
+    without = [u for u in findings["unexplained"] if not u["depends_on"] and "like" not in u]
     lines = [
         f"A **{LOADS.get(u['channel'], channel_name(u['channel']))}** that follows "
         f"{and_list([channel_name(d) for d in u['depends_on']])}: {u['form']}. It is "
         f"{100 * u['share']:.0f} % of what the model leaves there."
         for u in with_form
+    ]
+    lines += [
+        f"In **{channel_name(u['channel'])}** something goes **{u['form']}**, worth "
+        f"{number(u['evidence'])} nats. The model has it, but it has no name: {'; '.join(u['why'])}."
+        for u in unnamed
     ]
     if without:
         shares = and_list(

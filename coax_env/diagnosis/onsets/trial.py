@@ -25,6 +25,9 @@ name's, what numbers and moment cost, and what a close fit finds; ours."""
 MADE_UP = 300.0
 """nats that a change, fitted as a step, may still gain beyond what the best so far gained from then on.
 Measured on eight synthetic flights (study_changes.py, seed 40): 260 at most, of 15 rivals; ours."""
+LEFT = 0.5
+"""Share of a channel's colour that a step may leave where it shows: what leaves more is not what
+colours the channel, as a step or growing, and growth takes three times as long to fit; ours."""
 OVER = (0.5, 1.5)
 """s before and after a moment in which a gust may have made the evidence; ours."""
 
@@ -59,7 +62,8 @@ def fitted_change(
 ) -> Trial | None:
     """A change fitted at its best moment, and what it is worth beside the state without it.
 
-    None where the filter diverges with it, or where it is out of the best's reach.
+    None where the filter diverges with it, where it is out of the best's reach, or where it leaves most
+    of the colour where it shows.
 
     It is fitted from the steady noise in which it was seen. What ends has numbers after it too. The
     quadratic is that of what is free.
@@ -85,6 +89,8 @@ def fitted_change(
     if best is not None and best.is_out_of_reach(state, step):
         return None
     problem, found = moved_to_best(problem, trial, effect)
+    if _leaves_colour(state, problem, trial, effect):
+        return None
     problem, trial, found = grown_or_step(problem, trial, found)
     trial = _with_noise_of(problem, trial, state.fit)
     trial, rivals = _compared(state, problem, trial, effect)
@@ -96,6 +102,32 @@ def fitted_change(
     onset = _worth(state, problem, trial, rivals, quadratic, found)
     changing_state = Changing(problem, trial, quadratic, {**state.onsets, effect: onset})
     return Trial(changing_state, onset, step.objective - trial.objective)
+
+
+def _leaves_colour(state: Changing, problem: Problem, trial: Fit, effect: str) -> bool:
+    """Whether a channel that shows a change stays coloured with it, by more than LEFT of what it was.
+
+    Args:
+        state: without the change. problem, trial: with it, as a step. effect: that changes.
+    """
+    without = whiteness(
+        state.problem.engine.filter(state.fit.values, state.fit.noise), problem.model.channels
+    )
+    _, quadratic = quadratic_at(problem, trial, problem.own[effect])
+    shows = [c for c in channels_of(problem, trial, quadratic, effect) if not without[c].white]
+    if not shows:
+        return False
+    with_it = [
+        whiteness(problem.engine.filter(trial.values, noise), problem.model.channels)
+        for noise in (trial.noise, state.fit.noise)
+    ]
+    return any(
+        all(
+            not left[c].white and left[c].coloured_share > LEFT * without[c].coloured_share
+            for left in with_it
+        )
+        for c in shows
+    )
 
 
 def _with_noise_of(problem: Problem, trial: Fit, fit: Fit) -> Fit:
