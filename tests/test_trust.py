@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from coax_env.diagnosis import moves
+from coax_env.diagnosis import moves, replication
 from coax_env.diagnosis import trust as trust_module
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.hold_out import fair_part
@@ -297,6 +297,37 @@ def test_what_shows_where_another_stands_at_its_limit_is_doubted(size, channels,
     found = list(trust_module._beside_limits("servo_delay", channels, limited))
     assert bool(found) == doubted and all("gyro bias" in text for text in found)
     assert not list(trust_module._beside_limits("gyro_bias", ["p", "q"], limited))
+
+
+def test_two_that_stand_for_each_other_are_not_exchanged_without_end(monkeypatch):
+    problem, rng = problem_of(8), np.random.default_rng(1)
+    fit, quadratic, worth = fitted_to(problem, *drawn(rng, [1.0] * 8, [1.0] * 8), EFFECTS[:1])
+    other = {EFFECTS[0]: EFFECTS[1], EFFECTS[1]: EFFECTS[0]}
+    monkeypatch.setattr(
+        replication, "_exchange", lambda problem, part, active, names: (active[0], other[active[0]])
+    )
+    assert set(replications(problem, fit, quadratic, worth)) == {EFFECTS[0]}
+
+
+def test_what_left_explains_nothing_any_more():
+    """Two effects of one column share what it does; without the one, the other has it all."""
+    problem, rng = problem_of(8), np.random.default_rng(2)
+    designs, y = drawn(rng, [1.0] * 8, [1.0] * 8)
+    for X in designs:
+        X[:, 2] = X[:, 1]
+    problem = replace(problem, own={e: (FreeParameter(n, 0.0, 1.0),) for e, n in
+                                    zip(EFFECTS, NAMES, strict=True)})  # fmt: skip
+    fit, quadratic, _ = fitted_to(problem, designs, y, EFFECTS[:2])
+    assert (
+        fit.values[NAMES[0]] == pytest.approx(fit.values[NAMES[1]]) == pytest.approx(0.5, abs=0.1)
+    )
+    left = quadratic.held_at(problem.off_values(EFFECTS[0]))
+    _, move = left.best(problem.free_names(EFFECTS[1:2]))
+    assert left.moved(move)[NAMES[1]] == pytest.approx(1.0, abs=0.1)
+    assert left.moved(move)[NAMES[0]] == 0.0
+    _, same = quadratic.best(problem.free_names(EFFECTS[1:2]), {NAMES[0]: 0.0})
+    assert quadratic.moved(same) == pytest.approx(left.moved(move))
+    assert lost(problem, left, EFFECTS[1:2], EFFECTS[1]) > 300.0  # 800 readings of 1 std
 
 
 @pytest.mark.parametrize(

@@ -163,10 +163,12 @@ def _standing(
     """Whether each name stands on a part of the flights; None where the part cannot tell.
 
     The weakest name is dropped, or exchanged for what explains it better, until all that is left
-    stands.
+    stands. What left has its off-value from then on: held where it was fitted, it would still explain
+    what it did, and two that stand for each other would be exchanged without end.
     """
     asked = {e: Asked.of(problem, fit, known[e], of_part) for e in fit.active}
     active = list(fit.active)
+    seen: set[frozenset[str]] = set()
     while active:
         margins = {
             e: asked[e].margin(lost(problem, of_part, active, e)) if e in asked else math.inf
@@ -175,12 +177,19 @@ def _standing(
         weakest = min(margins, key=lambda e: margins[e])
         if margins[weakest] < 0.0:
             active.remove(weakest)
+            of_part = of_part.held_at(problem.off_values(weakest) | problem.file_values(weakest))
             continue
         exchange = _exchange(problem, of_part, active, [e for e in active if e in asked])
         if exchange is None:
             break
+        seen.add(frozenset(active))
         old, new = exchange
         active[active.index(old)] = new
+        if frozenset(active) in seen:
+            break  # each for the other, by what a bound or Occam's factor makes of it
+        of_part = of_part.held_at(
+            problem.off_values(old) | problem.file_values(old) | problem.file_values(new)
+        )
     result: dict[str, bool | None] = {}
     for effect, of_one in asked.items():
         stands = effect in active and same_way(problem, fit, of_part, active, effect)

@@ -100,6 +100,19 @@ class Quadratic:
             by_channel=self.parts.by_channel[chosen].sum(0),
         )
 
+    def held_at(self, values: Mapping[str, float]) -> "Quadratic":
+        """The same parabola about a point at which some parameters have other values.
+
+        Its least values differ from this one's by a constant. Its parts and blocks stay this one's.
+
+        Args:
+            values: of these parameters.
+        """
+        i = self.index(values.keys())
+        move = np.zeros(len(self.names))
+        move[i] = np.array(list(values.values())) - self.at[i]
+        return replace(self, at=self.at + move, g=self.g + self.G @ move)
+
     @cached_property
     def _places(self) -> dict[str, int]:
         return {name: i for i, name in enumerate(self.names)}
