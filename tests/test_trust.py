@@ -331,24 +331,27 @@ def test_what_left_explains_nothing_any_more():
 
 
 @pytest.mark.parametrize(
-    ("limited", "coloured", "falls", "beside", "kept", "named"),
+    ("limited", "coloured", "undetermined", "falls", "beside", "kept", "named"),
     [
-        (False, False, False, False, 1.0, True),
-        (False, True, False, False, 1.0, True),  # a doubt alone is a doubtful name
-        (False, False, True, False, 1.0, True),
-        (False, False, False, True, 1.0, True),
-        (False, True, True, False, 1.0, False),
-        (False, True, False, True, 1.0, False),
-        (False, True, False, False, 0.7, False),  # 30 % of the halves are without it
-        (False, False, False, False, 0.7, True),
-        (False, True, False, False, None, True),  # none could tell
-        (True, False, False, False, 1.0, False),
+        (False, False, False, False, False, 1.0, True),
+        (False, True, True, False, False, 1.0, True),  # a doubtful name
+        (True, True, False, False, False, 1.0, True),
+        (False, False, False, True, False, 1.0, True),
+        (False, False, False, False, True, 1.0, True),
+        (False, True, False, True, False, 1.0, False),
+        (False, True, False, False, True, 1.0, False),
+        (False, True, False, False, False, 0.7, False),  # 30 % of the halves are without it
+        (False, False, False, False, False, 0.7, True),
+        (False, False, False, True, True, 1.0, False),
+        (False, True, False, False, False, None, True),  # none could tell
+        (True, False, True, False, False, 1.0, False),
+        (True, False, False, True, False, 1.0, False),
     ],
 )
 def test_what_stands_for_something_else_has_no_name(
-    monkeypatch, limited, coloured, falls, beside, kept, named
+    monkeypatch, limited, coloured, undetermined, falls, beside, kept, named
 ):
-    """An effect that shows in q, beside another that shows where it is told to."""
+    """An effect that shows in q, with another one, without a name, that shows there or elsewhere."""
     one, other = EFFECTS[:2]
     parts = {one: Replication(1.0, kept, ()), other: Replication(1.0, 1.0, ())}
     stand_ins = {
@@ -357,9 +360,8 @@ def test_what_stands_for_something_else_has_no_name(
         "in_shocks": lambda *of: False,
         "channels_of": lambda p, f, q, e: ["q"] if e == one or beside else ["h"],
         "at_limit": lambda p, f, e: limited if e == one else True,
-        "determined": lambda *of: {},
+        "determined": lambda p, f, q, e, i: dict.fromkeys(NAMES, e == one and not undetermined),
         "_sizes": lambda *of: [],
-        "_undetermined": lambda *of: [],
     }
     for name, stand_in in stand_ins.items():
         monkeypatch.setattr(trust_module, name, stand_in)
@@ -368,6 +370,7 @@ def test_what_stands_for_something_else_has_no_name(
     worth = dict.fromkeys((one, other), Evidence(100.0, 1.0))
     nothing: dict[str, tuple[str, ...]] = {one: (), other: ()}
     found = trust_module.trusts(problem_of(8), fit, None, worth, nothing, white)  # type: ignore[arg-type]
+    assert list(found) == [one, other]
     assert found[one].named == named and not found[other].named
 
 

@@ -6,9 +6,10 @@ cause at its limit beside it, a number that the flights determine, no other effe
 well, and more evidence than something that no list has, or a single gust (shocks.py), gives a wrong
 name. A doubtful cause still improves the model, and stays in it.
 
-No name at all has what stands at the limit of what is believed, since something else is behind it; and
-where the model leaves more than noise, what is beside such a one or does not hold under other noise or
-on parts of the flights. The model keeps it, findings tell it among what is unexplained.
+No name at all has what stands at the limit of what is believed and is not determined, or does not hold
+under other noise or on parts of the flights; nor of what shows where the model leaves more than noise,
+what does not hold so, or shows beside such a one at its limit. The model keeps it, findings tell it
+among what is unexplained.
 """
 
 import math
@@ -33,6 +34,9 @@ from coax_env.plain_words import and_list, channel_name, plain
 
 AT_BOUND = 0.99
 """Share of the most usual sizes from which a number stands at its bound; ours."""
+SPEAKING_AGAINST = 2
+"""Of three that speak against a name, colour where it shows, parts and noise under which it does not
+hold, and something at its limit without a name beside it, so many take the name; ours."""
 MOST_VARIATIONS = 3
 """Variations of the noise that a doubt names; of more, their number; ours."""
 
@@ -97,27 +101,33 @@ def trusts(
     channels = {e: channels_of(problem, fit, quadratic, e) for e in fit.active}
     limited = {e: channels[e] for e in fit.active if at_limit(problem, fit, e)}
     result = {}
-    for effect in fit.active:
+    unnamed: dict[str, Sequence[str]] = {}
+    for effect in sorted(fit.active, key=lambda e: e not in limited):
         known = determined(problem, fit, quadratic, effect, evidence[effect].inflation)
         coloured = list(_not_white(channels[effect], white))
-        beside = list(_beside_limits(effect, channels[effect], limited))
+        undetermined = list(_undetermined(problem, effect, known))
         doubts = (
             *coloured,
             *_under_noise(falling[effect]),
             *on_parts(replicated[effect], runs, problem.settings),
             *_sizes(problem, fit, effect),
-            *beside,
-            *_undetermined(problem, effect, known),
+            *_beside_limits(effect, channels[effect], limited),
+            *undetermined,
             *_alternatives(found[effect]),
             *_weak(worth[effect], shaken, problem.settings),
         )
         of_parts = replicated[effect]
         falls = falling[effect] or not _returns(of_parts, runs, problem.settings)
-        named = effect not in limited and not (coloured and (falls or beside))
+        if effect in limited and (falls or undetermined):
+            unnamed[effect] = channels[effect]
+        beside = list(_beside_limits(effect, channels[effect], unnamed))
+        if sum(map(bool, (coloured, falls, beside))) >= SPEAKING_AGAINST:
+            unnamed.setdefault(effect, ())
         result[effect] = Trust(
-            not falling[effect], of_parts.runs, of_parts.kept, known, tuple(doubts), named
-        )
-    return result
+            not falling[effect], of_parts.runs, of_parts.kept, known, tuple(doubts),
+            effect not in unnamed,
+        )  # fmt: skip
+    return {effect: result[effect] for effect in fit.active}
 
 
 def of_line(line: Line, chosen: Settings = SETTINGS) -> Trust:
