@@ -293,6 +293,38 @@ def test_a_line_between_readings_on_a_clock_that_was_logged_wrong_is_none():
     assert np.mean(interpolated(logged, y)[:-5] == ~new[:-5]) > 0.97
 
 
+def with_outliers(y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One row of 250 off by up to 0.4."""
+    return np.where(rng.random(y.size) < 0.004, y + rng.uniform(-0.4, 0.4, y.size), y)
+
+
+@pytest.mark.parametrize("every", [2, 3, 5])
+@pytest.mark.parametrize("digits", [None, 5])
+def test_a_line_between_readings_is_none_where_it_is_as_coarse_as_half_their_noise(every, digits):
+    """With outliers of its own, rows that are missing, and the steps written with more decimals."""
+    rng = np.random.default_rng(12)
+    t = np.arange(0.0, 15.0, 0.01)
+    readings = 0.3 * np.sin(2.0 * t[::every]) + rng.normal(0.0, 0.03, t[::every].size)
+    y = 0.0149 * np.round(with_outliers(np.interp(t, t[::every], readings), rng) / 0.0149)
+    y = y if digits is None else np.round(y, digits)
+    kept = np.ones(t.size, bool)
+    kept[rng.integers(0, t.size, 10)] = False
+    new = (np.arange(t.size) % every == 0)[kept]
+    assert np.mean(interpolated(t[kept], y[kept]) == ~new) > 0.99
+    alone = 0.3 * np.sin(2.0 * t) + rng.normal(0.0, 0.03, t.size)
+    assert not interpolated(t, 0.0149 * np.round(with_outliers(alone, rng) / 0.0149)).any()
+
+
+@pytest.mark.parametrize("every", [2, 5])
+def test_a_held_coarse_sensor_is_known_in_spite_of_outliers(every):
+    rng = np.random.default_rng(13)
+    t = np.arange(0.0, 15.0, 0.01)
+    readings = 0.3 * np.sin(2.0 * t[::every]) + rng.normal(0.0, 0.03, t[::every].size)
+    y = with_outliers(np.repeat(readings, every)[: t.size], rng)
+    found = repeats(0.06 * np.round(y / 0.06), None, t)
+    assert np.mean(found == (np.arange(t.size) % every != 0)) > 0.99
+
+
 @pytest.mark.parametrize("rounded", [None, 4])
 @pytest.mark.parametrize("every", [2, 5, 10])
 def test_a_line_between_readings_is_no_reading(every, rounded):

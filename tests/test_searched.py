@@ -97,8 +97,9 @@ def believes_its_sensors(monkeypatch) -> None:
     ],
 )
 def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had, costs, active):
-    """From it, and from none: the likelier end stands, and nothing but shocks is asked then."""
+    """From it, and from none: the likelier end stands, and shocks and jitter alone are asked then."""
     plain, wider = (SimpleNamespace(name=n, report=lambda text: None) for n in ("plain", "wider"))
+    asked: list[Any] = []
 
     def one(problem: Any, noise: Noise, coarse: bool = False) -> Searched:
         fit = Fit(("wind",) if problem is wider else had, {}, noise)
@@ -112,12 +113,13 @@ def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had,
     )
     monkeypatch.setattr(searched, "_white_since", lambda best, clock, gained: None)
     monkeypatch.setattr(searched, "search", lambda problem, fit: (fit, None))
+    monkeypatch.setattr(searched, "_with_jitter", lambda problem, fit: asked.append(problem))
     monkeypatch.setattr(searched, "cost", lambda problem, fit, quadratic: costs[fit.active[0]])
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     found = searched.searched(plain, FINE, {})  # type: ignore[arg-type]
     assert found.problem is wider and found.fit.active == active
-    assert found.refitted.noise is lasting
+    assert found.refitted.noise is lasting and asked == [wider]
 
 
 @pytest.mark.parametrize(
@@ -164,7 +166,7 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
 
 
 def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypatch):
-    """Without what cannot be told from the rest of it where rotors follow at once."""
+    """Without what cannot be told from what is left of it."""
     t, smooth = 0.01 * np.arange(30), np.linspace(0.0, 1.0, 30)
     record = Record("a", t, np.zeros((30, 4)), np.stack([smooth, smooth], axis=1))
     model = SimpleNamespace(channels=("ax", "h"), vehicle=SimpleNamespace(effects=()))
@@ -208,14 +210,13 @@ def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypa
     ("active", "own", "smoothed", "hidden"),
     [
         ((), (), ("ax",), {"thrust_exponent"}),
-        ((), (), ("p",), set()),  # no command acts on a rate within its row
+        ((), (), ("p",), {"attitude_delay"}),  # no command acts on a rate within its row
+        ((), (), ("p", "ax"), {"attitude_delay", "thrust_exponent"}),
         (("motor_lag",), (), ("ax",), set()),
         ((), ("motor_lag",), ("ax",), set()),
     ],
 )
-def test_an_exponent_of_thrust_hides_behind_a_low_pass_where_rotors_follow_at_once(
-    active, own, smoothed, hidden
-):
+def test_what_hides_behind_a_low_pass(active, own, smoothed, hidden):
     problem = SimpleNamespace(model=SimpleNamespace(vehicle=SimpleNamespace(effects=own)))
     fit = Fit(active, {}, FINE)
     passes = dict.fromkeys(smoothed, LowPass(0.008))

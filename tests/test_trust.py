@@ -331,25 +331,29 @@ def test_what_left_explains_nothing_any_more():
 
 
 @pytest.mark.parametrize(
-    ("limited", "coloured", "undetermined", "falls", "beside", "kept", "named"),
+    ("limited", "coloured", "undetermined", "falls", "beside", "kept", "nats", "named"),
     [
-        (False, False, False, False, False, 1.0, True),
-        (False, True, True, False, False, 1.0, True),  # a doubtful name
-        (True, True, False, False, False, 1.0, True),
-        (False, False, False, True, False, 1.0, True),
-        (False, False, False, False, True, 1.0, True),
-        (False, True, False, True, False, 1.0, False),
-        (False, True, False, False, True, 1.0, False),
-        (False, True, False, False, False, 0.7, False),  # 30 % of the halves are without it
-        (False, False, False, False, False, 0.7, True),
-        (False, False, False, True, True, 1.0, False),
-        (False, True, False, False, False, None, True),  # none could tell
-        (True, False, True, False, False, 1.0, False),
-        (True, False, False, True, False, 1.0, False),
+        (False, False, False, False, False, 1.0, 100.0, True),
+        (False, True, True, False, False, 1.0, 100.0, True),  # a doubtful name
+        (True, True, False, False, False, 1.0, 100.0, True),
+        (False, False, False, True, False, 1.0, 100.0, True),
+        (False, False, False, False, True, 1.0, 100.0, True),
+        (False, False, False, False, False, 0.7, 100.0, True),  # 30 % of the halves are without it
+        (False, True, False, False, False, None, 100.0, True),  # none could tell
+        (False, False, False, False, False, 1.0, 30.0, True),
+        (False, False, False, True, False, 1.0, 30.0, True),
+        (False, True, False, False, False, 1.0, 30.0, False),
+        (False, True, False, True, False, 1.0, 100.0, False),
+        (False, True, False, False, True, 1.0, 100.0, False),
+        (False, True, False, False, False, 0.7, 100.0, False),
+        (False, False, False, True, True, 1.0, 100.0, False),
+        (False, False, False, True, False, 0.7, 100.0, False),
+        (True, False, True, False, False, 1.0, 100.0, False),
+        (True, False, False, True, False, 1.0, 100.0, False),
     ],
 )
 def test_what_stands_for_something_else_has_no_name(
-    monkeypatch, limited, coloured, undetermined, falls, beside, kept, named
+    monkeypatch, limited, coloured, undetermined, falls, beside, kept, nats, named
 ):
     """An effect that shows in q, with another one, without a name, that shows there or elsewhere."""
     one, other = EFFECTS[:2]
@@ -367,7 +371,7 @@ def test_what_stands_for_something_else_has_no_name(
         monkeypatch.setattr(trust_module, name, stand_in)
     white = {c: SimpleNamespace(white=not (c == "q" and coloured)) for c in ("q", "h")}
     fit = Fit((one, other), {}, Noise({}))
-    worth = dict.fromkeys((one, other), Evidence(100.0, 1.0))
+    worth = {one: Evidence(nats, 1.0), other: Evidence(100.0, 1.0)}
     nothing: dict[str, tuple[str, ...]] = {one: (), other: ()}
     found = trust_module.trusts(problem_of(8), fit, None, worth, nothing, white)  # type: ignore[arg-type]
     assert list(found) == [one, other]

@@ -7,9 +7,9 @@ well, and more evidence than something that no list has, or a single gust (shock
 name. A doubtful cause still improves the model, and stays in it.
 
 No name at all has what stands at the limit of what is believed and is not determined, or does not hold
-under other noise or on parts of the flights; nor of what shows where the model leaves more than noise,
-what does not hold so, or shows beside such a one at its limit. The model keeps it, findings tell it
-among what is unexplained.
+under other noise or on parts of the flights; nor what two of these speak against: other noise, parts of
+the flights, noise left where it shows, little evidence there, such a one beside it. The model keeps it,
+findings tell it among what is unexplained.
 """
 
 import math
@@ -35,8 +35,8 @@ from coax_env.plain_words import and_list, channel_name, plain
 AT_BOUND = 0.99
 """Share of the most usual sizes from which a number stands at its bound; ours."""
 SPEAKING_AGAINST = 2
-"""Of three that speak against a name, colour where it shows, parts and noise under which it does not
-hold, and something at its limit without a name beside it, so many take the name; ours."""
+"""Of what speaks against a name so much takes it: colour where it shows, little evidence beside that,
+parts of the flights and noise under which it does not hold, something at its limit beside it; ours."""
 MOST_VARIATIONS = 3
 """Variations of the noise that a doubt names; of more, their number; ours."""
 
@@ -117,11 +117,13 @@ def trusts(
             *_weak(worth[effect], shaken, problem.settings),
         )
         of_parts = replicated[effect]
-        falls = falling[effect] or not _returns(of_parts, runs, problem.settings)
-        if effect in limited and (falls or undetermined):
+        gone = not _returns(of_parts, runs, problem.settings)
+        if effect in limited and (falling[effect] or gone or undetermined):
             unnamed[effect] = channels[effect]
         beside = list(_beside_limits(effect, channels[effect], unnamed))
-        if sum(map(bool, (coloured, falls, beside))) >= SPEAKING_AGAINST:
+        weak = coloured and worth[effect] < problem.settings.sure_evidence
+        against = (coloured, weak, falling[effect], gone, beside)
+        if sum(map(bool, against)) >= SPEAKING_AGAINST:
             unnamed.setdefault(effect, ())
         result[effect] = Trust(
             not falling[effect], of_parts.runs, of_parts.kept, known, tuple(doubts),

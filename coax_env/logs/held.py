@@ -46,7 +46,7 @@ def repeats(
     inner = np.diff(starts)[1:]  # times that each value shows, without the first and the last one
     if inner.size < FEWEST:
         return found
-    off_beat = _off_beat(_row_numbers(present, t), starts[1:])
+    off_beat = _off_beat(_row_numbers(present, t), starts[1:][~_is_spike(y)[starts[1:]]])
     if off_beat is not None:
         found[present[again & off_beat]] = True
         return found
@@ -72,6 +72,14 @@ ON_THE_BEAT = 0.95
 read at the others; ours."""
 FEWEST_ON_IT = 25  # changes: of two rows in turn, chance makes so many in 3 million logs one; ours
 SLOWEST_BEAT = 50  # rows from one reading to the next; ours
+
+
+def _is_spike(y: np.ndarray) -> np.ndarray:
+    """Where a row alone is off, (n,) bool, and the one that is back: an outlier, no new reading."""
+    off = np.zeros(y.size, bool)
+    alone = np.flatnonzero((y[1:-1] != y[:-2]) & (y[2:] == y[:-2])) + 1
+    off[alone] = off[alone + 1] = True
+    return off
 
 
 def _row_numbers(present: np.ndarray, t: np.ndarray | None) -> np.ndarray:
@@ -134,6 +142,8 @@ LEAST_KINK = 3.0
 MOST_DIGITS = 9  # behind the point, in which a rounding is looked for
 MOST_APART = 8  # roundings between the two numbers that are next to each other
 OFF_GRID = 0.05  # of a rounding: more is no number of that grid
+SAME = 1e-6  # of the widest step between two levels: closer, they are one; ours
+OFF_STEP = 0.2  # of a coarse sensor's step: its numbers are rounded once more; ours
 A_FEW = 32  # numbers that are asked first: where they have more decimals, so have all
 
 
@@ -150,25 +160,82 @@ def interpolated(t: np.ndarray, values: np.ndarray, angle: bool = False) -> np.n
     present = np.flatnonzero(~np.isnan(values))
     if present.size < 3 * FEWEST:
         return found
-    at, y = t[present], values[present]
-    rounding = max(_rounding(y), 1e-9 * float(np.abs(y).max()))
+    y = values[present]
+    rounding, grid = max(_rounding(y), 1e-9 * float(np.abs(y).max())), _grid(y)
     y = np.unwrap(y) if angle else y
+    inside = _on_lines_or_cubics(t[present], present, y, rounding)
+    if not inside.any() and grid > 0.0:
+        inside = _on_coarse_lines(_row_numbers(present, t), y, grid)
+    found[present[inside]] = True
+    return found
+
+
+def _on_lines_or_cubics(
+    at: np.ndarray, rows: np.ndarray, y: np.ndarray, rounding: float
+) -> np.ndarray:
+    """Where numbers that are far finer than their sensor lie on lines or cubics, (n,) bool.
+
+    Args:
+        at: (n,) time [s]. rows: (n,) places. y: (n,) numbers. rounding: unit of their last decimal.
+    """
+    found = np.zeros(y.size, bool)
     # by the times as they are logged, or by the even clock that there was before these were wrong
-    off = min((_off_line(x, y) for x in (at, present)), key=np.median)
+    off = min((_off_line(x, y) for x in (at, rows)), key=np.median)
     # three numbers are rounded, each by half a unit at most
     straight = (off <= 1.01 * rounding) & (y[2:] != y[:-2])
     kinks = off[off > 1.01 * rounding]
     if kinks.size < FEWEST or np.median(kinks) <= LEAST_KINK * rounding:
         return found
     if np.mean(straight) >= LEAST_STRAIGHT:
-        found[present[1:-1][straight]] = True
+        found[1:-1][straight] = True
     elif (curved := _inside_cubics(at, y, rounding)).any():
-        found[present[curved]] = True
+        found |= curved
     elif np.mean(straight) <= MOST_REPEATED:  # a line over a gap
         for first, behind in stretches(straight):
             if behind - first >= FROZEN:
-                found[present[1 + first : 1 + behind]] = True
+                found[1 + first : 1 + behind] = True
     return found
+
+
+SLOWEST_LINES = 20  # rows between the readings that coarse lines are looked for through; ours
+LEAST_APART = 25  # rows that are off such lines wherever else the readings were; ours
+MOST_OFF = 0.2
+"""Share of these that may be off the lines through the readings: outliers, a clock's jump; ours."""
+
+
+def _on_coarse_lines(rows: np.ndarray, y: np.ndarray, grid: float) -> np.ndarray:
+    """Where numbers as coarse as their sensor's noise lie on lines between readings, (n,) bool.
+
+    A line and a number on it are off by half a step each at most, if its ends are readings; if they are
+    not, the noise of those that are is seen.
+
+    Args:
+        rows: (n,) numbers of the rows. y: (n,) numbers. grid: step between them.
+    """
+    for every in range(SLOWEST_LINES, 1, -1):
+        off = []
+        for first in range(every):
+            knots = rows % every == first
+            if np.count_nonzero(knots) < FEWEST:
+                break
+            line = np.interp(rows, rows[knots], y[knots])
+            off.append(int(np.count_nonzero(np.abs(y - line) > 1.01 * grid)))
+        else:
+            least, *others = sorted(off)
+            if others[0] >= LEAST_APART and least <= MOST_OFF * others[0]:
+                return np.asarray(rows % every != off.index(least))
+    return np.zeros(y.size, bool)
+
+
+def _grid(y: np.ndarray) -> float:
+    """Step between the numbers of a coarse sensor, rounded or not; 0 where there is none."""
+    levels = np.unique(y)
+    whole = float(np.ptp(levels))
+    if whole == 0.0:
+        return 0.0
+    apart = np.diff(levels)
+    step = whole / round(whole / float(apart[apart > SAME * apart.max()].min()))
+    return step if _off_whole((levels - levels[0]) / step) < OFF_STEP else 0.0
 
 
 def _off_line(x: np.ndarray, y: np.ndarray) -> np.ndarray:
