@@ -1093,6 +1093,7 @@ def test_colour_is_asked_of_a_fit_that_has_converged(monkeypatch, gained, colour
         "_with_noise_of": lambda of, fit, other: fit, "_compared": lambda *given: (trial, rivals),
         "converged": lambda of, fit: replace(fit, objective=90.0),
         "quadratic_at": lambda of, fit, free: (fit, quadratic),
+        "_leaves_colour": lambda *given: False,
         "_is_coloured": lambda of, fit, q, effect: coloured and fit.objective > 95.0,
         "_worth": lambda state, of, fit, rivals, q, found: replace(found, nats=-fit.objective),
     }  # fmt: skip
@@ -1157,6 +1158,7 @@ def test_a_step_out_of_reach_is_not_fitted_further(monkeypatch, reach):
         raise InterruptedError
 
     monkeypatch.setattr(trials, "grown_or_step", grown)
+    monkeypatch.setattr(trials, "_leaves_colour", lambda *given: False)
     monkeypatch.setattr(trials.Trial, "is_out_of_reach", lambda self, of, step: not reach)
     state.fit = trial
     best = trial_worth(50.0, 0.0)

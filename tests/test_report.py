@@ -477,7 +477,7 @@ def test_a_finger_turns_the_flight(seen):
                     }
                 ],
             },
-            "worth 75 nats. The model has it, but it has no name: it is at its limit.",
+            "worth 75.2 nats. The model has it, but it has no name: it is at its limit.",
         ),
         ({"verdict": "partly explained"}, "explain a part of what the simulation got wrong"),
         ({"gain": None}, "how well this predicts is not known"),

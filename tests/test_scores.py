@@ -423,7 +423,7 @@ def test_an_unseen_effect_is_said_where_it_would_move_a_cause_by_many_std():
         ):  # fmt: skip
             G[size[a], size[b]] = w * information / usual[cause] ** 2
         fit = Fit(("gyro_bias",), {**OFF, cause: 0.02}, NOISE)
-        return remarks._resting_on_unseen(PROBLEM, fit, replace(q, G=G), {})
+        return remarks._resting_on_unseen(PROBLEM, fit, replace(q, G=G), {"gyro_bias": {}})
 
     (text,) = texts(100.0)
     assert text.startswith("gyro_bias.x = 0.02 holds without swash_offset")
