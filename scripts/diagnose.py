@@ -255,8 +255,9 @@ def summary(result: "Diagnosis") -> str:
     if findings["causes"]:
         lines.append("  (nats: gain in log-likelihood by the cause; 5 nats are odds of 150 to 1)")
     for term in findings["unexplained"]:
-        why = f"; no name, for {term['why'][0]}" if "like" in term else ""
-        lines.append(f"  unexplained: {term['channel']} ({term['form']}{why})")
+        lines.append(f"  unexplained: {term['channel']} ({term['form']})")
+        if "like" in term:
+            lines.append(f"    {term['evidence']:.0f} nats, no name: {'; '.join(term['why'])}")
     gain = findings["gain"]
     if gain and gain["error_removed_percent"] is not None:
         low, high = gain["ci95"]
