@@ -117,7 +117,8 @@ def trusts(
             *_weak(worth[effect], shaken, problem.settings),
         )
         of_parts = replicated[effect]
-        gone = not _returns(of_parts, runs, problem.settings)
+        gone = _gone_without_runs(of_parts, runs, problem.settings)
+        gone |= _gone_in_halves(of_parts, problem.settings)
         if effect in limited and (falling[effect] or gone or undetermined):
             unnamed[effect] = channels[effect]
         beside = list(_beside_limits(effect, channels[effect], unnamed))
@@ -208,21 +209,25 @@ def on_parts(of_parts: Replication, runs: int, chosen: Settings) -> Iterable[str
     """
     if runs < 2:
         yield "one run alone was fitted"
-    elif of_parts.runs < chosen.least_runs:
+    elif _gone_without_runs(of_parts, runs, chosen):
         if len(of_parts.rests_on) == 1:
             yield f"it rests on {of_parts.rests_on[0]} alone"
         else:
             yield f"it is gone without {' or without '.join(of_parts.rests_on)}"
     if of_parts.kept is None:
         yield "no half of the flights could tell"
-    elif of_parts.kept < chosen.least_kept:
+    elif _gone_in_halves(of_parts, chosen):
         yield f"it returns in {100.0 * of_parts.kept:.0f} % of the halves of the flights"
 
 
-def _returns(of_parts: Replication, runs: int, chosen: Settings) -> bool:
-    """Whether a name returns on enough parts of the flights, as far as these can tell."""
-    enough = runs < 2 or of_parts.runs >= chosen.least_runs
-    return enough and (of_parts.kept is None or of_parts.kept >= chosen.least_kept)
+def _gone_without_runs(of_parts: Replication, runs: int, chosen: Settings) -> bool:
+    """Whether a name does not return without enough of the runs; of one run nothing is left out."""
+    return runs > 1 and of_parts.runs < chosen.least_runs
+
+
+def _gone_in_halves(of_parts: Replication, chosen: Settings) -> bool:
+    """Whether a name does not return in enough of the halves that could tell, where some could."""
+    return of_parts.kept is not None and of_parts.kept < chosen.least_kept
 
 
 def _sizes(problem: Problem, fit: Fit, effect: str) -> Iterable[str]:
