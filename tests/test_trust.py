@@ -14,15 +14,23 @@ import pytest
 from scipy.stats import binom, norm
 
 from coax_env.diagnosis import moves, replication
-from coax_env.diagnosis import trust as trust_module
-from coax_env.diagnosis.evidence import Evidence
+from coax_env.diagnosis.doubts import (
+    Against,
+    doubts,
+    of_sizes,
+    on_parts,
+    sizes,
+    under_noise,
+    weak,
+    without_name,
+)
 from coax_env.diagnosis.hold_out import fair_part
 from coax_env.diagnosis.moves import Proposal, accepted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, replications
 from coax_env.diagnosis.scores import lost
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.diagnosis.trust import at_limit, beside_large_axes, determined, of_line, on_parts
+from coax_env.diagnosis.trust import beside_large_axes, determined, of_line
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
@@ -279,8 +287,16 @@ def test_a_size_is_unusual_from_two_and_a_half_on_and_a_limit_at_five(size, word
     problem = replace(problem_of(1), model=model, own=own)
     usual = model.effect_parameters("gyro_bias")[1].std
     values = {"gyro_bias.x": 0.0, "gyro_bias.y": size * usual, "gyro_bias.z": 0.0}
-    found = list(trust_module._sizes(problem, Fit(("gyro_bias",), values, Noise({})), "gyro_bias"))
+    found = list(of_sizes(sizes(problem, Fit(("gyro_bias",), values, Noise({})), "gyro_bias")))
     assert bool(found) == bool(words) and all(words in text for text in found)
+
+
+def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
+    """An effect against which nothing speaks but what is said here."""
+    sound = Against(
+        tuple(channels), (), (), Replication(1.0, 1.0, ()), 8, {"gain": 1.0}, True, (), 100.0, False
+    )
+    return replace(sound, **but)
 
 
 @pytest.mark.parametrize(
@@ -288,15 +304,13 @@ def test_a_size_is_unusual_from_two_and_a_half_on_and_a_limit_at_five(size, word
     [(5.0, ["q", "r"], True), (4.9, ["q", "r"], False), (5.0, ["r", "h"], False)],
 )
 def test_what_shows_where_another_stands_at_its_limit_is_doubted(size, channels, doubted):
-    model = HeliModel(LAMA)
-    fit = Fit((), {f.name: f.value for f in model.effect_parameters("gyro_bias")}, Noise({}))
-    usual = model.effect_parameters("gyro_bias")[1].std
-    fit = fit.at({"gyro_bias.y": -size * usual})
-    problem = replace(problem_of(1), model=model)
-    limited = {"gyro_bias": ["p", "q"]} if at_limit(problem, fit, "gyro_bias") else {}
-    found = list(trust_module._beside_limits("servo_delay", channels, limited))
+    against = {
+        "gyro_bias": known_of(["p", "q"], sizes={"gyro_bias.y": size}),
+        "servo_delay": known_of(channels),
+    }
+    found = list(doubts("servo_delay", against, SETTINGS))
     assert bool(found) == doubted and all("gyro bias" in text for text in found)
-    assert not list(trust_module._beside_limits("gyro_bias", ["p", "q"], limited))
+    assert not any("beside it" in text for text in doubts("gyro_bias", against, SETTINGS))
 
 
 def test_two_that_stand_for_each_other_are_not_exchanged_without_end(monkeypatch):
@@ -353,29 +367,26 @@ def test_what_left_explains_nothing_any_more():
     ],
 )
 def test_what_stands_for_something_else_has_no_name(
-    monkeypatch, limited, coloured, undetermined, falls, beside, kept, nats, named
+    limited, coloured, undetermined, falls, beside, kept, nats, named
 ):
     """An effect that shows in q, with another one, without a name, that shows there or elsewhere."""
     one, other = EFFECTS[:2]
-    parts = {one: Replication(1.0, kept, ()), other: Replication(1.0, 1.0, ())}
-    stand_ins = {
-        "replications": lambda *of: parts,
-        "not_holding": lambda *of: {one: ["half of all"] if falls else [], other: []},
-        "in_shocks": lambda *of: False,
-        "channels_of": lambda p, f, q, e: ["q"] if e == one or beside else ["h"],
-        "at_limit": lambda p, f, e: limited if e == one else True,
-        "determined": lambda p, f, q, e, i: dict.fromkeys(NAMES, e == one and not undetermined),
-        "_sizes": lambda *of: [],
+    against = {
+        one: known_of(
+            coloured=("q",) * coloured,
+            falls_at=("half of all",) * falls,
+            parts=Replication(1.0, kept, ()),
+            sizes={"gain": 5.0 if limited else 1.0},
+            determined=not undetermined,
+            nats=nats,
+        ),
+        other: known_of(["q" if beside else "h"], sizes={"gain": 5.0}, determined=False),
     }
-    for name, stand_in in stand_ins.items():
-        monkeypatch.setattr(trust_module, name, stand_in)
-    white = {c: SimpleNamespace(white=not (c == "q" and coloured)) for c in ("q", "h")}
-    fit = Fit((one, other), {}, Noise({}))
-    worth = {one: Evidence(nats, 1.0), other: Evidence(100.0, 1.0)}
-    nothing: dict[str, tuple[str, ...]] = {one: (), other: ()}
-    found = trust_module.trusts(problem_of(8), fit, None, worth, nothing, white)  # type: ignore[arg-type]
-    assert list(found) == [one, other]
-    assert found[one].named == named and not found[other].named
+    assert without_name(against, SETTINGS) == ({other} if named else {one, other})
+    assert bool(list(doubts(one, against, SETTINGS))) == (
+        not named or limited or coloured or undetermined or falls or beside or kept != 1.0
+        or nats < SETTINGS.sure_evidence
+    )  # fmt: skip
 
 
 def test_a_size_is_that_beyond_the_off_value():
@@ -384,22 +395,22 @@ def test_a_size_is_that_beyond_the_off_value():
     own = {"ground_effect": tuple(model.effect_parameters("ground_effect"))}
     problem = replace(problem_of(1), model=model, own=own)
     usual = {f.name: f.std for f in own["ground_effect"]}
-    for sizes, words in ((0.0, ""), (3.0, "3.0 usual sizes"), (-2.6, "")):
-        decay = 2.0 + sizes * usual["ground_effect.decay"]
+    for size, words in ((0.0, ""), (3.0, "3.0 usual sizes"), (-2.6, "")):
+        decay = 2.0 + size * usual["ground_effect.decay"]
         values = {"ground_effect.gain": 0.1, "ground_effect.decay": decay}
         fit = Fit(("ground_effect",), values, Noise({}))
-        found = " ".join(trust_module._sizes(problem, fit, "ground_effect"))
-        assert words in found and (sizes != 0.0 or not found)
+        found = " ".join(of_sizes(sizes(problem, fit, "ground_effect")))
+        assert words in found and (size != 0.0 or not found)
 
 
 def test_doubts_name_three_variations_and_count_the_rest():
     one, many = ["twice force xy"], [f"half level {k}" for k in range(5)]
-    assert list(trust_module._under_noise([])) == []
-    assert list(trust_module._under_noise(one)) == ["it does not hold at twice force xy"]
-    (text,) = trust_module._under_noise(many)
+    assert list(under_noise([])) == []
+    assert list(under_noise(one)) == ["it does not hold at twice force xy"]
+    (text,) = under_noise(many)
     assert "half level 2" in text and "half level 3" not in text
     assert text.endswith("2 more changes of the noise")
-    (three,) = trust_module._under_noise(many[:3])
+    (three,) = under_noise(many[:3])
     assert "more" not in three
 
 
@@ -461,5 +472,5 @@ def test_a_trial_that_diverges_is_refused_and_says_so(monkeypatch):
     ],
 )
 def test_little_evidence_leaves_a_doubt_and_more_of_it_is_asked_in_shocks(nats, in_shocks, words):
-    found = list(trust_module._weak(nats, in_shocks, SETTINGS))
+    found = list(weak(nats, in_shocks, SETTINGS))
     assert bool(found) == bool(words) and all(words in text for text in found)

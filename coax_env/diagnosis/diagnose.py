@@ -200,7 +200,7 @@ def diagnose(
     causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)
-    unnamed = findings.without_a_name(problem, fit, quadratic, evidence, trust, white["after"])
+    unnamed = findings.without_a_name(evidence, trust, white["after"])
     unexplained = described + unnamed + findings.unexplained(white["after"], speaking_for)
 
     sensors = {c: sensor_std(flight, c) for c in flight.channels}

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.confounding import Alternatives, channels_of
+from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
@@ -76,7 +76,7 @@ def causes(
                 },
                 "evidence": evidence[effect].nats,
                 "confusable_with": confusable_with(problem, effect, found[effect]),
-                "channels": channels_of(problem, fit, quadratic, effect),
+                "channels": list(trust[effect].channels),
                 **trust[effect].entries(),
             }
         )
@@ -189,9 +189,6 @@ def unexplained(white: Mapping[str, Whiteness], described: Collection[str]) -> l
 
 
 def without_a_name(
-    problem: Problem,
-    fit: Fit,
-    quadratic: Quadratic,
     evidence: Mapping[str, Evidence],
     trust: Mapping[str, Trust],
     white: Mapping[str, Whiteness],
@@ -199,12 +196,12 @@ def without_a_name(
     """Entries of `unexplained` for what the model has and no name is given to.
 
     Args:
-        problem, fit, quadratic, evidence, trust: as of `causes`.
+        evidence: of each effect. trust: what speaks for and against each.
         white: whiteness of the innovations, by channel.
     """
     entries = []
-    for effect in (e for e in fit.active if not trust[e].named):
-        first = channels_of(problem, fit, quadratic, effect)[0]
+    for effect in (e for e in trust if not trust[e].named):
+        first = trust[effect].channels[0]
         entries.append(
             {
                 "channel": first,

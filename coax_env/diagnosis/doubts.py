@@ -1,0 +1,209 @@
+"""What speaks against a name: as measured, in plain words, and when it is enough to take the name.
+
+What stands at the limit of what is believed and is not determined, or does not hold under other noise
+or on parts of the flights, stands for something else. Two of these take a name, too: noise left where
+it shows, little evidence there, other noise, parts of the flights, such a one beside it.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.replication import Replication
+from coax_env.diagnosis.settings import Settings
+from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
+from coax_env.plain_words import and_list, channel_name, plain
+
+AT_BOUND = 0.99
+"""Share of the most usual sizes from which a number stands at its bound; ours."""
+SPEAKING_AGAINST = 2
+"""Of what speaks against a name so much takes it; ours."""
+MOST_VARIATIONS = 3
+"""Variations of the noise that a doubt names; of more, their number; ours."""
+
+
+@dataclass(frozen=True)
+class Against:
+    """What was measured that may speak against a name.
+
+    Attributes:
+        channels: in which it shows most, strongest first.
+        coloured: those of them in which more than noise is left.
+        falls_at: variations of the noise under which it does not hold.
+        parts: how it fared on parts of the flights. runs: number of runs that were fitted.
+        sizes: of its numbers [usual sizes].
+        determined: whether the flights say more of one of its numbers than the prior did.
+        alternatives: effects that would do as well.
+        nats: its evidence. shaken: whether gusts come in single shocks.
+    """
+
+    channels: tuple[str, ...]
+    coloured: tuple[str, ...]
+    falls_at: tuple[str, ...]
+    parts: Replication
+    runs: int
+    sizes: Mapping[str, float]
+    determined: bool
+    alternatives: tuple[str, ...]
+    nats: float
+    shaken: bool
+
+    @property
+    def at_limit(self) -> bool:
+        """Whether one of its numbers is as large as is believed at most."""
+        return any(is_limit(size) for size in self.sizes.values())
+
+    def is_gone_on_parts(self, chosen: Settings) -> bool:
+        """Whether it does not return without enough of the runs, or in enough of the halves."""
+        without_runs = _gone_without_runs(self.parts, self.runs, chosen)
+        return without_runs or _gone_in_halves(self.parts, chosen)
+
+    def stands_for_something_else(self, chosen: Settings) -> bool:
+        """Whether it is at its limit, and does not hold or is not determined."""
+        unsound = self.falls_at or not self.determined or self.is_gone_on_parts(chosen)
+        return self.at_limit and bool(unsound)
+
+
+def sizes(problem: Problem, fit: Fit, effect: str) -> dict[str, float]:
+    """Numbers of an effect, from its off-value on, in usual sizes, however wide priors are by now.
+
+    Args:
+        problem, fit: with the effect. effect: an active one.
+    """
+    numbers = problem.model.effect_parameters(effect)
+    return {f.name: abs(fit.values[f.name] - f.value) / f.std for f in numbers}
+
+
+def is_limit(size: float) -> bool:
+    """Whether a number of so many usual sizes stands at the limit of what is believed."""
+    return size > AT_BOUND * MOST_USUAL_SIZES
+
+
+def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
+    """Effects to which no name is given.
+
+    Args:
+        against: of each active effect. chosen: what decides.
+    """
+    standing_in = {e: of for e, of in against.items() if of.stands_for_something_else(chosen)}
+
+    def voices(effect: str, of: Against) -> int:
+        weak = bool(of.coloured) and of.nats < chosen.sure_evidence
+        beside = any(_shows_beside(effect, of, standing_in))
+        parts = of.is_gone_on_parts(chosen)
+        return sum((bool(of.coloured), weak, bool(of.falls_at), parts, beside))
+
+    return {
+        effect
+        for effect, of in against.items()
+        if effect in standing_in or voices(effect, of) >= SPEAKING_AGAINST
+    }
+
+
+def _shows_beside(effect: str, of: Against, others: Mapping[str, Against]) -> Iterator[str]:
+    """Those of some others that show in the same channels as an effect."""
+    return (e for e, it in others.items() if e != effect and set(it.channels) & set(of.channels))
+
+
+# --- in plain words ---------------------------------------------------------------------------------
+
+
+def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Iterator[str]:
+    """Reasons against a name.
+
+    Args:
+        effect: the name. against: of each active effect. chosen: what decides.
+    """
+    of = against[effect]
+    if of.coloured:
+        coloured = and_list([channel_name(c) for c in of.coloured])
+        yield f"it shows in {coloured}, where the model leaves more than noise"
+    yield from under_noise(of.falls_at)
+    yield from on_parts(of.parts, of.runs, chosen)
+    yield from of_sizes(of.sizes)
+    yield from _beside_limits(effect, against)
+    if not of.determined:
+        yield "none of its numbers is determined"
+    if of.alternatives:
+        others = and_list([plain(name) for name in of.alternatives])
+        yield f"these flights cannot distinguish it from {others}"
+    yield from weak(of.nats, of.shaken, chosen)
+
+
+def under_noise(variations: Iterable[str]) -> Iterator[str]:
+    """What other noise says against a name.
+
+    Args:
+        variations: of the noise under which it does not hold.
+    """
+    every = list(variations)
+    if every:
+        shown = every[:MOST_VARIATIONS]
+        if len(every) > MOST_VARIATIONS:
+            shown.append(f"{len(every) - MOST_VARIATIONS} more changes of the noise")
+        yield f"it does not hold at {and_list(shown)}"
+
+
+def on_parts(of_parts: Replication, runs: int, chosen: Settings) -> Iterator[str]:
+    """What left-out runs and halves say against a name.
+
+    Args:
+        of_parts: how it fared. runs: number of runs that were fitted.
+        chosen: the shares that it needs.
+    """
+    if runs < 2:
+        yield "one run alone was fitted"
+    elif _gone_without_runs(of_parts, runs, chosen):
+        if len(of_parts.rests_on) == 1:
+            yield f"it rests on {of_parts.rests_on[0]} alone"
+        else:
+            yield f"it is gone without {' or without '.join(of_parts.rests_on)}"
+    if of_parts.kept is None:
+        yield "no half of the flights could tell"
+    elif _gone_in_halves(of_parts, chosen):
+        yield f"it returns in {100.0 * of_parts.kept:.0f} % of the halves of the flights"
+
+
+def _gone_without_runs(of_parts: Replication, runs: int, chosen: Settings) -> bool:
+    """Whether a name does not return without enough of the runs; of one run nothing is left out."""
+    return runs > 1 and of_parts.runs < chosen.least_runs
+
+
+def _gone_in_halves(of_parts: Replication, chosen: Settings) -> bool:
+    """Whether a name does not return in enough of the halves that could tell, where some could."""
+    return of_parts.kept is not None and of_parts.kept < chosen.least_kept
+
+
+def of_sizes(numbers: Mapping[str, float]) -> Iterator[str]:
+    """What unusual sizes say against a name.
+
+    Args:
+        numbers: name -> usual sizes.
+    """
+    for name, size in numbers.items():
+        if is_limit(size):
+            limit = f"{plain(name)} stands at the limit of what is believed"
+            yield f"{limit}: something else hides behind the name"
+        elif size > UNUSUAL_FROM:
+            yield f"{plain(name)} is {size:.1f} usual sizes"
+
+
+def _beside_limits(effect: str, against: Mapping[str, Against]) -> Iterator[str]:
+    """What stands at its limit leaves a part of itself to others that show in its channels."""
+    limited = {e: of for e, of in against.items() if of.at_limit}
+    others = [plain(e) for e in _shows_beside(effect, against[effect], limited)]
+    if others:
+        limit = f"{and_list(others)} beside it stands at the limit of what is believed"
+        yield f"{limit}: it may be a part of that"
+
+
+def weak(nats: float, shaken: bool, chosen: Settings) -> Iterator[str]:
+    """What little evidence says against a name.
+
+    Args:
+        nats: its evidence. shaken: whether gusts come in single shocks. chosen: what is enough.
+    """
+    if shaken and nats < chosen.clear_evidence * chosen.evidence:
+        yield f"gusts come in single shocks here, and {nats:.0f} nats may be one of them"
+    elif nats < chosen.sure_evidence:
+        yield f"it is worth {nats:.0f} nats only: an effect that is in no list may look like it"
