@@ -21,10 +21,12 @@ from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import error_level, error_memory, starting_noise
-from coax_env.estimation.lasting_errors import ERRING, ErringModel, with_errors, with_inner
+from coax_env.estimation.lasting_errors import ERRING, ErringModel, with_errors
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.rotor_jitter import JitteryModel
 from coax_env.estimation.state_space import Noise, Record
+from coax_env.estimation.swinging_gusts import SwingingModel
+from coax_env.estimation.wrapping_model import with_innermost
 from coax_env.logs.flight import Run, read_flight
 from coax_env.model import dynamics
 from coax_env.model import state as S
@@ -51,10 +53,14 @@ INPUT = np.tile(dynamics.kernel_input(COMMAND), 2)
 ANGLE_PAIRS = list(zip(GYROS, ANGLES, strict=True))
 
 
-@pytest.fixture(params=[HeliModel, JitteryModel])
+def swinging(model: HeliModel) -> HeliModel:
+    return SwingingModel(JitteryModel.like(model), (0.6, 1.2, 0.0, 0.5, 0.9, 0.7))
+
+
+@pytest.fixture(params=[HeliModel.like, JitteryModel.like, swinging])
 def model(request) -> ErringModel:
-    """Errors around the helicopter, and around one whose rotor speeds jitter."""
-    return ErringModel(request.param.like(PLAIN))
+    """Errors around the helicopter, rotor speeds that jitter, and gusts that swing as well."""
+    return ErringModel(request.param(PLAIN))
 
 
 def state(model: ErringModel) -> np.ndarray:
@@ -62,7 +68,7 @@ def state(model: ErringModel) -> np.ndarray:
     x[:N_FULL] = dynamics.full_state(HOVER, COMMAND, LAMA)
     x[S.R], x[S.U] = 0.2, 0.5
     x[N_FULL : model.states] = 1.5
-    x[model.errors] = 0.01 * np.arange(1, len(ERRING) + 1)
+    x[model.added] = 0.01 * np.arange(1, len(ERRING) + 1)
     return x
 
 
@@ -81,7 +87,7 @@ def stepped(model: HeliModel, x: np.ndarray, p: np.ndarray, dt: float = 0.01) ->
 def test_every_reading_but_the_rotors_has_its_error(model):
     x, p, inner = state(model), model.vector({}, NOISE), model.inner
     more = read(model, x, p) - read(inner, x[: model.states], inner.vector({}, NOISE))
-    own = x[model.errors].tolist()
+    own = x[model.added].tolist()
     expected = dict.fromkeys(CHANNELS, 0.0) | dict(zip(ERRING, own, strict=True))
     assert_allclose(more, list(expected.values()), atol=1e-12)
     assert set(CHANNELS) - set(ERRING) == {"rpm_upper", "rpm_lower", "v"}
@@ -91,7 +97,7 @@ def test_errors_fade_and_move_nothing(model):
     x, p, inner = state(model), model.vector({}, NOISE), model.inner
     later = stepped(model, x, p)
     left = [math.exp(-0.01 / MEMORY[GROUP[channel]]) for channel in ERRING]
-    assert_allclose(later[model.errors], left * x[model.errors], rtol=1e-12)
+    assert_allclose(later[model.added], left * x[model.added], rtol=1e-12)
     alone = stepped(inner, x[: model.states], inner.vector({}, NOISE))
     assert np.array_equal(later[: model.states], alone)
 
@@ -106,7 +112,7 @@ def test_the_drift_is_what_the_step_adds_to_first_order(model):
 
 def test_every_error_has_its_levels_variance(model):
     """x' = -x / tau + w has variance q tau / 2; all else is the inner model's noise."""
-    errors, p = model.errors, model.vector({}, NOISE)
+    errors, p = model.added, model.vector({}, NOISE)
     q, decay = model.process_noise(NOISE, p)
     std = [STD[GROUP[channel]] for channel in ERRING]
     assert_allclose(np.sqrt(q[errors] / (2.0 * decay[errors])), std)
@@ -119,10 +125,12 @@ def test_every_error_has_its_levels_variance(model):
 
 def test_another_motion_keeps_the_errors_and_when_commands_are_read():
     late = ErringModel(PLAIN).reading_after(0.03)
-    other = with_inner(late, JitteryModel)
+    other = with_innermost(late, JitteryModel)
     assert isinstance(other, ErringModel) and isinstance(other.inner, JitteryModel)
     assert other.read_delay == 0.03 and other.exact.size == late.exact.size + 2
-    alone = with_inner(PLAIN.reading_after(0.02), JitteryModel)
+    both = with_innermost(ErringModel(SwingingModel(PLAIN, (1.0,) * 6)), JitteryModel)
+    assert isinstance(both.inner.inner, JitteryModel) and both.frequencies == (1.0,) * 6
+    alone = with_innermost(PLAIN.reading_after(0.02), JitteryModel)
     assert isinstance(alone, JitteryModel) and alone.read_delay == 0.02
 
 

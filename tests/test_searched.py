@@ -69,7 +69,7 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
     believes_its_sensors(monkeypatch)
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
     monkeypatch.setattr(searched, "with_swings", lambda problem, fit: None)
-    monkeypatch.setattr(searched, "_with_jitter", lambda problem, fit: None)
+    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
     monkeypatch.setattr(searched, "_flies_better", lambda *fits: answers.pop(0))
@@ -97,7 +97,7 @@ def believes_its_sensors(monkeypatch) -> None:
     ],
 )
 def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had, costs, active):
-    """From it, and from none: the likelier end stands, and shocks and jitter alone are asked then."""
+    """From it, and from none: the likelier end stands; readings are not believed less then."""
     plain, wider = (SimpleNamespace(name=n, report=lambda text: None) for n in ("plain", "wider"))
     asked: list[Any] = []
 
@@ -113,7 +113,8 @@ def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had,
     )
     monkeypatch.setattr(searched, "_white_since", lambda best, clock, gained: None)
     monkeypatch.setattr(searched, "search", lambda problem, fit: (fit, None))
-    monkeypatch.setattr(searched, "_with_jitter", lambda problem, fit: asked.append(problem))
+    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
+    monkeypatch.setattr(searched, "with_swings", lambda problem, fit: asked.append(problem))
     monkeypatch.setattr(searched, "cost", lambda problem, fit, quadratic: costs[fit.active[0]])
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
@@ -159,10 +160,55 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
     believes_its_sensors(monkeypatch)
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
+    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
     monkeypatch.setattr(searched, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
     found = searched.searched("fading", Noise({"force_xy": 0.2}), {})  # type: ignore[arg-type]
     assert asked == [("fading", 0.2), (swinging, 0.7)]
     assert found.problem is swinging and found.low_passes == {}
+
+
+@pytest.mark.parametrize(
+    ("rotors", "rate", "gained", "order"),
+    [
+        (True, True, True, ["jitter", "swings"]),  # measured rotor speeds tell it by themselves
+        (False, True, True, ["swings", "jitter", "swings"]),
+        (False, True, False, ["swings", "jitter"]),  # rotors do not: nothing new to ask
+        (False, False, False, ["swings"]),
+    ],
+)
+def test_gusts_are_asked_for_a_frequency_beside_rotors_that_jitter(
+    monkeypatch, rotors, rate, gained, order
+):
+    asked: list[str] = []
+    plain, jittery, swinging = (
+        SimpleNamespace(name=name, report=lambda text: None) for name in ("p", "j", "s")
+    )
+
+    def of(problem: Any, noise: Noise) -> Searched:
+        fit = Fit((), {}, noise)
+        return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
+
+    def with_swings(problem: Any, fit: Fit) -> Any:
+        asked.append("swings")
+        return (swinging, {"force_xy": 0.7}) if problem is jittery else None
+
+    def with_jitter(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
+        asked.append("jitter")
+        return (of(jittery, noise), noise) if gained else (found, noise)
+
+    def coloured(found: Searched, channels: Any) -> bool:
+        return found.problem is plain and (rate if "r" in channels else rotors)
+
+    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
+    monkeypatch.setattr(searched, "with_swings", with_swings)
+    monkeypatch.setattr(searched, "_jittery", with_jitter)
+    monkeypatch.setattr(searched, "_is_coloured", coloured)
+    monkeypatch.setattr(searched, "_searched", of)
+    noise = Noise({"force_xy": 0.2})
+    found = searched._in_unrest(of(plain, noise), noise, {}, erring=True)
+    assert asked == order
+    assert found.problem is (swinging if gained else plain)
+    assert found.fit.noise.level("force_xy") == (0.7 if gained else 0.2)
 
 
 def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypatch):

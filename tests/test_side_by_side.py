@@ -46,7 +46,11 @@ def erring_and_jittery(vehicle: Vehicle) -> HeliModel:
 
 
 def swinging(vehicle: Vehicle) -> HeliModel:
-    return SwingingModel(vehicle).swinging_at((0.6, 0.8, 1.1, 0.5, 0.0, 0.7))
+    return SwingingModel(HeliModel(vehicle), (0.6, 0.8, 1.1, 0.5, 0.0, 0.7))
+
+
+def of_everything(vehicle: Vehicle) -> HeliModel:
+    return ErringModel(SwingingModel(JitteryModel(vehicle), (0.6, 0.8, 1.1, 0.5, 0.0, 0.7)))
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +80,7 @@ def flown():
         (swinging, ACTIVE),
         (erring, ACTIVE),
         (erring_and_jittery, LATE),
+        (of_everything, ACTIVE),
     ],
     ids=[
         "bare",
@@ -86,15 +91,16 @@ def flown():
         "swings, six effects",
         "errors that last, six effects",
         "errors that last and jitter, late commands",
+        "errors that last in gusts that swing, and jitter",
     ],
 )
 def test_derivatives_in_lanes_are_those_one_by_one(flown, kind, active):
     """Likelihood and signatures to the rounding of their differences, effects on or off."""
     vehicle, record, noise, free, values = flown
-    if kind in (JitteryModel, erring_and_jittery):
+    if kind in (JitteryModel, erring_and_jittery, of_everything):
         noise = with_jitter(noise, HeliModel(vehicle))
         free, values = [*free, REACTION], {**values, REACTION.name: 0.7}
-    if kind in (erring, erring_and_jittery):
+    if kind in (erring, erring_and_jittery, of_everything):
         noise = with_errors(noise)
     both = []
     for lanes in (same, one_by_one):

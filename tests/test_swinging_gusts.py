@@ -17,8 +17,10 @@ from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import AXES, GUST_AXES
+from coax_env.estimation.lasting_errors import ErringModel
+from coax_env.estimation.rotor_jitter import JitteryModel
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.swinging_gusts import N_SWINGING, SWINGS, SwingingModel, swings
+from coax_env.estimation.swinging_gusts import SwingingModel, swinging_at, swings
 from coax_env.model import dynamics
 from coax_env.model import parameters as P
 from coax_env.model import state as S
@@ -27,7 +29,9 @@ from coax_env.model.layout import GUSTS, N_CHANNELS, N_FULL
 LAMA = load_vehicle("lama400d")
 PLAIN = HeliModel(LAMA)
 FREQUENCIES = (0.6, 1.2, 0.0, 0.5, 0.9, 0.7)
-MODEL = SwingingModel.like(PLAIN).swinging_at(FREQUENCIES)
+MODEL = SwingingModel(PLAIN, FREQUENCIES)
+SWINGS = MODEL.added
+N_SWINGING = MODEL.exact.size
 LEVELS = dict(zip(AXES, (0.2, 0.3, 0.006, 0.003), strict=True))
 NOISE = Noise({**LEVELS, **{f"memory_{axes}": 0.8 for axes in AXES}})
 HOVER, COMMAND = dynamics.hover_trim(LAMA)
@@ -134,6 +138,37 @@ def test_what_commands_show_of_gusts_turns_with_them():
     assert_allclose(out[exact], (later - x)[exact], rtol=1e-9)
     shown = gains["command_gain.moment_xy"] * 0.2  # of the lateral one
     assert out[S.GUST_L] == pytest.approx(shown, rel=0.05)
+
+
+def test_around_rotors_that_jitter_gusts_turn_alike_and_the_rest_is_theirs():
+    """Also where commands show gusts, which the inner model takes in by itself."""
+    inner = JitteryModel.like(PLAIN)
+    model = SwingingModel(inner, FREQUENCIES)
+    x = np.concatenate([state()[:N_FULL], [1.5, -2.0], state()[SWINGS]])
+    u = np.append(INPUT, [0.3, -0.2, 0.1, 0.2, 0.0, 0.0])
+    gains = {name: 0.01 * (1.0 + k) for k, name in enumerate(P.COMMAND_GAINS)}
+    later, alone = np.zeros(x.size), np.zeros(N_FULL + 2)
+    model.step.__wrapped__(x, u, DT, model.vector(gains, NOISE), np.zeros(model.work_size), later)
+    inner.step.__wrapped__(
+        x[: N_FULL + 2], u, DT, inner.vector(gains, NOISE), np.zeros(inner.work_size), alone
+    )
+    rest = np.r_[0 : GUSTS.start, GUSTS.stop : N_FULL + 2]
+    assert np.array_equal(later[rest], alone[rest])
+    without = np.zeros(N_SWINGING)
+    MODEL.step.__wrapped__(
+        state(), u, DT, MODEL.vector(gains, NOISE), np.zeros(MODEL.work_size), without
+    )
+    assert_allclose(later[GUSTS], without[GUSTS], rtol=1e-12)
+    assert_allclose(later[model.added], without[SWINGS], rtol=1e-12)
+
+
+def test_frequencies_are_changed_where_the_gusts_are():
+    around = ErringModel(SwingingModel(JitteryModel.like(PLAIN), FREQUENCIES)).reading_after(0.02)
+    other = swinging_at(around, (1.0,) * 6)
+    assert isinstance(other, ErringModel) and isinstance(other.inner, SwingingModel)
+    assert other.frequencies == other.inner.frequencies == (1.0,) * 6 and other.read_delay == 0.02
+    assert isinstance(other.inner.inner, JitteryModel)
+    assert swinging_at(PLAIN, FREQUENCIES).frequencies == FREQUENCIES
 
 
 def passes(gust: np.ndarray) -> list[SimpleNamespace]:

@@ -19,13 +19,14 @@ nothing is coloured then: what a model lacks may swing, too.
 
 And where innovations that rotors' jitter would colour stay so, it is done again with that noise in the
 filter (estimation/rotor_jitter.py), if its levels are worth more than a tie: after a search, since a
-motor's lag colours them too and must be found as what it is.
+motor's lag colours them too and must be found as what it is. Then gusts are asked for a frequency once
+more; first, where measured rotor speeds themselves are coloured, which gusts do not touch.
 
 And where commands are late, by a delay of the readings' own (estimation/helicopter.py), if that is
 likelier: what was found beside a delay that is off by a part of a row may stand for that part.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -43,7 +44,6 @@ from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_swings
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
-from coax_env.estimation.lasting_errors import with_inner
 from coax_env.estimation.low_pass import LowPass, before_low_pass, records_before
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import pooled_rms, replay_runs
@@ -51,11 +51,14 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import REACTION, JitteryModel, with_jitter
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import is_white, whiteness
+from coax_env.estimation.wrapping_model import with_innermost
 from coax_env.model.layout import INERTIAL
 
 COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
-SHOWN_BY = ("rpm_upper", "rpm_lower", "r")
+ROTOR_SPEEDS = ("rpm_upper", "rpm_lower")
+"""Channels that jitter alone, or a motor's lag, colours."""
+SHOWN_BY = (*ROTOR_SPEEDS, "r")
 """Channels that a rotor's jitter colours."""
 READ_WITHIN = 0.02
 """Of a row, to which the delay of the commands that readings see is looked for; ours."""
@@ -162,31 +165,31 @@ def _lost(problem: Problem, found: Searched) -> float:
 
 
 def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bool) -> Searched:
-    """Again with shocks, jitter, readings believed less, where the first search asks for it.
+    """Again with shocks, jitter, swings, readings believed less, where the first search asks for it.
 
     Args:
         best: of the first search. noise: levels to start from.
         clock: of all runs in the order in which they were flown.
-        erring: whether readings have errors that last; nothing but shocks and jitter is asked for then.
+        erring: whether readings have errors that last; readings are not believed less then.
     """
     shaken = in_shocks(best.problem, best.fit)
     if shaken:
         best = _changed(best, clock) or _searched_in_shocks(best, noise)
-    swinging = None if shaken or erring else with_swings(best.problem, best.fit)
-    if swinging is not None:
-        problem, levels = swinging
-        problem.report("gusts have a frequency: searching again with that")
-        return _searched(problem, noise.with_levels(levels))
-    problem = best.problem
-    found = _with_jitter(problem, best.fit)
-    if found is not None:
-        problem, levels = found
-        problem.report("searching again with rotor speeds that jitter")
-        noise = with_jitter(noise, problem.model).with_levels(levels)
-        best = _searched(problem, noise)
-        problem = best.problem
+    if _is_coloured(best, ROTOR_SPEEDS):
+        best, noise = _jittery(best, noise)
+    asked = None
+    while best is not asked:
+        asked = best
+        swinging = None if shaken else with_swings(best.problem, best.fit)
+        if swinging is not None:
+            problem, levels = swinging
+            problem.report("gusts have a frequency: searching again with that")
+            return _searched(problem, noise.with_levels(levels))
+        if _is_coloured(best, SHOWN_BY):
+            best, noise = _jittery(best, noise)
     if erring:
         return best
+    problem = best.problem
     coarser = _coarser(best.fit.noise)
     passes = problem.engine.filter(best.fit.values, best.fit.noise)
     if not coarser or is_white(passes, problem.model.channels):
@@ -311,27 +314,39 @@ def _with_late_readings(problem: Problem, fit: Fit) -> Problem | None:
     return late if trial.objective < fit.objective - problem.settings.tie else None
 
 
-def _with_jitter(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] | None:
-    """The problem with rotors that jitter and the levels of that, where they gain more than a tie."""
-    passes = problem.engine.filter(fit.values, fit.noise)
-    shown = whiteness(passes, problem.model.channels)
-    if all(shown[channel].white for channel in SHOWN_BY if channel in shown):
-        return None
-    chosen = problem.settings
-    wider = problem.with_model(with_inner(problem.model, JitteryModel)).with_free([REACTION])
+def _is_coloured(found: Searched, channels: Sequence[str]) -> bool:
+    """Whether one of some channels is."""
+    passes = found.problem.engine.filter(found.fit.values, found.fit.noise)
+    shown = whiteness(passes, found.problem.model.channels)
+    return not all(shown[channel].white for channel in channels if channel in shown)
+
+
+def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
+    """The search with rotors that jitter, where that gains more than a tie, and levels it started from.
+
+    Args:
+        found: with such rotors already, or without. noise: levels that it started from.
+    """
+    problem, fit, chosen = found.problem, found.fit, found.problem.settings
+    if JITTER_LEVEL in fit.noise.process:
+        return found, noise
+    wider = problem.with_model(with_innermost(problem.model, JitteryModel)).with_free([REACTION])
     start = with_jitter(fit.noise, wider.model)
     levels = (*fit.levels, JITTER_LEVEL, JITTER_MEMORY)
     trial = replace(fit.at({REACTION.name: REACTION.value}), levels=levels)
-    noise = fit_noise(
+    jittery = fit_noise(
         wider.engine, trial.values, start, levels,
         chosen.first_noise_evaluations, chosen.step_gain, problem.noise_fit_seconds,
     )  # fmt: skip
-    gained = wider.engine.log_likelihood(trial.values, noise)
-    gained -= sum(run.log_likelihood for run in passes)
+    gained = wider.engine.log_likelihood(trial.values, jittery)
+    gained -= problem.engine.log_likelihood(fit.values, fit.noise)
     problem.report(f"rotor speeds that jitter: {gained:.1f} nats")
     if gained < chosen.tie:
-        return None
-    return wider, {name: noise.level(name) for name in (JITTER_LEVEL, JITTER_MEMORY)}
+        return found, noise
+    problem.report("searching again with rotor speeds that jitter")
+    of_jitter = {name: jittery.level(name) for name in (JITTER_LEVEL, JITTER_MEMORY)}
+    noise = with_jitter(noise, wider.model).with_levels(of_jitter)
+    return _searched(wider, noise), noise
 
 
 def _coarser(noise: Noise) -> dict[str, float]:

@@ -19,7 +19,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import AXES, GUST_AXES, GUST_LEVELS, MEMORIES
 from coax_env.estimation.noise_levels import evenly_picked
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.swinging_gusts import FASTEST, SwingingModel, swings
+from coax_env.estimation.swinging_gusts import FASTEST, swinging_at, swings
 from coax_env.estimation.whiteness import is_white
 from coax_env.plain_words import and_list
 
@@ -72,7 +72,7 @@ def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] 
 
 
 def _swinging(problem: Problem, frequencies: Sequence[float]) -> Problem:
-    return problem.with_model(SwingingModel.like(problem.model).swinging_at(frequencies))
+    return problem.with_model(swinging_at(problem.model, frequencies))
 
 
 def _lasting(noise: Noise, frequencies: Sequence[float]) -> Noise:

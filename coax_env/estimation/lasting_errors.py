@@ -10,18 +10,16 @@ off so, where it is 1.0 to 1.6 with these.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 
-from coax_env.estimation.helicopter import HeliModel, Motion
+from coax_env.estimation.helicopter import Motion
 from coax_env.estimation.helicopter_noise import error_level, error_memory
-from coax_env.estimation.state_space import Noise, ProcessNoise, Record
+from coax_env.estimation.state_space import Noise
+from coax_env.estimation.wrapping_model import WrappingModel
 from coax_env.kernel.compilation import compiled
-from coax_env.kernel.variants import under_names
 from coax_env.model import dynamics
 from coax_env.model.layout import (
     ANGLES,
@@ -54,10 +52,10 @@ has next to none; ours."""
 _PLACES = np.array([CHANNELS.index(channel) for channel in ERRING])
 _COUNT = len(ERRING)
 
-inner_step: Any = None  # the inner model's, put in by `erring` and `side_by_side`
+inner_step: Any = None  # the inner model's, put in by `WrappingModel` and `side_by_side`
 inner_measure: Any = None
 inner_drift: Any = None
-INNER = N_FULL  # its number of states, put in by `erring`
+INNER = N_FULL  # its number of states, put in by `WrappingModel`
 WORK = dynamics.WORK_SIZE  # the size of its scratch; behind it drift and readings
 
 
@@ -94,87 +92,26 @@ def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) 
         out[INNER + _COUNT + i] = own[INNER + i]
 
 
-@cache
-def erring(inner: Motion, states: int, work: int, name: str) -> Motion:
-    """The motion of a model whose readings have errors that last, not compiled.
+class ErringModel(WrappingModel):
+    """A model whose readings have errors that last as well, through the engine's protocol."""
 
-    Args:
-        inner: the model's without them. states: how many it has. work: size of its scratch.
-        name: its class', by which numba's cache tells them apart.
-    """
-    names = {"INNER": states, "WORK": work}
-    step, measure, drift = (
-        under_names(f, names, f"over_{name}") for f in (_step, _measure, _drift_and_readings)
-    )
-    return Motion(step, measure, drift, inner)
+    own = Motion(_step, _measure, _drift_and_readings)
+    added_scale = np.array([1e-5 if c in ANGLES else 1e-4 for c in ERRING])
+    tail = _COUNT
+    word = "erring"
 
+    def added_parameters(self, inner: np.ndarray, noise: Noise | None) -> np.ndarray:
+        """Memories of the errors [s]."""
+        return _by_channel(noise, error_memory, MEMORY_START)
 
-class ErringModel(HeliModel):
-    """A model whose readings have errors that last as well, through the engine's protocol.
+    def added_variances(self, noise: Noise) -> np.ndarray:
+        """Of the errors, in their units squared."""
+        return _by_channel(noise, error_level, 0.0) ** 2
 
-    Attributes:
-        inner: the model without them: the helicopter, or one whose rotor speeds jitter.
-    """
-
-    def __init__(self, inner: HeliModel) -> None:
-        self.inner, self.states = inner, inner.exact.size
-        self.motion = erring(inner.motion, self.states, inner.work_size, inner.kind)
-        super().__init__(inner.vehicle, inner.bare_values)
-        self.read_delay, self.frequencies = inner.read_delay, inner.frequencies
-        self.air, self.exact = inner.air, np.append(inner.exact, np.ones(_COUNT, bool))
-        self.work_size = inner.work_size + self.states + N_CHANNELS
-        self.state_scale = np.append(
-            inner.state_scale, [1e-5 if c in ANGLES else 1e-4 for c in ERRING]
-        )
-        added = [[i, i] for i in range(self.states, self.states + _COUNT)]
-        self.noise_places = np.insert(inner.noise_places, self.states, added, 0)
-
-    @property
-    def kind(self) -> str:
-        """As `HeliModel.kind`."""
-        return f"erring_{self.inner.kind}"
-
-    @property
-    def errors(self) -> slice:
-        """Places of the states that are errors of the channels ERRING, in their units."""
-        return slice(self.states, self.states + _COUNT)
-
-    def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
-        """The inner model's parameter vector, and behind it the errors' memories [s]."""
-        memories = _by_channel(noise, error_memory, MEMORY_START)
-        return np.append(self.inner.vector(values, noise), memories)
-
-    def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
-        """First state (n,) and its covariance, without what the noise levels add."""
-        x, covariance = self.inner.start(record)
-        return np.append(x, np.zeros(_COUNT)), np.pad(covariance, (0, _COUNT))
-
-    def start_noise(self, noise: Noise) -> np.ndarray:
-        """Variances that the noise levels add to the first state (n,)."""
-        errors = _by_channel(noise, error_level, 0.0)
-        return np.append(self.inner.start_noise(noise), errors**2)
-
-    def process_noise(self, noise: Noise, vector: np.ndarray) -> ProcessNoise:
-        """What the noise adds to the covariance, by entry of `noise_places`."""
-        own = self.inner.process_noise(noise, vector[:-_COUNT])
-        fades = 1.0 / vector[-_COUNT:]
-        driven = 2.0 * _by_channel(noise, error_level, 0.0) ** 2 * fades
-        return ProcessNoise(
-            np.insert(own.intensity, self.states, driven), np.insert(own.decay, self.states, fades)
-        )
-
-
-def with_inner(model: HeliModel, kind: type[HeliModel]) -> HeliModel:
-    """A model of another kind, whose readings have errors that last where the first's have.
-
-    Args:
-        model: with such errors or without. kind: of the helicopter's motion.
-    """
-    if not isinstance(model, ErringModel):
-        return kind.like(model)
-    own = ErringModel(kind.like(model.inner))
-    own.read_delay = model.read_delay
-    return own
+    def added_noise(self, noise: Noise, tail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of errors with an exponential memory."""
+        fades = 1.0 / tail
+        return 2.0 * self.added_variances(noise) * fades, fades
 
 
 def _by_channel(noise: Noise | None, name_of: Any, otherwise: float) -> np.ndarray:

@@ -10,8 +10,7 @@ had inertias 10 to 40 % too large, and plays and lags of the servos.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from copy import copy
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,28 +18,17 @@ from scipy.signal import welch
 from scipy.stats import gmean
 
 from coax_env.estimation import helicopter_noise
-from coax_env.estimation.helicopter import (
-    READ,
-    HeliModel,
-    Motion,
-    _reads_another,
-    _take_in_innovations,
-    kernel_drift,
-    kernel_measure,
-    kernel_step,
-)
+from coax_env.estimation.helicopter import HeliModel, Motion, _take_in_innovations
 from coax_env.estimation.helicopter_noise import AXES, GUST_AXES
 from coax_env.estimation.run_passes import RunPass
-from coax_env.estimation.state_space import Noise, ProcessNoise, Record
+from coax_env.estimation.state_space import Noise, ProcessNoise
+from coax_env.estimation.wrapping_model import WrappingModel
 from coax_env.kernel.compilation import compiled
 from coax_env.model import dynamics
 from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model.layout import GUSTS, N_CHANNELS, N_FULL
 
-SWINGS = slice(N_FULL, N_FULL + 6)
-"""Partners of the six gusts [N, N m]."""
-N_SWINGING = SWINGS.stop
 AXES_OF_GUSTS = ("force x", "force y", "force z", "moment x", "moment y", "moment z")
 FASTEST = 5.0
 """Hz, of any swing: 20 rows of 100 Hz; ours."""
@@ -51,19 +39,22 @@ STANDS_OUT, CLEARLY = 1.5, 5.0
 Of four **synthetic** flights whose gusts swing, at 0.3 to 1.5 Hz, the clearest had 20 to 47 and the
 least 3; gusts that only fade have up to 2.1, since the lowest frequency is half in a window's mean."""
 
-# of the scratch, behind the kernel's: drift and readings
-_OUT = dynamics.WORK_SIZE
-_WORK_SIZE = _OUT + N_FULL + N_CHANNELS
+inner_step: Any = None  # the inner model's, put in by `WrappingModel` and `side_by_side`
+inner_measure: Any = None
+inner_drift: Any = None
+INNER = N_FULL  # its number of states, put in by `WrappingModel`
+WORK = dynamics.WORK_SIZE  # the size of its scratch; behind it drift and readings
+_TAIL = 12
+"""Parameters behind the inner model's: frequencies [Hz] and memories [s] of the six gusts."""
 
 
 @compiled()
-def _turned(x, partner, memory, frequency, dt, out):
+def _turned(x, gust, partner, memory, frequency, dt, out):
     """A gust and its partner `dt` seconds later, into the same places of `out`.
 
     Args:
-        x, out: (35,) states. partner: place in them of the gust's. memory: [s]. frequency: [Hz].
+        x, out: states. gust, partner: places in them. memory: [s]. frequency: [Hz].
     """
-    gust = partner - N_FULL + S.GUST_X
     fade = math.exp(-dt / memory)
     ahead = 2.0 * math.pi * frequency * dt
     along, across = fade * math.cos(ahead), fade * math.sin(ahead)
@@ -73,77 +64,75 @@ def _turned(x, partner, memory, frequency, dt, out):
 
 
 @compiled()
-def _turned_all(x, dt, p, out):
-    """All six, by what `p` ends with: their frequencies, then their memories. `out` may be `x`."""
+def _turned_all(x, states, dt, p, out):
+    """All six, by what `p` ends with; partners are behind so many states. `out` may be `x`."""
     for i in range(6):
-        _turned(x, N_FULL + i, p[p.size - 6 + i], p[p.size - 12 + i], dt, out)
+        _turned(x, S.GUST_X + i, states + i, p[p.size - 6 + i], p[p.size - _TAIL + i], dt, out)
 
 
 def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """The helicopter's step; gusts turn."""
-    for i in range(N_SWINGING):
+    """The inner model's step; gusts turn, from what commands show of them on."""
+    for i in range(INNER + 6):
         out[i] = x[i]
     _take_in_innovations(u, p, out)
-    for i in range(6):  # the step reads them as they were
-        work[_OUT + i] = out[S.GUST_X + i]
-    kernel_step(out[:N_FULL], u, dt, p, work, out[:N_FULL])
     for i in range(6):
-        out[S.GUST_X + i] = work[_OUT + i]
-    _turned_all(out, dt, p, out)
+        work[WORK + i] = out[S.GUST_X + i]
+    inner_step(x[:INNER], u, dt, p[: p.size - _TAIL], work, out[:INNER])
+    for i in range(6):
+        out[S.GUST_X + i] = work[WORK + i]
+    _turned_all(out, INNER, dt, p, out)
 
 
 def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
-    """The helicopter's readings."""
-    kernel_measure(x[:N_FULL], u[READ], p, work, out)
+    """The inner model's readings."""
+    inner_measure(x[:INNER], u, p[: p.size - _TAIL], work, out)
 
 
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """The helicopter's; gusts turn exactly."""
-    own = work[_OUT:_WORK_SIZE]
-    kernel_drift(x[:N_FULL], u, dt, p, work, own)
-    if _reads_another(u):
-        kernel_measure(x[:N_FULL], u[READ], p, work, own[N_FULL:])
-    for i in range(N_SWINGING):
+    """The inner model's; gusts turn exactly."""
+    own = work[WORK : WORK + INNER + N_CHANNELS]
+    inner_drift(x[:INNER], u, dt, p[: p.size - _TAIL], work, own)
+    for i in range(INNER + 6):
         out[i] = x[i]
     _take_in_innovations(u, p, out)
-    _turned_all(out, dt, p, out)
-    for i in range(N_SWINGING):
-        out[i] -= x[i]
+    _turned_all(out, INNER, dt, p, out)
+    for i in range(6):
+        out[S.GUST_X + i] -= x[S.GUST_X + i]
+        out[INNER + i] -= x[INNER + i]
     for i in range(S.GUST_X):
-        out[i] += own[i]
-    for i in range(S.GUST_X + 6, N_FULL):
-        out[i] += own[i]
+        out[i] = own[i]
+    for i in range(S.GUST_X + 6, INNER):
+        out[i] = own[i]
     for i in range(N_CHANNELS):
-        out[N_SWINGING + i] = own[N_FULL + i]
+        out[INNER + 6 + i] = own[INNER + i]
 
 
-class SwingingModel(HeliModel):
-    """A vehicle in gusts that swing, through the engine's protocol."""
+class SwingingModel(WrappingModel):
+    """A model in gusts that swing, through the engine's protocol.
 
-    motion = Motion(_step, _measure, _drift_and_readings)
-    air = np.append(HeliModel.air, np.arange(SWINGS.start, SWINGS.stop))
-    exact = np.append(HeliModel.exact, np.ones(6, bool))
-    work_size = _WORK_SIZE
-    state_scale = np.append(HeliModel.state_scale, HeliModel.state_scale[GUSTS])
-    noise_places = np.insert(
-        HeliModel.noise_places, N_FULL, [[i, i] for i in range(SWINGS.start, SWINGS.stop)], 0
-    )
-    frequencies: Sequence[float] = (0.0,) * 6
+    Attributes:
+        frequencies: of forces along and of moments about the axes [Hz], 0 of one that only fades.
+    """
 
-    def swinging_at(self, frequencies: Sequence[float]) -> "SwingingModel":
-        """The same in gusts with these frequencies.
+    own = Motion(_step, _measure, _drift_and_readings)
+    added_scale = HeliModel.state_scale[GUSTS]
+    tail = _TAIL
+    word = "swinging"
 
-        Args:
-            frequencies: of forces along and of moments about the axes [Hz], 0 of one that only fades.
-        """
-        model = copy(self)
-        model.frequencies = tuple(frequencies)
-        return model
+    def __init__(self, inner: HeliModel, frequencies: Sequence[float] = (0.0,) * 6) -> None:
+        super().__init__(inner)
+        self.air = np.append(inner.air, np.arange(self.added.start, self.added.stop))
+        self.frequencies = tuple(frequencies)
 
-    def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
-        """The helicopter's parameter vector, and behind it six frequencies and memories."""
-        own = super().vector(values, noise)
-        return np.concatenate([own, self.frequencies, self._memories(own)])
+    def around(self, inner: HeliModel) -> "SwingingModel":
+        """The same around another model."""
+        own = SwingingModel(inner, self.frequencies)
+        own.read_delay = self.read_delay
+        return own
+
+    def added_parameters(self, inner: np.ndarray, noise: Noise | None) -> np.ndarray:
+        """Frequencies [Hz] and memories [s] of the six gusts."""
+        return np.append(self.frequencies, self._memories(inner))
 
     def _memories(self, vector: np.ndarray) -> np.ndarray:
         """Memories of the six gusts [s]: in a group those that swing last as many swings each."""
@@ -155,33 +144,43 @@ class SwingingModel(HeliModel):
                 memories[own] *= mean / np.array([self.frequencies[i] for i in own])
         return memories
 
-    def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
-        """First state (35,) and its covariance, without what the noise levels add."""
-        x, covariance = super().start(record)
-        return np.append(x, np.zeros(6)), np.pad(covariance, (0, 6))
+    def added_variances(self, noise: Noise) -> np.ndarray:
+        """Of the partners [N^2, (N m)^2]: the gusts' own."""
+        return helicopter_noise.gust_levels(noise) ** 2
 
-    def start_noise(self, noise: Noise) -> np.ndarray:
-        """Variances that the noise levels add to the first state (35,)."""
-        return np.append(super().start_noise(noise), helicopter_noise.gust_levels(noise) ** 2)
-
-    def process_noise(self, noise: Noise, vector: np.ndarray) -> ProcessNoise:
-        """What the noise adds to the covariance, by entry of `noise_places`.
-
-        Of a gust that swings it drives the partner, by 2 (1 + 1 / (w memory)^2) times what drives one
-        that fades: its variance is then the same.
-        """
-        own = helicopter_noise.process_noise(noise, vector)
-        fades = 1.0 / vector[-6:]
-        fading = 2.0 * helicopter_noise.gust_levels(noise) ** 2 * fades
-        swung = 2.0 * math.pi * vector[-12:-6] / fades
+    def added_noise(self, noise: Noise, tail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of the partners of gusts that swing: 2 (1 + 1 / (w memory)^2) times what drives one that
+        fades, so that its variance is the same."""
+        fades = 1.0 / tail[6:]
+        fading = 2.0 * self.added_variances(noise) * fades
+        swung = 2.0 * math.pi * tail[:6] / fades
         swinging = swung > 0.0
         driven = np.zeros(6)
         driven[swinging] = 2.0 * (1.0 + 1.0 / swung[swinging] ** 2) * fading[swinging]
-        intensity = np.insert(own.intensity, N_FULL, driven)
-        decay = np.insert(own.decay, N_FULL, fades)
-        intensity[GUSTS] = np.where(swinging, 0.0, fading)
-        decay[GUSTS] = fades
-        return ProcessNoise(intensity, decay)
+        return driven, fades
+
+    def process_noise(self, noise: Noise, vector: np.ndarray) -> ProcessNoise:
+        """What the noise adds to the covariance; what swings is driven by its partner alone."""
+        every = super().process_noise(noise, vector)
+        fades = 1.0 / vector[-6:]
+        every.decay[GUSTS] = fades
+        every.intensity[GUSTS] = np.where(
+            vector[-_TAIL:-6] > 0.0, 0.0, 2.0 * self.added_variances(noise) * fades
+        )
+        return every
+
+
+def swinging_at(model: HeliModel, frequencies: Sequence[float]) -> HeliModel:
+    """A model in gusts with these frequencies; errors of its readings that last stay around it.
+
+    Args:
+        model: with other frequencies or none. frequencies: of the six gusts [Hz].
+    """
+    if isinstance(model, SwingingModel):
+        return SwingingModel(model.inner, frequencies)
+    if isinstance(model, WrappingModel):
+        return model.around(swinging_at(model.inner, frequencies))
+    return SwingingModel(model, frequencies)
 
 
 def swings(passes: Sequence[RunPass], row: float) -> list[float]:
