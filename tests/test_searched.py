@@ -16,6 +16,7 @@ from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.helicopter_noise import LEAST_READING_STD
 from coax_env.estimation.low_pass import LowPass
 from coax_env.estimation.state_space import Noise, Record
+from coax_env.model.layout import GYROS
 
 
 def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
@@ -362,9 +363,14 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
         lambda found, noise, clock: (found if found is behind else without, wider),
     )  # fmt: skip
     monkeypatch.setattr(searched, "_is_white_inside", lambda found: white)
+    monkeypatch.setattr(
+        searched,
+        "_behind_other_low_passes",
+        lambda problem, found, noise: asked.append("again") or found,
+    )
     of_each = {"behind": 50.0, "without": lost}
     monkeypatch.setattr(searched, "_lost", lambda problem, found: of_each[found.problem])
-    asked = []
+    asked: list[Any] = []
 
     def in_unrest(best: Searched, noise: Noise, clock: Any, erring: bool) -> Searched:
         asked.append((noise is wider, erring))
@@ -372,5 +378,51 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
 
     monkeypatch.setattr(searched, "_in_unrest", in_unrest)
     found = searched.searched("as given", levels, {})  # type: ignore[arg-type]
-    assert found.problem == taken and asked == [(True, True)]
+    assert found.problem == taken
+    assert asked == (["again"] if taken == "behind" else []) + [(True, True)]
     assert found.low_passes == ({"p": LowPass(0.01)} if taken == "behind" else {})
+
+
+@pytest.mark.parametrize(
+    ("passes", "lost", "taken"),
+    [
+        ({"p": LowPass(0.0105)}, 10.0, "found"),  # as it was: no further search
+        ({"p": LowPass(0.006)}, 10.0, "again"),
+        ({"p": LowPass(0.010, 2)}, 10.0, "again"),
+        ({}, 10.0, "again"),
+        ({"p": LowPass(0.006)}, 90.0, "found"),
+    ],
+)
+def test_low_passes_are_fitted_once_more_beside_errors_that_last(monkeypatch, passes, lost, taken):
+    """Of groups that have one, to readings as logged, from the levels that the search began with."""
+    levels = Noise({"error_gyros": 0.1})
+
+    class Problem(SimpleNamespace):
+        def with_records(self, records: Any, smoothed: bool = False) -> "Problem":
+            return Problem(**{**vars(self), "records": records, "smoothed": smoothed})
+
+    def of(problem: Any, noise: Noise) -> Searched:
+        fit = Fit(("wind",), {}, noise)
+        return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
+
+    asked: list[Any] = []
+
+    def low_passes(problem: Any, fit: Fit, noise: Noise, groups: Any) -> dict[str, LowPass]:
+        asked.append((problem.records, noise, groups))
+        return passes
+
+    given = Problem(
+        engine=SimpleNamespace(records="logged"), model=SimpleNamespace(channels=("p",)),
+        report=lambda text: None,
+    )  # fmt: skip
+    found = replace(of(given.with_records("before", True), levels), low_passes={"p": LowPass(0.01)})
+    monkeypatch.setattr(searched, "low_passes", low_passes)
+    monkeypatch.setattr(searched, "records_before", lambda logged, channels, those: ("then", those))
+    monkeypatch.setattr(searched, "_searched", of)
+    monkeypatch.setattr(searched, "_lost", lambda problem, it: 50.0 if it is found else lost)
+    best = searched._behind_other_low_passes(given, found, levels)  # type: ignore[arg-type]
+    assert asked == [("logged", levels, [GYROS])]
+    assert (best is found) == (taken == "found")
+    if best is not found:
+        assert best.low_passes == passes
+        assert best.problem.records == ("then", passes) and best.problem.smoothed

@@ -39,7 +39,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.sensor_errors import with_lasting_errors
-from coax_env.diagnosis.sensor_low_pass import hidden_behind, low_passes
+from coax_env.diagnosis.sensor_low_pass import GROUPS, hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_swings
 from coax_env.estimation.changing_model import Lap
@@ -66,6 +66,8 @@ NEAR = 0.3
 """Share of what errors that last are worth that one change in flight must be by its score, to be asked
 instead of them. On three flights with such errors the best change was worth 0.05 to 0.15 of them, and
 asking took 64 s of 110; growth scores less than it is worth; ours."""
+NEARLY = 0.1
+"""Share of its time by which a low-pass must be another one for a further search; ours."""
 FINER = 2.0
 """Times finer than LEAST_READING_STD that a channel must be for a second search; ours."""
 
@@ -105,6 +107,8 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         no_more = set(other.fit.active) <= set(best.fit.active)
         if other is not first and no_more and _lost(problem, other) < _lost(problem, best):
             best, begun = other, begun_so
+    if best.low_passes and begun is not noise and best.changing is None:
+        best = _behind_other_low_passes(problem, best, begun)
     if best.changing is not None:
         return best
     found = _in_unrest(best, begun, clock, erring=begun is not noise)
@@ -144,6 +148,34 @@ def _with_errors(found: Searched, noise: Noise, clock: Mapping[str, Lap]) -> tup
     problem.report("searching again with errors of readings that last")
     best = _likelier(_searched(problem, begun), trial)
     return replace(best, low_passes=found.low_passes), begun
+
+
+def _behind_other_low_passes(problem: Problem, found: Searched, noise: Noise) -> Searched:
+    """The search behind low-passes as they are beside errors that last, where that is likelier.
+
+    Without such errors a low-pass takes a part of them up.
+
+    Args:
+        problem: as given. found: with errors that last. noise: levels that it started from.
+    """
+    logged = problem.engine.records
+    behind = [group for group in GROUPS if found.low_passes.keys() & set(group)]
+    passes = low_passes(found.problem.with_records(logged), found.fit, noise, behind)
+    if _are_nearly(passes, found.low_passes):
+        return found
+    problem.report("searching again with readings as they were before these low-passes")
+    before = records_before(logged, problem.model.channels, passes)
+    again = _searched(found.problem.with_records(before, True), noise)
+    again = replace(again, low_passes=passes)
+    return again if _lost(problem, again) < _lost(problem, found) else found
+
+
+def _are_nearly(passes: Mapping[str, LowPass], others: Mapping[str, LowPass]) -> bool:
+    """Whether low-passes, by channel, are the others to a share of their times."""
+    if passes.keys() != others.keys():
+        return False
+    pairs = [(passes[channel], others[channel]) for channel in passes]
+    return all(a.order == b.order and abs(a.time - b.time) < NEARLY * b.time for a, b in pairs)
 
 
 def _is_white_inside(found: Searched) -> bool:

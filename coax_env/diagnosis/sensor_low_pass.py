@@ -44,21 +44,24 @@ WITHIN = 0.01
 """Of a row, to which the likeliest time is sought; ours."""
 
 
-def low_passes(problem: Problem, fit: Fit, noise: Noise) -> dict[str, LowPass]:
+def low_passes(
+    problem: Problem, fit: Fit, noise: Noise, groups: Sequence[Sequence[str]] = GROUPS
+) -> dict[str, LowPass]:
     """The low-passes of the channels that have one.
 
     Args:
         problem, fit: after a search. noise: from which that began: gusts have taken up by now what a
             low-pass does to the readings' noise.
+        groups: channels that are asked, each group for one low-pass.
     """
     if problem.has_slow_rows:
         return {}
     passes = problem.engine.filter(fit.values, fit.noise)
-    if max(_alike(passes, problem.model.channels, group) for group in GROUPS) < ALIKE:
+    if max(_alike(passes, problem.model.channels, group) for group in groups) < ALIKE:
         return {}
     found: dict[str, LowPass] = {}
-    for turn in range(TURNS):
-        for group in GROUPS:
+    for turn in range(TURNS if len(groups) > 1 else 1):
+        for group in groups:
             low_pass, noise = _likeliest(problem, fit, noise, group, found)
             found |= dict.fromkeys(group, low_pass)
         if all(low_pass == NONE for low_pass in found.values()):
