@@ -17,6 +17,10 @@ from numba.core.dispatcher import Dispatcher
 from scipy.spatial.transform import Rotation
 
 from coax_env import derivative, hover_trim, load_vehicle
+from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.lasting_errors import ErringModel
+from coax_env.estimation.rotor_jitter import JitteryModel
+from coax_env.estimation.swinging_gusts import SwingingModel
 from coax_env.kernel import compilation
 from coax_env.model import channels as Z
 from coax_env.model import dynamics, effects
@@ -1036,6 +1040,9 @@ def test_entries_are_complete(name):
 
 def test_no_two_compiled_functions_share_a_name():
     """Else one's machine code runs as the other's, where a process loads what two have compiled."""
+    plain = HeliModel(load_vehicle("lama400d"))
+    nested = ErringModel(SwingingModel(JitteryModel.like(plain)))
+    assert ErringModel(plain).step and SwingingModel(plain).step and nested.step
     names = {}
     gc.collect()
     for thing in gc.get_objects():

@@ -174,11 +174,15 @@ def compiled_motion(motion: Motion, names: Mapping[str, Any], kind: str) -> tupl
 
 
 @cache
-def pointers(motion: Motion) -> tuple[Any, Any, Any]:
-    """A model's three, as the engine takes them: compiled when a model of its kind is first made."""
+def pointers(motion: Motion, kind: str) -> tuple[Any, Any, Any]:
+    """A model's three, as the engine takes them: compiled when a model of its kind is first made.
+
+    Args:
+        motion: the model's. kind: what tells it from others.
+    """
     step, measure, drift = motion[:3]
     if motion.inner is not None:
-        known = _around(motion, {}, f"in_{step.__qualname__}")
+        known = _around(motion, {}, f"in_{kind}")
         step, measure, drift = (under_names(f, known, "around") for f in motion[:3])
     return pointer(STEP)(step), pointer(MEASURE)(measure), pointer(STEP)(drift)
 
@@ -289,7 +293,7 @@ class HeliModel:
         self.vehicle = vehicle
         self.bare_values = {**(held or {}), **vehicle.values()}
         self.size_ratios = usual_sizes.ratios(vehicle)
-        self.step, self.measure, self.drift_and_readings = pointers(self.motion)
+        self.step, self.measure, self.drift_and_readings = pointers(self.motion, self.kind)
 
     @classmethod
     def like(cls, model: "HeliModel") -> Self:
