@@ -11,7 +11,7 @@ from shared_flights import read
 
 from coax_env.errors import InputError
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
-from coax_env.logs.outliers import find_outliers
+from coax_env.logs.outliers import are_answers, find_outliers
 from coax_env.logs.repairs import hold_last
 from coax_env.model.layout import RPM_PER_RAD_S
 
@@ -213,6 +213,40 @@ def test_real_motion_stays() -> None:
             assert not find_outliers("q", reading).any()
     heading = np.angle(np.exp(1j * (2 * t + rng.normal(0, 0.01, len(t)))))
     assert not find_outliers("psi", heading, 0.0087).any()
+
+
+def test_what_commands_foretell_is_no_outlier(tmp_path: Path) -> None:
+    """Rotors whose speed jumps turn the body; bit errors that come at any time are none of that."""
+    rng = np.random.default_rng(4)
+    n = 1200
+    jumps = np.where(rng.random(n) < 0.05, rng.choice([-20.0, 20.0], n), 0.0)
+    speed = 200.0 + jumps + rng.normal(0.0, 0.3, n)
+    rate = 0.02 * np.roll(speed - 200.0, 3) + rng.normal(0.0, 0.01, n)
+    broken = rng.choice(np.arange(20, n - 20), 12, replace=False)
+    rate[broken] += rng.choice([-0.6, 0.6], 12)
+    flagged = find_outliers("r", rate, 0.01)
+    answers = are_answers("r", rate, [speed, np.zeros(n)])
+    genuine = np.setdiff1d(np.flatnonzero(np.roll(jumps, 3)), broken)
+    alone = np.setdiff1d(broken, np.flatnonzero(np.roll(jumps, 3)))
+    assert flagged[broken].all() and flagged[genuine].mean() > 0.7
+    assert answers[genuine].mean() > 0.98 and not answers[alone].any()
+    command = np.tile([0.0, 224.0, 0.0, 0.0], (n, 1))
+    command[:, 0] = speed
+    run = Run("hover", 0.01 * np.arange(n), command, {"r": rate})
+    flight = read_flight(write_flight(Flight("lama400d", (run,)), tmp_path / "flight"))
+    left_out = np.flatnonzero(np.isnan(flight.run("hover").measured["r"]))
+    assert set(alone) <= set(left_out) and not set(genuine[answers[genuine]]) & set(left_out)
+
+
+def test_one_jump_of_a_command_foretells_nothing() -> None:
+    """What it alone would explain is not foretold by any other row."""
+    rate = np.random.default_rng(0).normal(0.0, 0.01, 400)
+    command = np.full(400, 200.0)
+    command[150], rate[152] = 220.0, 1.0
+    assert find_outliers("r", rate, 0.01)[152]
+    assert not are_answers("r", rate, [command])[152]
+    assert not are_answers("r", rate, []).any()
+    assert not are_answers("r", rate, [np.full(400, 200.0)]).any()
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from coax_env.logs.clipped import clipped
 from coax_env.logs.columns import advice, time_advice
 from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
 from coax_env.logs.held import interpolated, repeats
-from coax_env.logs.outliers import find_leaps, find_outliers
+from coax_env.logs.outliers import are_answers, find_leaps, find_outliers
 from coax_env.logs.packets import broken_packets
 from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS, without
 from coax_env.model.layout import ANGLES, CHANNELS, RPM_PER_RAD_S
@@ -239,6 +239,11 @@ def _without_outliers(
 ) -> dict[str, np.ndarray]:
     """Channels with any reading, NaN in place of outliers."""
     measured = {}
+    causes = {
+        name: hold_last(data[name])
+        for name in (*ROTOR_COMMANDS, *SWASH_COMMANDS, *_MEASURED_ROTOR)
+        if name in data and not np.isnan(data[name]).all()
+    }
     for channel in CHANNELS:
         values = data.get(channel)
         if values is None:
@@ -248,6 +253,9 @@ def _without_outliers(
             continue
         outlier = find_outliers(channel, values, noise.get(channel))
         outlier |= find_leaps(channel, data["t"], values)
+        if outlier.any():
+            others = [cause for name, cause in causes.items() if name != channel]
+            outlier &= ~are_answers(channel, values, others)
         if outlier.any():
             values = np.where(outlier, np.nan, values)
             counts[f"outliers in {channel} removed"] += int(np.count_nonzero(outlier))
