@@ -114,7 +114,8 @@ def _leaves_colour(state: Changing, problem: Problem, trial: Fit, effect: str) -
         state.problem.engine.filter(state.fit.values, state.fit.noise), problem.model.channels
     )
     _, quadratic = quadratic_at(problem, trial, problem.own[effect])
-    shows = [c for c in channels_of(problem, trial, quadratic, effect) if not without[c].white]
+    shown = channels_of(problem, trial, quadratic, effect)
+    shows = [c for c in shown if c in without and not without[c].white]  # few readings: unjudged
     if not shows:
         return False
     with_it = [
