@@ -85,8 +85,9 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
 
 
 def believes_its_sensors(monkeypatch) -> None:
-    """No errors that last."""
+    """No errors that last, and white rotor speeds."""
     monkeypatch.setattr(searched, "with_lasting_errors", lambda problem, fit, noise: None)
+    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
 
 
 @pytest.mark.parametrize(
@@ -171,18 +172,30 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
 @pytest.mark.parametrize(
     ("rotors", "rate", "gained", "order"),
     [
-        (True, True, True, ["jitter", "swings"]),  # measured rotor speeds tell it by themselves
-        (False, True, True, ["swings", "jitter", "swings"]),
-        (False, True, False, ["swings", "jitter"]),  # rotors do not: nothing new to ask
-        (False, False, False, ["swings"]),
+        (
+            True,
+            True,
+            True,
+            ["jitter", "low-passes", "swings"],
+        ),  # rotor speeds tell it by themselves
+        (False, True, True, ["low-passes", "swings", "jitter", "swings"]),
+        (
+            False,
+            True,
+            False,
+            ["low-passes", "swings", "jitter"],
+        ),  # rotors do not: nothing new to ask
+        (False, False, False, ["low-passes", "swings"]),
     ],
 )
-def test_gusts_are_asked_for_a_frequency_beside_rotors_that_jitter(
+def test_jitter_is_asked_first_where_rotor_speeds_show_it_and_gusts_beside_it(
     monkeypatch, rotors, rate, gained, order
 ):
     asked: list[str] = []
+    engine = SimpleNamespace(filter=lambda values, noise: [])
     plain, jittery, swinging = (
-        SimpleNamespace(name=name, report=lambda text: None) for name in ("p", "j", "s")
+        SimpleNamespace(name=name, report=lambda text: None, engine=engine)
+        for name in ("p", "j", "s")
     )
 
     def of(problem: Any, noise: Noise) -> Searched:
@@ -203,10 +216,13 @@ def test_gusts_are_asked_for_a_frequency_beside_rotors_that_jitter(
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     monkeypatch.setattr(searched, "with_swings", with_swings)
     monkeypatch.setattr(searched, "_jittery", with_jitter)
-    monkeypatch.setattr(searched, "_is_coloured", coloured)
     monkeypatch.setattr(searched, "_searched", of)
-    noise = Noise({"force_xy": 0.2})
-    found = searched._in_unrest(of(plain, noise), noise, {}, erring=True)
+    monkeypatch.setattr(
+        searched, "_before_low_passes", lambda first, noise: asked.append("low-passes")
+    )
+    believes_its_sensors(monkeypatch)
+    monkeypatch.setattr(searched, "_is_coloured", coloured)
+    found = searched.searched(plain, Noise({"force_xy": 0.2}), {})  # type: ignore[arg-type]
     assert asked == order
     assert found.problem is (swinging if gained else plain)
     assert found.fit.noise.level("force_xy") == (0.7 if gained else 0.2)
@@ -357,11 +373,12 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     behind, without = one("behind", ("wind",)), one("without", names)
     behind = replace(behind, low_passes={"p": LowPass(0.01)})
     monkeypatch.setattr(searched, "_searched", lambda problem, noise: one("first", ()))
-    monkeypatch.setattr(searched, "_before_low_passes", lambda problem, first, noise: behind)
+    monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: behind)
     monkeypatch.setattr(
         searched, "_with_errors",
         lambda found, noise, clock: (found if found is behind else without, wider),
     )  # fmt: skip
+    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
     monkeypatch.setattr(searched, "_is_white_inside", lambda found: white)
     monkeypatch.setattr(
         searched,

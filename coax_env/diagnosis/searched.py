@@ -8,19 +8,19 @@ three times that, as long as the model's open-loop flight over the horizon comes
 runs (the likelihood raised to a power less than 1, for a model that is wrong: Miller and Dunson 2019,
 J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Identification, ch. 8).
 
+Where measured rotor speeds stay coloured, it is done again with rotors that jitter in the filter
+(estimation/rotor_jitter.py), if these are worth more than a tie: after a search, since a motor's lag
+colours them too and must be found as what it is, and first, since nothing else touches these readings.
+
 Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) it is done again, with
-what was before it. This comes first: errors that last would take a part of it up. Where errors of
+what was before it. This comes next: errors that last would take a part of it up. Where errors of
 readings last (sensor_errors.py) it is done again with these in it; where inertial sensors stay coloured
 behind a low-pass, without it too, and that stands if it is likelier and has no name more: errors of
-every memory at once look like a low-pass.
+every memory at once look like a low-pass. Low-passes are then fitted once more.
 
 Where gusts have a frequency it is done again with that in the filter (estimation/swinging_gusts.py), if
-nothing is coloured then: what a model lacks may swing, too.
-
-And where innovations that rotors' jitter would colour stay so, it is done again with that noise in the
-filter (estimation/rotor_jitter.py), if its levels are worth more than a tie: after a search, since a
-motor's lag colours them too and must be found as what it is. Then gusts are asked for a frequency once
-more; first, where measured rotor speeds themselves are coloured, which gusts do not touch.
+nothing is coloured then: what a model lacks may swing, too. Jitter that the yaw rate alone shows is
+asked then, and gusts once more beside it.
 
 And where commands are late, by a delay of the readings' own (estimation/helicopter.py), if that is
 likelier: what was found beside a delay that is off by a part of a row may stand for that part.
@@ -100,7 +100,9 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         clock: of all runs in the order in which they were flown.
     """
     first = _searched(problem, noise)
-    smoothed = _before_low_passes(problem, first, noise)
+    if _is_coloured(first, ROTOR_SPEEDS):
+        first, noise = _jittery(first, noise)
+    smoothed = _before_low_passes(first, noise)
     best, begun = _with_errors(smoothed or first, noise, clock)
     if smoothed is not None and not _is_white_inside(best):
         other, begun_so = _with_errors(first, noise, clock)
@@ -115,12 +117,13 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     return replace(found, low_passes=best.low_passes)
 
 
-def _before_low_passes(problem: Problem, first: Searched, noise: Noise) -> Searched | None:
+def _before_low_passes(first: Searched, noise: Noise) -> Searched | None:
     """The search with readings as they were before a low-pass, where there is one.
 
     Args:
-        problem: as given. first: the search in it. noise: levels to start from.
+        first: the search in readings as logged. noise: levels to start from.
     """
+    problem = first.problem
     smoothed = low_passes(problem, first.fit, noise)
     if not smoothed:
         return None
@@ -207,8 +210,6 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
     shaken = in_shocks(best.problem, best.fit)
     if shaken:
         best = _changed(best, clock) or _searched_in_shocks(best, noise)
-    if _is_coloured(best, ROTOR_SPEEDS):
-        best, noise = _jittery(best, noise)
     asked = None
     while best is not asked:
         asked = best
