@@ -148,8 +148,9 @@ def test_what_changed_once_is_no_error_that_lasts(monkeypatch, onsets, white, wo
     assert (changed is not None) == used and (changed is None or changed.changing is state)
 
 
-def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkeypatch):
-    """Nothing is coloured then, and nothing else is asked."""
+@pytest.mark.parametrize("white", [True, False])
+def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkeypatch, white):
+    """Nothing is coloured then, and nothing else is asked; what a model lacks may swing, too."""
     asked: list[tuple[Any, float]] = []
 
     def one(problem: Any, noise: Noise, coarse: bool = False) -> Searched:
@@ -157,16 +158,20 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
         fit = Fit((), {}, noise)
         return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
 
-    swinging = SimpleNamespace(report=lambda text: None)
+    engine, model = SimpleNamespace(filter=lambda values, noise: []), SimpleNamespace(channels=())
+    fading, swinging = (
+        SimpleNamespace(report=lambda text: None, engine=engine, model=model) for _ in range(2)
+    )
+    monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
     monkeypatch.setattr(searched, "_searched", one)
     believes_its_sensors(monkeypatch)
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
     monkeypatch.setattr(searched, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
-    found = searched.searched("fading", Noise({"force_xy": 0.2}), {})  # type: ignore[arg-type]
-    assert asked == [("fading", 0.2), (swinging, 0.7)]
-    assert found.problem is swinging and found.low_passes == {}
+    found = searched.searched(fading, Noise({"force_xy": 0.2}), {})  # type: ignore[arg-type]
+    assert asked == [(fading, 0.2), (swinging, 0.7)]
+    assert found.problem is (swinging if white else fading) and found.low_passes == {}
 
 
 @pytest.mark.parametrize(
@@ -192,9 +197,10 @@ def test_jitter_is_asked_first_where_rotor_speeds_show_it_and_gusts_beside_it(
     monkeypatch, rotors, rate, gained, order
 ):
     asked: list[str] = []
-    engine = SimpleNamespace(filter=lambda values, noise: [])
+    engine, model = SimpleNamespace(filter=lambda values, noise: []), SimpleNamespace(channels=())
+    monkeypatch.setattr(searched, "is_white", lambda passes, channels: True)
     plain, jittery, swinging = (
-        SimpleNamespace(name=name, report=lambda text: None, engine=engine)
+        SimpleNamespace(name=name, report=lambda text: None, engine=engine, model=model)
         for name in ("p", "j", "s")
     )
 

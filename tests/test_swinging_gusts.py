@@ -195,26 +195,21 @@ def test_a_gust_that_only_fades_has_none():
 
 
 @pytest.mark.parametrize(
-    ("white_before", "peak", "gain", "white_with", "used"),
+    ("peak", "gain", "used"),
     [
-        (False, 0.8, 100.0, True, True),
-        (True, 0.8, 100.0, True, False),  # nothing asks for more
-        (False, 0.0, 100.0, True, False),  # nor swings
-        (False, 0.8, 10.0, True, False),  # not worth the threshold
-        (False, 0.8, 100.0, False, False),  # what a model lacks may swing, too
+        (0.8, 100.0, True),
+        (0.0, 100.0, False),  # no swings
+        (0.8, 10.0, False),  # not worth the threshold
     ],
 )
-def test_swings_are_used_where_they_are_worth_it_and_nothing_stays_coloured(
-    monkeypatch, white_before, peak, gain, white_with, used
-):
+def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, peak, gain, used):
     """The fits are stand-ins, which gain at once what they may."""
-    white = iter([white_before, white_with])
     fit = Fit((), {}, NOISE, objective=500.0)
     gained = lambda problem, fit: replace(fit, objective=500.0 - gain)  # noqa: E731
-    monkeypatch.setattr(asking, "is_white", lambda passes, channels: next(white))
     monkeypatch.setattr(asking, "swings", lambda passes, row: [peak] * 6)
     monkeypatch.setattr(asking, "fitted", gained)
     monkeypatch.setattr(asking, "noise_fitted", gained)
+    monkeypatch.setattr(asking, "with_latent_noise", lambda problem, fit: None)
     monkeypatch.setattr(asking, "_swinging", lambda problem, frequencies: problem)
     monkeypatch.setattr(asking, "_likeliest", lambda part, trial, found, axes: (found, trial))
     monkeypatch.setattr(asking, "evenly_picked", lambda records, seconds: records)

@@ -294,7 +294,17 @@ def test_a_size_is_unusual_from_two_and_a_half_on_and_a_limit_at_five(size, word
 def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
     """An effect against which nothing speaks but what is said here."""
     sound = Against(
-        tuple(channels), (), (), Replication(1.0, 1.0, ()), 8, {"gain": 1.0}, True, (), 100.0, False
+        tuple(channels),
+        (),
+        0.0,
+        (),
+        Replication(1.0, 1.0, ()),
+        8,
+        {"gain": 1.0},
+        True,
+        (),
+        100.0,
+        False,
     )
     return replace(sound, **but)
 
@@ -387,6 +397,17 @@ def test_what_stands_for_something_else_has_no_name(
         not named or limited or coloured or undetermined or falls or beside or kept != 1.0
         or nats < SETTINGS.sure_evidence
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(("share", "doubted"), [(0.5, False), (0.6, True)])
+def test_nothing_is_sure_where_the_model_leaves_colour_in_most_channels(share, doubted):
+    """Though what shows the effect is white; it keeps its name."""
+    against = {"servo_play": known_of(elsewhere=share)}
+    found = list(doubts("servo_play", against, SETTINGS))
+    assert bool(found) == doubted and all("most of what was read" in text for text in found)
+    assert not without_name(against, SETTINGS)
+    shown = {"servo_play": known_of(elsewhere=share, coloured=("q",))}
+    assert len(list(doubts("servo_play", shown, SETTINGS))) == 1
 
 
 def test_a_size_is_that_beyond_the_off_value():

@@ -18,6 +18,8 @@ AT_BOUND = 0.99
 """Share of the most usual sizes from which a number stands at its bound; ours."""
 SPEAKING_AGAINST = 2
 """Of what speaks against a name so much takes it; ours."""
+MOST = 0.5
+"""Share of the channels from which what is left in them speaks against every name; ours."""
 MOST_VARIATIONS = 3
 """Variations of the noise that a doubt names; of more, their number; ours."""
 
@@ -29,6 +31,7 @@ class Against:
     Attributes:
         channels: in which it shows most, strongest first.
         coloured: those of them in which more than noise is left.
+        elsewhere: share of all channels in which it is.
         falls_at: variations of the noise under which it does not hold.
         parts: how it fared on parts of the flights. runs: number of runs that were fitted.
         sizes: of its numbers [usual sizes].
@@ -39,6 +42,7 @@ class Against:
 
     channels: tuple[str, ...]
     coloured: tuple[str, ...]
+    elsewhere: float
     falls_at: tuple[str, ...]
     parts: Replication
     runs: int
@@ -118,6 +122,8 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
     if of.coloured:
         coloured = and_list([channel_name(c) for c in of.coloured])
         yield f"it shows in {coloured}, where the model leaves more than noise"
+    elif of.elsewhere > MOST:
+        yield "the model leaves more than noise in most of what was read"
     yield from under_noise(of.falls_at)
     yield from on_parts(of.parts, of.runs, chosen)
     yield from of_sizes(of.sizes)

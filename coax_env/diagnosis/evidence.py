@@ -29,7 +29,7 @@ from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, loss, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import is_white, whiteness
-from coax_env.model.layout import ACCELEROMETERS, INERTIAL
+from coax_env.model.layout import ACCELEROMETERS
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def _unlike_gusts(problem: Problem, fit: Fit) -> bool:
 
 def _feels_gusts(problem: Problem) -> bool:
     """Whether gyros or accelerometers are aboard, and read before a command answers what they feel."""
-    return not problem.has_slow_rows and not problem.aboard.isdisjoint(INERTIAL)
+    return not problem.has_slow_rows and not problem.sees_poses_alone
 
 
 def _is_white(problem: Problem, fit: Fit) -> bool:
@@ -196,7 +196,8 @@ def _only(problem: Problem, fit: Fit, causes: Collection[str]) -> Fit:
 
 def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:
     """What colour, and commands for what the filter does not see, make of a cause's variance."""
-    unseen = problem.reads_seldom or problem.unlike_gusts or problem.smoothed
+    unseen = problem.reads_seldom or problem.sees_poses_alone
+    unseen = unseen or problem.unlike_gusts or problem.smoothed
     colour = inflation(problem, quadratic, fit.active, effect)
     late = unseen and effect in WEAK_OR_LATE
     return colour * problem.settings.unseen_inflation if late else colour

@@ -21,7 +21,7 @@ from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.model import effects
-from coax_env.model.layout import CHANNELS, INERTIAL
+from coax_env.model.layout import CHANNELS
 from coax_env.plain_words import plain
 
 
@@ -107,8 +107,7 @@ def confusable_with(problem: Problem, effect: str, alternatives: Iterable[str]) 
 
 def alike_in_seldom_poses(problem: Problem, effect: str) -> list[str]:
     """What a cause cannot be told from by poses alone, more than Settings.slow_rows apart."""
-    felt = not problem.aboard.isdisjoint(INERTIAL)
-    if effect not in LATE or felt or not problem.reads_seldom:
+    if effect not in LATE or not problem.sees_poses_alone or not problem.reads_seldom:
         return []
     return sorted((LATE - {effect}) & set(problem.candidates))
 

@@ -33,7 +33,7 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
         found: the confounded alternatives of each cause that is named.
     """
     return [
-        *_slow_rows(problem),
+        *_seen_late(problem),
         *_unlike_gusts(problem),
         *_smoothed(problem),
         *_swings(problem),
@@ -109,15 +109,16 @@ def held_out_before(
     ]
 
 
-def _slow_rows(problem: Problem) -> list[str]:
-    if not problem.reads_seldom:
+def _seen_late(problem: Problem) -> list[str]:
+    if problem.has_slow_rows:
+        why = f"rows {1e3 * problem.row:.0f} ms apart: what the commands did between them is not known"
+    elif problem.reads_seldom:
+        apart = 1e3 * problem.between_readings
+        why = f"readings {apart:.0f} ms apart: commands may answer what none has shown yet"
+    elif problem.sees_poses_alone:
+        why = "neither gyros nor accelerometers: who flies may see gusts before poses show them"
+    else:
         return []
-    why = (
-        f"rows {1e3 * problem.row:.0f} ms apart: what the commands did between them is not known"
-        if problem.has_slow_rows
-        else f"readings {1e3 * problem.between_readings:.0f} ms apart: commands may answer what none"
-        " has shown yet"
-    )
     return [
         f"{why}, and what looks like a weak or late answer must be worth"
         f" {problem.settings.unseen_inflation:g} times as much"

@@ -217,7 +217,10 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
         if swinging is not None:
             problem, levels = swinging
             problem.report("gusts have a frequency: searching again with that")
-            return _searched(problem, noise.with_levels(levels))
+            other = _searched(problem, noise.with_levels(levels))
+            passes = problem.engine.filter(other.fit.values, other.fit.noise)
+            if is_white(passes, problem.model.channels):
+                return other
         if _is_coloured(best, SHOWN_BY):
             best, noise = _jittery(best, noise)
     if erring:

@@ -1,9 +1,11 @@
 """Whether gusts have a frequency, which a memory that fades does not have.
 
-Asked after a search, where something stays coloured. Spectra of the filter's own gusts show where each
-may swing (estimation/swinging_gusts.py); from there frequencies, noise levels and numbers are fitted in
-turns, frequencies by the likelihood itself, since they change the filter's gains. What a model lacks
-may look like a swing as well: nothing may be coloured then, or none is used.
+Asked after a search, of white innovations too: poses are too coarse to be coloured by a swing, and it
+makes false names all the same. Spectra of the filter's own gusts show where each may swing
+(estimation/swinging_gusts.py); from there frequencies, noise levels and numbers are fitted in turns,
+frequencies by the likelihood itself, since they change the filter's gains. Gusts that swing have no
+fast part, so that white noise is asked for once more. What a model lacks may look like a swing as well:
+after a search with them nothing may be coloured, or none is used (searched.py).
 """
 
 import math
@@ -14,13 +16,12 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import gmean
 
-from coax_env.diagnosis.fits import fitted, noise_fitted
+from coax_env.diagnosis.fits import fitted, noise_fitted, with_latent_noise
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import AXES, GUST_AXES, GUST_LEVELS, MEMORIES
 from coax_env.estimation.noise_levels import evenly_picked
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.swinging_gusts import FASTEST, swinging_at, swings
-from coax_env.estimation.whiteness import is_white
 from coax_env.plain_words import and_list
 
 TURNS = 3
@@ -34,16 +35,12 @@ SLOWEST = 0.05
 
 
 def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] | None:
-    """The problem whose gusts swing, and levels of these, where that leaves nothing coloured.
+    """The problem whose gusts swing, and levels of these, where they are worth the threshold.
 
     Args:
         problem, fit: after a search.
     """
-    channels = problem.model.channels
-    passes = problem.engine.filter(fit.values, fit.noise)
-    if is_white(passes, channels):
-        return None
-    frequencies = swings(passes, problem.row)
+    frequencies = swings(problem.engine.filter(fit.values, fit.noise), problem.row)
     if not any(frequencies):
         return None
     best = _swinging(problem, frequencies)
@@ -59,14 +56,13 @@ def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] 
         for axes in AXES:
             frequencies, trial = _likeliest(part, trial, frequencies, axes)
         best = _swinging(problem, frequencies)
-    trial = fitted(best, noise_fitted(best, trial))
+    trial = noise_fitted(best, trial)
+    trial = fitted(best, with_latent_noise(best, trial) or trial)
     gained = fit.objective - trial.objective
     problem.report(
         f"gusts that swing at {and_list([f'{f:.2f}' for f in frequencies])} Hz: {gained:.1f} nats"
     )
     if gained < problem.settings.evidence:
-        return None
-    if not is_white(best.engine.filter(trial.values, trial.noise), channels):
         return None
     return best, {name: trial.noise.level(name) for name in (*GUST_LEVELS, *MEMORIES)}
 

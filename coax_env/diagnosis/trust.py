@@ -87,6 +87,7 @@ def trusts(
     falling = not_holding(problem, fit, quadratic, worth)
     shaken = bool(fit.active) and in_shocks(problem, fit)
     runs = len(of_runs(problem.engine.records))
+    elsewhere = sum(not of.white for of in white.values()) / max(len(white), 1)
     known, against = {}, {}
     for effect in fit.active:
         channels = channels_of(problem, fit, quadratic, effect)
@@ -94,6 +95,7 @@ def trusts(
         against[effect] = Against(
             channels=tuple(channels),
             coloured=tuple(c for c in channels if c in white and not white[c].white),
+            elsewhere=elsewhere,
             falls_at=tuple(falling[effect]),
             parts=replicated[effect],
             runs=runs,
