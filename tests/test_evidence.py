@@ -258,8 +258,30 @@ def test_by_poses_alone_names_are_asked_so_and_numbers_are_the_readings(monkeypa
     ],
 )
 def test_gyros_and_accelerometers_feel_gusts_in_time_but_between_slow_rows(aboard, slow, feels):
-    problem = SimpleNamespace(aboard=frozenset(aboard), has_slow_rows=slow)
+    alone = aboard.isdisjoint({"p", "q", "r", "ax", "ay", "az"})
+    problem = SimpleNamespace(sees_poses_alone=alone, has_slow_rows=slow)
     assert evidence._feels_gusts(problem) == feels  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("effect", "unseen", "colour", "factor"),
+    [
+        ("motor_lag", {}, 2.0, 2.0),
+        ("motor_lag", {"reads_seldom"}, 2.0, 6.0),
+        ("motor_lag", {"smoothed", "sees_poses_alone"}, 2.0, 6.0),
+        ("motor_lag", {"sees_poses_alone"}, 1.0, 3.0),
+        ("motor_lag", {"sees_poses_alone"}, 8.0, 8.0),  # poses fine enough to show it are coloured
+        ("marker_offset", {"sees_poses_alone", "reads_seldom"}, 2.0, 2.0),  # no answer to commands
+    ],
+)
+def test_what_looks_like_a_late_answer_must_be_worth_more_where_gusts_are_seen_late(
+    monkeypatch, effect, unseen, colour, factor
+):
+    conditions = ("reads_seldom", "unlike_gusts", "smoothed", "sees_poses_alone")
+    problem = SimpleNamespace(settings=SETTINGS, **{name: name in unseen for name in conditions})
+    monkeypatch.setattr(evidence, "inflation", lambda problem, quadratic, active, effect: colour)
+    fit = SimpleNamespace(active=(effect,))
+    assert evidence._inflation(problem, fit, None, effect) == factor  # type: ignore[arg-type]
 
 
 def test_where_commands_show_nothing_the_readings_decide(monkeypatch):

@@ -16,7 +16,8 @@ slow rows: a servo's delay of 35 ms was 14 +- 3 with them, 28 +- 3 without.
 Neither likelihood knows what the commands did between rows that are far apart, nor what a pilot saw
 coming of gusts that are not as the filter has them (with a frequency, say); and what is left of a
 sensor's low-pass, taken back by its likeliest form, is itself a late answer. What looks like a weak or
-late answer must be worth several times as much there (`Settings.unseen_inflation`).
+late answer must be worth several times as much there (`Settings.unseen_inflation`); by poses alone,
+where colour takes no more than that from it already.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -196,11 +197,14 @@ def _only(problem: Problem, fit: Fit, causes: Collection[str]) -> Fit:
 
 def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:
     """What colour, and commands for what the filter does not see, make of a cause's variance."""
-    unseen = problem.reads_seldom or problem.sees_poses_alone
-    unseen = unseen or problem.unlike_gusts or problem.smoothed
     colour = inflation(problem, quadratic, fit.active, effect)
-    late = unseen and effect in WEAK_OR_LATE
-    return colour * problem.settings.unseen_inflation if late else colour
+    unseen = problem.settings.unseen_inflation
+    if effect not in WEAK_OR_LATE:
+        return colour
+    if problem.reads_seldom or problem.unlike_gusts or problem.smoothed:
+        return colour * unseen
+    # what poses show late colours them, where they are fine enough to show it
+    return max(colour, unseen) if problem.sees_poses_alone else colour
 
 
 def _is_doubtful(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:
