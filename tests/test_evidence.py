@@ -271,6 +271,8 @@ def test_gyros_and_accelerometers_feel_gusts_in_time_but_between_slow_rows(aboar
         ("motor_lag", {"smoothed", "sees_poses_alone"}, 2.0, 6.0),
         ("motor_lag", {"sees_poses_alone"}, 1.0, 3.0),
         ("motor_lag", {"sees_poses_alone"}, 8.0, 8.0),  # poses fine enough to show it are coloured
+        ("command_delay", {"sees_poses_alone"}, 1.0, 1.0),  # a constant time
+        ("command_delay", {"reads_seldom", "sees_poses_alone"}, 1.0, 3.0),
         ("marker_offset", {"sees_poses_alone", "reads_seldom"}, 2.0, 2.0),  # no answer to commands
     ],
 )

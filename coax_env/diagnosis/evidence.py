@@ -16,8 +16,9 @@ slow rows: a servo's delay of 35 ms was 14 +- 3 with them, 28 +- 3 without.
 Neither likelihood knows what the commands did between rows that are far apart, nor what a pilot saw
 coming of gusts that are not as the filter has them (with a frequency, say); and what is left of a
 sensor's low-pass, taken back by its likeliest form, is itself a late answer. What looks like a weak or
-late answer must be worth several times as much there (`Settings.unseen_inflation`); by poses alone,
-where colour takes no more than that from it already.
+late answer must be worth several times as much there (`Settings.unseen_inflation`). So must a weak one
+by poses alone, where colour takes no more than that from it already: a command that answers a gust
+before poses show it makes an answer weak or slow, and none late by a constant time.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -25,7 +26,7 @@ from dataclasses import dataclass, replace
 
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_at, without
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
-from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem
+from coax_env.diagnosis.problem import PURE_DELAYS, WEAK_OR_LATE, Fit, Problem
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, loss, threshold
 from coax_env.estimation.quadratic import Quadratic
@@ -204,7 +205,8 @@ def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) ->
     if problem.reads_seldom or problem.unlike_gusts or problem.smoothed:
         return colour * unseen
     # what poses show late colours them, where they are fine enough to show it
-    return max(colour, unseen) if problem.sees_poses_alone else colour
+    slack = problem.sees_poses_alone and effect not in PURE_DELAYS
+    return max(colour, unseen) if slack else colour
 
 
 def _is_doubtful(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:

@@ -51,6 +51,9 @@ answers gusts between the rows of a log, which holds each command until the next
 better than the filter does, as by poses alone: of 30 clean **synthetic** flights (`--arms mixed_poses`,
 seed 503) three at 60 Hz had a motor lag, yaw damping or yaw inertia of 34 to 60 nats."""
 
+PURE_DELAYS = frozenset({"command_delay", "servo_delay"})
+"""Of these those that are a constant time."""
+
 ROTOR_SPEEDS = ("rpm_upper", "rpm_lower")
 """Channels that show commands, and no gust."""
 
