@@ -80,6 +80,7 @@ from coax_env.errors import InputError
 from coax_env.files import read_bytes, staged_folder, write_text
 from coax_env.logs.card import CARD, Card, read_card
 from coax_env.logs.card_columns import Column, Quaternion
+from coax_env.logs.clock import on_even_clock
 from coax_env.logs.csv_log import CsvLog, read_csv
 from coax_env.logs.frames import place
 from coax_env.logs.repairs import repaired
@@ -222,6 +223,7 @@ def read_flight(path: str | Path) -> Flight:
         unread |= dict.fromkeys(log.unknown)
         logs.append(repaired(log, card.noise, counts, card.holds))
     _check_columns(folder, card, renamed, unread)
+    logs = read_apart(on_even_clock(logs, counts), counts, card.holds)
     runs = tuple(
         Run(
             entry.name,
@@ -233,7 +235,7 @@ def read_flight(path: str | Path) -> Flight:
             battery=data.battery,
             part=entry.part,
         )
-        for entry, data in zip(card.runs, read_apart(logs, counts, card.holds), strict=True)
+        for entry, data in zip(card.runs, logs, strict=True)
     )
     return Flight(
         vehicle=card.vehicle,

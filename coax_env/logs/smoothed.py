@@ -54,7 +54,7 @@ def read_apart(
         holds: channel -> what the card says; one that never holds stays as it is.
     """
     pieces = {c: _pieces(runs, c) for c in MOTION if holds.get(c) is not False}
-    steep = {c: max(steepness(own, k) for k in (1, 2)) for c, (own, _) in pieces.items()}
+    steep = {c: _steepest(own) for c, (own, _) in pieces.items()}
     rows = max((_apart(*pieces[c]) for c, times in steep.items() if times > STEEP), default=1)
     if rows == 1:
         return list(runs)
@@ -71,6 +71,19 @@ def read_apart(
         found.append(replace(run, measured=measured))
     counts[f"smoothed readings left out, all but one in {rows} of {and_list(smooth)}"] += left_out
     return found
+
+
+def are_steep(runs: Sequence[Repaired]) -> bool:
+    """Whether a channel is smoothed, or has no noise at all.
+
+    Args:
+        runs: of one flight.
+    """
+    return any(_steepest(_pieces(runs, channel)[0]) > STEEP for channel in MOTION)
+
+
+def _steepest(pieces: Sequence[np.ndarray]) -> float:
+    return max(steepness(pieces, rows) for rows in (1, 2))
 
 
 def _apart(pieces: Sequence[np.ndarray], step: float) -> int:
