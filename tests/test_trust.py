@@ -294,18 +294,10 @@ def test_a_size_is_unusual_from_two_and_a_half_on_and_a_limit_at_five(size, word
 def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
     """An effect against which nothing speaks but what is said here."""
     sound = Against(
-        tuple(channels),
-        (),
-        0.0,
-        (),
-        Replication(1.0, 1.0, ()),
-        8,
-        {"gain": 1.0},
-        True,
-        (),
-        100.0,
-        False,
-    )
+        channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
+        parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
+        alternatives=(), nats=100.0, shaken=False,
+    )  # fmt: skip
     return replace(sound, **but)
 
 
@@ -408,6 +400,13 @@ def test_nothing_is_sure_where_the_model_leaves_colour_in_most_channels(share, d
     assert not without_name(against, SETTINGS)
     shown = {"servo_play": known_of(elsewhere=share, coloured=("q",))}
     assert len(list(doubts("servo_play", shown, SETTINGS))) == 1
+
+
+def test_nothing_is_sure_where_a_run_is_much_louder_than_its_noise():
+    against = {"servo_play": known_of(loud=("pe", "pn"))}
+    (text,) = doubts("servo_play", against, SETTINGS)
+    assert "position east and position north" in text and "2 times as loud" in text
+    assert not without_name(against, SETTINGS)
 
 
 def test_a_size_is_that_beyond_the_off_value():

@@ -20,6 +20,10 @@ SPEAKING_AGAINST = 2
 """Of what speaks against a name so much takes it; ours."""
 MOST = 0.5
 """Share of the channels from which what is left in them speaks against every name; ours."""
+LOUD = 2.0
+"""Std of whitened innovations of a run, 1 where all is right, from which evidence is not to be trusted:
+what changes them by a tenth is worth hundreds of nats. A wrong clock made that of a position 4 on a
+clean **synthetic** flight, with a motor lag and a play of 400 nats, both sure; ours."""
 MOST_VARIATIONS = 3
 """Variations of the noise that a doubt names; of more, their number; ours."""
 
@@ -32,6 +36,7 @@ class Against:
         channels: in which it shows most, strongest first.
         coloured: those of them in which more than noise is left.
         elsewhere: share of all channels in which it is.
+        loud: channels whose innovations are over LOUD times as loud in a run as their noise is.
         falls_at: variations of the noise under which it does not hold.
         parts: how it fared on parts of the flights. runs: number of runs that were fitted.
         sizes: of its numbers [usual sizes].
@@ -43,6 +48,7 @@ class Against:
     channels: tuple[str, ...]
     coloured: tuple[str, ...]
     elsewhere: float
+    loud: tuple[str, ...]
     falls_at: tuple[str, ...]
     parts: Replication
     runs: int
@@ -124,6 +130,9 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
         yield f"it shows in {coloured}, where the model leaves more than noise"
     elif of.elsewhere > MOST:
         yield "the model leaves more than noise in most of what was read"
+    if of.loud:
+        loud = and_list([channel_name(c) for c in of.loud])
+        yield f"a run is over {LOUD:g} times as loud in {loud} as the noise that was fitted"
     yield from under_noise(of.falls_at)
     yield from on_parts(of.parts, of.runs, chosen)
     yield from of_sizes(of.sizes)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from coax_env.diagnosis.confounding import Alternatives, channels_of
-from coax_env.diagnosis.doubts import Against, doubts, on_parts, sizes, without_name
+from coax_env.diagnosis.doubts import LOUD, Against, doubts, on_parts, sizes, without_name
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.noise_variation import not_holding
 from coax_env.diagnosis.problem import Fit, Problem
@@ -87,6 +87,7 @@ def trusts(
     falling = not_holding(problem, fit, quadratic, worth)
     shaken = bool(fit.active) and in_shocks(problem, fit)
     runs = len(of_runs(problem.engine.records))
+    loud = tuple(channel for channel, of in white.items() if of.spread > LOUD)
     elsewhere = sum(not of.white for of in white.values()) / max(len(white), 1)
     known, against = {}, {}
     for effect in fit.active:
@@ -96,6 +97,7 @@ def trusts(
             channels=tuple(channels),
             coloured=tuple(c for c in channels if c in white and not white[c].white),
             elsewhere=elsewhere,
+            loud=loud,
             falls_at=tuple(falling[effect]),
             parts=replicated[effect],
             runs=runs,
