@@ -164,12 +164,21 @@ def test_noise_and_numbers_are_fitted_by_turns_until_a_turn_gains_little(monkeyp
 # --- what a cause is worth ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("factor", "lost", "close"), [(1.0, 139.0, True), (1.0, 141.0, False),
-                                                       (3.0, 300.0, True)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("factor", "lost", "foretold", "close"),
+    [
+        (1.0, 139.0, 139.0, True),
+        (1.0, 141.0, 139.0, False),
+        (3.0, 300.0, 300.0, True),
+        (1.0, 2000.0, 1001.0, False),
+        (1.0, 2000.0, 999.0, True),  # it lost far more than was foretold: it has not converged
+    ],
+)
 def test_evidence_is_what_a_refit_without_it_loses_over_the_inflation(
-    monkeypatch, factor, lost, close
+    monkeypatch, factor, lost, foretold, close
 ):
     """Within ten thresholds the refit goes on until it has converged, a nat less here."""
+    monkeypatch.setattr(evidence, "loss", lambda *given: foretold)
     monkeypatch.setattr(evidence, "inflation", lambda *given: factor)
     monkeypatch.setattr(evidence, "without", lambda problem, fit, quadratic, effect: fit)
     monkeypatch.setattr(evidence, "noise_fitted", lambda problem, fit: fit)
