@@ -11,7 +11,7 @@ from shared_flights import read
 
 from coax_env.errors import InputError
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
-from coax_env.logs.outliers import are_answers, find_outliers
+from coax_env.logs.outliers import are_answers, find_outliers, off_median
 from coax_env.logs.repairs import hold_last
 from coax_env.model.layout import RPM_PER_RAD_S
 
@@ -225,7 +225,8 @@ def test_what_commands_foretell_is_no_outlier(tmp_path: Path) -> None:
     broken = rng.choice(np.arange(20, n - 20), 12, replace=False)
     rate[broken] += rng.choice([-0.6, 0.6], 12)
     flagged = find_outliers("r", rate, 0.01)
-    answers = are_answers("r", rate, [speed, np.zeros(n)])
+    every = np.ones(n, dtype=bool)
+    answers = are_answers("r", rate, [off_median(speed), np.zeros(n)], every)
     genuine = np.setdiff1d(np.flatnonzero(np.roll(jumps, 3)), broken)
     alone = np.setdiff1d(broken, np.flatnonzero(np.roll(jumps, 3)))
     assert flagged[broken].all() and flagged[genuine].mean() > 0.7
@@ -244,9 +245,10 @@ def test_one_jump_of_a_command_foretells_nothing() -> None:
     command = np.full(400, 200.0)
     command[150], rate[152] = 220.0, 1.0
     assert find_outliers("r", rate, 0.01)[152]
-    assert not are_answers("r", rate, [command])[152]
-    assert not are_answers("r", rate, []).any()
-    assert not are_answers("r", rate, [np.full(400, 200.0)]).any()
+    every = np.ones(400, dtype=bool)
+    assert not are_answers("r", rate, [off_median(command)], every)[152]
+    assert not are_answers("r", rate, [], every).any()
+    assert not are_answers("r", rate, [off_median(np.full(400, 200.0))], every).any()
 
 
 @pytest.mark.slow

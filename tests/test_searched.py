@@ -258,7 +258,7 @@ def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypa
     monkeypatch.setattr(searched, "_searched", one)
     believes_its_sensors(monkeypatch)
     monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
-    monkeypatch.setattr(searched, "_is_white_inside", lambda found: True)
+    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {"ax": LowPass(0.008)})
     problem = Problem(
         model=model, engine=SimpleNamespace(records=[record]), report=lambda text: None,
@@ -384,8 +384,9 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
         searched, "_with_errors",
         lambda found, noise, clock: (found if found is behind else without, wider),
     )  # fmt: skip
-    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
-    monkeypatch.setattr(searched, "_is_white_inside", lambda found: white)
+    monkeypatch.setattr(
+        searched, "_is_coloured", lambda found, channels: "ax" in channels and not white
+    )
     monkeypatch.setattr(
         searched,
         "_behind_other_low_passes",

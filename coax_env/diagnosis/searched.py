@@ -35,7 +35,7 @@ from scipy.optimize import minimize_scalar
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
-from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.problem import ROTOR_SPEEDS, Fit, Problem
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.sensor_errors import with_lasting_errors
@@ -56,8 +56,6 @@ from coax_env.model.layout import INERTIAL
 
 COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
-ROTOR_SPEEDS = ("rpm_upper", "rpm_lower")
-"""Channels that jitter alone, or a motor's lag, colours."""
 SHOWN_BY = (*ROTOR_SPEEDS, "r")
 """Channels that a rotor's jitter colours."""
 READ_WITHIN = 0.02
@@ -104,7 +102,7 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         first, noise = _jittery(first, noise)
     smoothed = _before_low_passes(first, noise)
     best, begun = _with_errors(smoothed or first, noise, clock)
-    if smoothed is not None and not _is_white_inside(best):
+    if smoothed is not None and _is_coloured(best, INERTIAL):
         other, begun_so = _with_errors(first, noise, clock)
         no_more = set(other.fit.active) <= set(best.fit.active)
         if other is not first and no_more and _lost(problem, other) < _lost(problem, best):
@@ -179,13 +177,6 @@ def _are_nearly(passes: Mapping[str, LowPass], others: Mapping[str, LowPass]) ->
         return False
     pairs = [(passes[channel], others[channel]) for channel in passes]
     return all(a.order == b.order and abs(a.time - b.time) < NEARLY * b.time for a, b in pairs)
-
-
-def _is_white_inside(found: Searched) -> bool:
-    """Whether gyros and accelerometers are white."""
-    passes = found.problem.engine.filter(found.fit.values, found.fit.noise)
-    seen = whiteness(passes, found.problem.model.channels)
-    return all(seen[channel].white for channel in INERTIAL if channel in seen)
 
 
 def _lost(problem: Problem, found: Searched) -> float:

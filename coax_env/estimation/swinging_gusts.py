@@ -126,9 +126,7 @@ class SwingingModel(WrappingModel):
 
     def around(self, inner: HeliModel) -> "SwingingModel":
         """The same around another model."""
-        own = SwingingModel(inner, self.frequencies)
-        own.read_delay = self.read_delay
-        return own
+        return SwingingModel(inner, self.frequencies)
 
     def added_parameters(self, inner: np.ndarray, noise: Noise | None) -> np.ndarray:
         """Frequencies [Hz] and memories [s] of the six gusts."""

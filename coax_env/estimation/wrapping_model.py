@@ -68,9 +68,7 @@ class WrappingModel(HeliModel):
         Args:
             inner: instead of its own.
         """
-        own = self.like(inner)
-        own.read_delay = self.read_delay
-        return own
+        return self.like(inner)
 
     def reading_after(self, delay: float) -> "WrappingModel":
         """The same, whose readings see commands this much later [s], once any delay is there."""

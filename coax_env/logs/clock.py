@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import median_abs_deviation
 
 from coax_env.logs.repairs import Repaired
 from coax_env.logs.smoothed import are_steep
@@ -89,7 +90,7 @@ def _off_the_middle(run: Repaired) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         expected = rate * (t[1:-1] - 0.5 * (t[:-2] + t[2:]))
         seen = y[1:-1] - 0.5 * (y[:-2] + y[2:])
         beside = np.maximum(steps[:-1], steps[1:]) < LONG * usual  # no row is missing there
-        scatter = _scatter(seen)
+        scatter = median_abs_deviation(seen, scale="normal")
         kept = beside & (np.abs(seen) < FAR * (scatter + np.abs(expected)))
         if scatter > 0.0 and expected[kept].any():
             yield expected[kept] / scatter, seen[kept] / scatter
@@ -102,7 +103,7 @@ def even_times(t: np.ndarray) -> np.ndarray:
         t: as logged [s].
     """
     steps = np.diff(t)
-    scatter = _scatter(steps) / math.sqrt(2.0)
+    scatter = median_abs_deviation(steps, scale="normal") / math.sqrt(2.0)
     step = float(np.median(t[AHEAD:] - t[:-AHEAD])) / AHEAD if t.size > 2 * AHEAD else 0.0
     if not UNEVEN * step < scatter < LARGEST * step:
         return t
@@ -148,8 +149,3 @@ def _refined(place: np.ndarray, seen: np.ndarray) -> np.ndarray:
         trials = plain + lost * (about >= np.arange(low, high + 1)[:, None])
         place[low:high] = trials[np.argmin(((trials - seen[low:high]) ** 2).sum(axis=1))]
     return place
-
-
-def _scatter(values: np.ndarray) -> float:
-    """Std of what is about a median, outliers left out."""
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))

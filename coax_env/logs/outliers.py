@@ -37,6 +37,8 @@ FORETOLD = 0.25
 """Share of a spike that its causes must foretell; ours. Of 82 of a yaw rate on a **synthetic** flight
 whose commands arrive in steps finer than logged, all the rotors' reaction, 70 are; of what is chance
 beside 8 std none."""
+AT_ONCE = 10_000
+"""Rows that are summed up at once."""
 ITS_OWN = 0.5
 """Share of a row in its own fit (leverage) from which the fit foretells nothing of it; ours."""
 
@@ -69,7 +71,14 @@ def find_outliers(channel: str, values: np.ndarray, noise: float | None = None) 
     return flagged
 
 
-def are_answers(channel: str, values: np.ndarray, causes: Sequence[np.ndarray]) -> np.ndarray:
+def off_median(values: np.ndarray) -> np.ndarray:
+    """How far numbers (n,) are off their running median."""
+    return values - _median_of_each(_windows(values))
+
+
+def are_answers(
+    channel: str, values: np.ndarray, causes: Sequence[np.ndarray], asked: np.ndarray
+) -> np.ndarray:
     """Where a reading is off its running median by what its causes foretell.
 
     Deviations from the median follow those of the causes in the last ANSWER_ROWS rows, by least squares
@@ -79,26 +88,37 @@ def are_answers(channel: str, values: np.ndarray, causes: Sequence[np.ndarray]) 
     Args:
         channel: name; angles are unwrapped first.
         values: (n,) readings, NaN where there is none.
-        causes: commands and measured rotor speeds, (n,) each, finite.
+        causes: how far commands and measured rotor speeds are off theirs, (n,) each.
+        asked: (n,) bool, rows to say it of.
 
     Returns:
         (n,) bool.
     """
     answers = np.zeros(len(values), dtype=bool)
     present, y = _present(channel, values)
-    off = y - _running_median(y)
-    moved = [cause - _running_median(cause) for cause in causes]
-    late = [np.pad(m, (k, 0))[: m.size][present] for m in moved for k in range(ANSWER_ROWS + 1)]
-    late = [column for column in late if column.any()]
-    if not late:
+    off = off_median(y)
+    moved = np.stack([np.pad(c, (ANSWER_ROWS, 0)) for c in causes if c.any()] or [np.zeros(0)])
+    if moved.size == 0:
         return answers
-    columns = np.stack(late, axis=1)
-    basis, sizes, _ = np.linalg.svd(columns / columns.std(axis=0), full_matrices=False)
-    basis = basis[:, sizes > 1e-9 * sizes[0]]
-    its_own = np.einsum("ij,ij->i", basis, basis)
-    left = off - basis @ (basis.T @ off)
-    foretold = np.where(its_own < ITS_OWN, off - left / np.maximum(1.0 - its_own, ITS_OWN), 0.0)
-    answers[present] = foretold * off > FORETOLD * off**2
+    back = ANSWER_ROWS - np.arange(ANSWER_ROWS + 1)
+
+    def late(rows: np.ndarray) -> np.ndarray:
+        """(r, columns): causes as they were in each of some rows, and in those before it."""
+        return moved[:, rows[:, None] + back].transpose(1, 0, 2).reshape(rows.size, -1)
+
+    products, with_off = 0.0, 0.0
+    for first in range(0, present.size, AT_ONCE):  # a log may last an hour
+        part = slice(first, first + AT_ONCE)
+        columns = late(present[part])
+        products, with_off = products + columns.T @ columns, with_off + columns.T @ off[part]
+    inverse = np.linalg.pinv(products, rcond=1e-12, hermitian=True)
+    which = np.flatnonzero(asked[present])
+    columns = late(present[which])
+    its_own = np.einsum("ij,jk,ik->i", columns, inverse, columns)
+    left = off[which] - columns @ (inverse @ with_off)
+    foretold = off[which] - left / np.maximum(1.0 - its_own, ITS_OWN)
+    told = (its_own < ITS_OWN) & (foretold * off[which] > FORETOLD * off[which] ** 2)
+    answers[present[which[told]]] = True
     return answers
 
 
@@ -140,10 +160,6 @@ def _windows(y: np.ndarray) -> np.ndarray:
     """Readings about each of some readings (n,), (n, 2 HALF_WINDOW + 1)."""
     padded = np.pad(y, HALF_WINDOW, mode="reflect")
     return np.lib.stride_tricks.sliding_window_view(padded, 2 * HALF_WINDOW + 1)
-
-
-def _running_median(y: np.ndarray) -> np.ndarray:
-    return _median_of_each(_windows(y))
 
 
 def _median_of_each(windows: np.ndarray) -> np.ndarray:

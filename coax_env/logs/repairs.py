@@ -14,7 +14,7 @@ from coax_env.logs.clipped import clipped
 from coax_env.logs.columns import advice, time_advice
 from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
 from coax_env.logs.held import interpolated, repeats
-from coax_env.logs.outliers import are_answers, find_leaps, find_outliers
+from coax_env.logs.outliers import are_answers, find_leaps, find_outliers, off_median
 from coax_env.logs.packets import broken_packets
 from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS, without
 from coax_env.model.layout import ANGLES, CHANNELS, RPM_PER_RAD_S
@@ -238,12 +238,7 @@ def _without_outliers(
     data: Mapping[str, np.ndarray], noise: Mapping[str, float], counts: Counter[str]
 ) -> dict[str, np.ndarray]:
     """Channels with any reading, NaN in place of outliers."""
-    measured = {}
-    causes = {
-        name: hold_last(data[name])
-        for name in (*ROTOR_COMMANDS, *SWASH_COMMANDS, *_MEASURED_ROTOR)
-        if name in data and not np.isnan(data[name]).all()
-    }
+    measured, flagged = {}, {}
     for channel in CHANNELS:
         values = data.get(channel)
         if values is None:
@@ -254,13 +249,25 @@ def _without_outliers(
         outlier = find_outliers(channel, values, noise.get(channel))
         outlier |= find_leaps(channel, data["t"], values)
         if outlier.any():
-            others = [cause for name, cause in causes.items() if name != channel]
-            outlier &= ~are_answers(channel, values, others)
-        if outlier.any():
-            values = np.where(outlier, np.nan, values)
-            counts[f"outliers in {channel} removed"] += int(np.count_nonzero(outlier))
+            flagged[channel] = outlier
         measured[channel] = values
+    causes = _off_medians(data) if flagged else {}
+    for channel, outlier in flagged.items():
+        others = [cause for name, cause in causes.items() if name != channel]
+        outlier &= ~are_answers(channel, measured[channel], others, outlier)
+        if outlier.any():
+            measured[channel] = np.where(outlier, np.nan, measured[channel])
+            counts[f"outliers in {channel} removed"] += int(np.count_nonzero(outlier))
     return measured
+
+
+def _off_medians(data: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """How far commands and measured rotor speeds are off their running medians, (n,) each."""
+    return {
+        name: off_median(hold_last(data[name]))
+        for name in (*ROTOR_COMMANDS, *SWASH_COMMANDS, *_MEASURED_ROTOR)
+        if name in data and not np.isnan(data[name]).all()
+    }
 
 
 def _commands(
