@@ -18,6 +18,7 @@ from coax_env.estimation.engine import Engine
 from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import GUST_LEVELS
+from coax_env.estimation.joint_gusts import SHARES
 from coax_env.estimation.parted_engine import AT
 from coax_env.estimation.rotor_jitter import REACTION
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
@@ -176,7 +177,7 @@ class Problem:
 
     def free_of_vehicle(self, active: Collection[str]) -> list[FreeParameter]:
         """Those of them that a vehicle file can hold: numbers of the machine as it is at last."""
-        of_filter = {*P.COMMAND_GAINS, REACTION.name}
+        of_filter = {*P.COMMAND_GAINS, REACTION.name, *SHARES}
         return [f for f in self.free(active) if f.name not in of_filter and AT not in f.name]
 
     def acting_names(self, effect: str) -> list[str]:

@@ -15,12 +15,12 @@ from coax_env.estimation.helicopter_noise import (
     error_memory,
     level_unit,
 )
+from coax_env.estimation.joint_gusts import SHARES
 from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
-from coax_env.estimation.swinging_gusts import AXES_OF_GUSTS
 from coax_env.model.effects import CATALOGUE
-from coax_env.model.layout import ERRING_GROUPS
+from coax_env.model.layout import AXES_OF_GUSTS, ERRING_GROUPS
 from coax_env.plain_words import and_list, channel_name, plain, with_unit
 
 
@@ -37,6 +37,7 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
         *_unlike_gusts(problem),
         *_smoothed(problem),
         *_swings(problem),
+        *_joint_gusts(fit),
         *_lasting_errors(fit),
         *_white_noise(problem, fit),
         *_moved_base(problem, fit),
@@ -130,6 +131,16 @@ def _swings(problem: Problem) -> list[str]:
     of = zip(AXES_OF_GUSTS, problem.model.base.frequencies, strict=False)
     said = [f"{axis} {frequency:.2g}" for axis, frequency in of if frequency > 0.0]
     return [f"gusts have a frequency [Hz]: {', '.join(said)}"] if said else []
+
+
+def _joint_gusts(fit: Fit) -> list[str]:
+    """Which gusts push and turn at once, where some do."""
+    said = [
+        f"{name.partition('.')[2].replace('_', ' ')} {fit.values[name]:+.2g}"
+        for name in SHARES
+        if name in fit.values
+    ]
+    return [f"gusts push and turn at once [m, or a number]: {', '.join(said)}"] if said else []
 
 
 def _lasting_errors(fit: Fit) -> list[str]:

@@ -20,7 +20,8 @@ every memory at once look like a low-pass. Low-passes are then fitted once more.
 
 Where gusts have a frequency it is done again with that in the filter (estimation/swinging_gusts.py), if
 nothing is coloured then: what a model lacks may swing, too. Jitter that the yaw rate alone shows is
-asked then, and gusts once more beside it.
+asked then, by poses alone where anything is named, and gusts once more beside it. Last it is asked
+whether gusts push and turn at once (correlated_gusts.py).
 
 And where commands are late, by a delay of the readings' own (estimation/helicopter.py), if that is
 likelier: what was found beside a delay that is off by a part of a row may stand for that part.
@@ -32,6 +33,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from coax_env.diagnosis.correlated_gusts import in_joint_gusts
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
@@ -212,8 +214,9 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
             passes = problem.engine.filter(other.fit.values, other.fit.noise)
             if is_white(passes, problem.model.channels):
                 return other
-        if _is_coloured(best, SHOWN_BY):
+        if _is_coloured(best, SHOWN_BY) or _may_hide_jitter(best):
             best, noise = _jittery(best, noise)
+        best = _with_joint_gusts(best, noise)
     if erring:
         return best
     problem = best.problem
@@ -348,6 +351,13 @@ def _is_coloured(found: Searched, channels: Sequence[str]) -> bool:
     return not all(shown[channel].white for channel in channels if channel in shown)
 
 
+def _may_hide_jitter(found: Searched) -> bool:
+    """Whether something is named where no reading would be coloured by rotors that jitter."""
+    problem = found.problem
+    unseen = problem.sees_poses_alone and problem.aboard.isdisjoint(ROTOR_SPEEDS)
+    return unseen and bool(found.fit.active)
+
+
 def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
     """The search with rotors that jitter, where that gains more than a tie, and levels it started from.
 
@@ -374,6 +384,25 @@ def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
     of_jitter = {name: jittery.level(name) for name in (JITTER_LEVEL, JITTER_MEMORY)}
     noise = with_jitter(noise, wider.model).with_levels(of_jitter)
     return _searched(wider, noise), noise
+
+
+def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:
+    """The search in gusts that push and turn at once, where it ends likelier.
+
+    Args:
+        found: with such gusts already, or without. noise: levels that it started from.
+    """
+    joint = in_joint_gusts(found.problem, found.fit)
+    if joint is None:
+        return found
+    problem, fit = joint
+    problem.report("searching again with gusts that push and turn at once")
+    other = _likelier(_searched(problem, noise, found.coarse), fit)
+    if not cost(problem, other.fit, other.quadratic) < cost(
+        found.problem, found.fit, found.quadratic
+    ):
+        return found
+    return replace(other, low_passes=found.low_passes)
 
 
 def _coarser(noise: Noise) -> dict[str, float]:

@@ -128,8 +128,14 @@ LEAST_READING_STD = {
 # --- in the filter ----------------------------------------------------------------------------------
 
 _REACTING = np.array([[S.R, S.OMEGA_U], [S.R, S.OMEGA_L]])
-NOISE_PLACES = np.vstack([np.repeat(np.arange(N_FULL)[:, None], 2, axis=1), _REACTING])
-"""Entries of the process noise's covariance: the diagonal, then yaw rate with each rotor's speed."""
+PAIRS_OF_GUSTS = tuple((i, j) for j in range(6) for i in range(j))
+_OF_GUSTS = np.array(PAIRS_OF_GUSTS) + GUSTS.start
+NOISE_PLACES = np.vstack([np.repeat(np.arange(N_FULL)[:, None], 2, axis=1), _REACTING, _OF_GUSTS])
+"""Entries of the process noise's covariance: the diagonal, yaw rate with each rotor's speed, gusts with
+each other: these are none, but their score says whether there should be some (joint_gusts.py)."""
+_REACTIONS = slice(N_FULL, N_FULL + len(_REACTING))
+JOINT = slice(-len(_OF_GUSTS), None)
+"""Places of the gusts with each other in NOISE_PLACES, and in those of models with more states."""
 _SPIN_UP = effects.parameter_index("spin_up_reaction.gain")
 GUST_AXES = ("force_xy", "force_xy", "force_z", "moment_xy", "moment_xy", "moment_z")
 """Group of each gust state."""
@@ -167,10 +173,11 @@ def process_noise(noise: Noise, p: np.ndarray) -> ProcessNoise:
         [p[P.ROTOR_INERTIA_U] + p[P.FLYBAR_INERTIA], -p[P.ROTOR_INERTIA_L]]
     )  # fmt: skip
     q[S.R] += float(per_speed @ per_speed) * level[ROTOR_LEVEL] ** 2
-    q[N_FULL:] = per_speed * level[ROTOR_LEVEL] ** 2
+    q[_REACTIONS] = per_speed * level[ROTOR_LEVEL] ** 2
     memory = np.array([level[f"memory_{axes}"] for axes in GUST_AXES])
     q[GUSTS] = 2.0 * gust_levels(noise) ** 2 / memory
     decay[GUSTS] = 1.0 / memory
+    decay[JOINT] = decay[_OF_GUSTS].mean(axis=1)
     q[TRIMS] = [level[name] ** 2 for name in TRIM_LEVELS]
     return ProcessNoise(q, decay)
 

@@ -29,7 +29,6 @@ from coax_env.model import parameters as P
 from coax_env.model import state as S
 from coax_env.model.layout import GUSTS, N_CHANNELS, N_FULL
 
-AXES_OF_GUSTS = ("force x", "force y", "force z", "moment x", "moment y", "moment z")
 FASTEST = 5.0
 """Hz, of any swing: 20 rows of 100 Hz; ours."""
 SPECTRUM_SECONDS = 5.0

@@ -54,8 +54,8 @@ class WrappingModel(HeliModel):
         self.exact = np.append(inner.exact, np.ones(self.added_scale.size, bool))
         self.work_size = inner.work_size + self.states + N_CHANNELS
         self.state_scale = np.append(inner.state_scale, self.added_scale)
-        places = [[i, i] for i in range(self.added.start, self.added.stop)]
-        self.noise_places = np.insert(inner.noise_places, self.states, places, 0)
+        places = np.repeat(np.r_[self.added][:, None], 2, axis=1)
+        self.noise_places = np.insert(inner.noise_places, self._behind, places, 0)
 
     @classmethod
     def like(cls, model: HeliModel) -> Self:
@@ -87,6 +87,11 @@ class WrappingModel(HeliModel):
         """Places of the added states."""
         return slice(self.states, self.states + self.added_scale.size)
 
+    @property
+    def _behind(self) -> list[int]:
+        """Where each added state's own entry goes into the inner model's."""
+        return [self.states] * self.added_scale.size
+
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """The inner model's parameter vector, and behind it what the added states need."""
         inner = self.inner.vector(values, noise)
@@ -107,8 +112,8 @@ class WrappingModel(HeliModel):
         inner = self.inner.process_noise(noise, vector[: -self.tail])
         driven, fades = self.added_noise(noise, vector[-self.tail :])
         return ProcessNoise(
-            np.insert(inner.intensity, self.states, driven),
-            np.insert(inner.decay, self.states, fades),
+            np.insert(inner.intensity, self._behind, driven),
+            np.insert(inner.decay, self._behind, fades),
         )
 
     # --- what each kind says of its states ----------------------------------------------------------

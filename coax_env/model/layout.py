@@ -50,6 +50,7 @@ ACTUATORS = slice(16, 20)
 GUST_FORCE = slice(20, 23)
 GUST_MOMENT = slice(23, 26)
 GUSTS = slice(20, 26)
+AXES_OF_GUSTS = ("force x", "force y", "force z", "moment x", "moment y", "moment z")
 TRIMS = slice(26, 28)
 
 # --- command --------------------------------------------------------------------------------------
