@@ -20,7 +20,7 @@ from coax_env.estimation.helicopter_noise import AXES, GUST_AXES
 from coax_env.estimation.lasting_errors import ErringModel
 from coax_env.estimation.rotor_jitter import JitteryModel
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.swinging_gusts import SwingingModel, swinging_at, swings
+from coax_env.estimation.swinging_gusts import SwingingModel, clearest, swinging_at, swings
 from coax_env.model import dynamics
 from coax_env.model import parameters as P
 from coax_env.model import state as S
@@ -182,6 +182,7 @@ def test_a_spectrum_shows_at_what_frequency_a_gust_comes():
     t, rng = 0.01 * np.arange(4500), np.random.default_rng(1)
     wave = np.sin(2.0 * np.pi * 0.8 * t) + 0.3 * rng.standard_normal(t.size)
     assert swings(passes(wave), 0.01) == pytest.approx([0.0, 0.8, 0.0, 0.0, 0.0, 0.0])
+    assert clearest(passes(wave), 0.01) == "force_xy"
 
 
 def test_a_gust_that_only_fades_has_none():
@@ -195,18 +196,21 @@ def test_a_gust_that_only_fades_has_none():
 
 
 @pytest.mark.parametrize(
-    ("peak", "gain", "used"),
+    ("peak", "alone", "gain", "used"),
     [
-        (0.8, 100.0, True),
-        (0.0, 100.0, False),  # no swings
-        (0.8, 10.0, False),  # not worth the threshold
+        (0.8, 60.0, 100.0, True),
+        (0.0, 60.0, 100.0, False),  # no swings
+        (0.8, 5.0, 100.0, False),  # none where they are clearest
+        (0.8, 60.0, 10.0, False),  # not worth the threshold
     ],
 )
-def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, peak, gain, used):
+def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, peak, alone, gain, used):
     """The fits are stand-ins, which gain at once what they may."""
     fit = Fit((), {}, NOISE, objective=500.0)
     gained = lambda problem, fit: replace(fit, objective=500.0 - gain)  # noqa: E731
     monkeypatch.setattr(asking, "swings", lambda passes, row: [peak] * 6)
+    monkeypatch.setattr(asking, "clearest", lambda passes, row: "force_z")
+    monkeypatch.setattr(asking, "_gained_by", lambda p, f, at, axes: alone * (axes == "force_z"))
     monkeypatch.setattr(asking, "fitted", gained)
     monkeypatch.setattr(asking, "noise_fitted", gained)
     monkeypatch.setattr(asking, "with_latent_noise", lambda problem, fit: None)
@@ -223,6 +227,28 @@ def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, peak, gain, u
     if found is not None:
         levels = {**LEVELS, **{f"memory_{axes}": 1.25 for axes in AXES}}  # one swing at 0.8 Hz
         assert found[0] is problem and found[1] == pytest.approx(levels)
+
+
+@pytest.mark.parametrize(("axes", "alone"), [("force_xy", [0.8, 0.9]), ("moment_z", [0.5])])
+def test_one_group_swings_alone(monkeypatch, axes, alone):
+    """The others only fade; what it gains is beside what the same flights are worth without."""
+    worth = lambda nats: SimpleNamespace(  # noqa: E731
+        engine=SimpleNamespace(log_likelihood=lambda values, noise: nats)
+    )
+    problem = SimpleNamespace(engine=SimpleNamespace(records=[]), noise_fit_seconds=60.0)
+    problem.with_records = lambda records: worth(20.0)
+    asked = []
+    monkeypatch.setattr(asking, "evenly_picked", lambda records, seconds: records)
+    monkeypatch.setattr(asking, "_swinging", lambda part, found: worth(33.0))
+    monkeypatch.setattr(
+        asking,
+        "_likeliest",
+        lambda part, trial, found, of: asked.append((found, of)) or (found, trial),
+    )
+    frequencies = [0.8, 0.9, 0.0, 0.0, 0.0, 0.5]
+    assert asking._gained_by(problem, Fit((), {}, NOISE), frequencies, axes) == 13.0
+    (found, of), *_ = asked
+    assert of == axes and [f for f in found if f] == alone
 
 
 @pytest.mark.slow

@@ -2,10 +2,12 @@
 
 Asked after a search, of white innovations too: poses are too coarse to be coloured by a swing, and it
 makes false names all the same. Spectra of the filter's own gusts show where each may swing
-(estimation/swinging_gusts.py); from there frequencies, noise levels and numbers are fitted in turns,
-frequencies by the likelihood itself, since they change the filter's gains. Gusts that swing have no
-fast part, so that white noise is asked for once more. What a model lacks may look like a swing as well:
-after a search with them nothing may be coloured, or none is used (searched.py).
+(estimation/swinging_gusts.py). Spectra peak by chance, too: where the clearest group of axes gains no
+more than a tie by swinging alone, nothing else is asked. From there frequencies, noise levels and
+numbers are fitted in turns, frequencies by the likelihood itself, since they change the filter's gains.
+Gusts that swing have no fast part, so that white noise is asked for once more. What a model lacks may
+look like a swing as well: after a search with them nothing may be coloured, or none is used
+(searched.py).
 """
 
 import math
@@ -21,7 +23,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import AXES, GUST_AXES, GUST_LEVELS, MEMORIES
 from coax_env.estimation.noise_levels import evenly_picked
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.swinging_gusts import FASTEST, swinging_at, swings
+from coax_env.estimation.swinging_gusts import FASTEST, clearest, swinging_at, swings
 from coax_env.plain_words import and_list
 
 TURNS = 3
@@ -40,8 +42,12 @@ def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] 
     Args:
         problem, fit: after a search.
     """
-    frequencies = swings(problem.engine.filter(fit.values, fit.noise), problem.row)
+    passes = problem.engine.filter(fit.values, fit.noise)
+    frequencies = swings(passes, problem.row)
     if not any(frequencies):
+        return None
+    alone = _gained_by(problem, fit, frequencies, clearest(passes, problem.row))
+    if alone < problem.settings.tie:
         return None
     best = _swinging(problem, frequencies)
     trial = replace(fit, noise=_lasting(fit.noise, frequencies))
@@ -65,6 +71,20 @@ def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] 
     if gained < problem.settings.evidence:
         return None
     return best, {name: trial.noise.level(name) for name in (*GUST_LEVELS, *MEMORIES)}
+
+
+def _gained_by(problem: Problem, fit: Fit, frequencies: Sequence[float], axes: str) -> float:
+    """What it gains that one group of axes swings, all else as it is [nats].
+
+    Args:
+        problem, fit: without swings. frequencies: of the six gusts. axes: one of AXES.
+    """
+    part = problem.with_records(evenly_picked(problem.engine.records, problem.noise_fit_seconds))
+    alone = [f if of == axes else 0.0 for f, of in zip(frequencies, GUST_AXES, strict=True)]
+    begun = replace(fit, noise=_lasting(fit.noise, alone))
+    found, trial = _likeliest(part, begun, alone, axes)
+    gained = _swinging(part, found).engine.log_likelihood(trial.values, trial.noise)
+    return gained - part.engine.log_likelihood(fit.values, fit.noise)
 
 
 def _swinging(problem: Problem, frequencies: Sequence[float]) -> Problem:

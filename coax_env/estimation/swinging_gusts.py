@@ -186,10 +186,21 @@ def swings(passes: Sequence[RunPass], row: float) -> list[float]:
     Args:
         passes: of a filter whose gusts only fade. row: seconds between rows.
     """
-    found = [_strongest([run.states[:, GUSTS.start + i] for run in passes], row) for i in range(6)]
-    if max(clear for _, clear in found) < CLEARLY:
+    frequencies, clear = _strongest_of_all(passes, row)
+    if max(clear) < CLEARLY:
         return [0.0] * 6
-    return [frequency if clear > STANDS_OUT else 0.0 for frequency, clear in found]
+    return [f if by > STANDS_OUT else 0.0 for f, by in zip(frequencies, clear, strict=True)]
+
+
+def clearest(passes: Sequence[RunPass], row: float) -> str:
+    """The group of axes, one of AXES, in whose gusts a swing stands out most."""
+    return GUST_AXES[int(np.argmax(_strongest_of_all(passes, row)[1]))]
+
+
+def _strongest_of_all(passes: Sequence[RunPass], row: float) -> tuple[list[float], list[float]]:
+    """`_strongest` of the six gusts."""
+    found = [_strongest([run.states[:, GUSTS.start + i] for run in passes], row) for i in range(6)]
+    return [frequency for frequency, _ in found], [clear for _, clear in found]
 
 
 def _strongest(gusts: Sequence[np.ndarray], row: float) -> tuple[float, float]:
