@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import ncx2
 
 from coax_env import load_vehicle
 from coax_env.diagnosis import vibration
@@ -86,6 +87,38 @@ def test_the_evidence_is_that_of_the_power_over_its_neighbours():
         for seed in range(6)
     ]
     assert np.mean(evidence) == pytest.approx(expected, rel=0.12)
+
+
+def test_a_second_that_is_off_is_no_line():
+    """Ten times as loud at the rotor's speed as a line of usual size, in one second of forty."""
+    flight = shaken({})
+    (run,) = flight.runs
+    one = (run.t >= 12.0) & (run.t < 13.0)
+    burst = 2.5 * one * np.sin(SPEEDS["upper"] * run.t)
+    run = replace(run, measured=run.measured | {"ax": run.measured["ax"] + burst})
+    line = vibration._line(replace(flight, runs=(run,)), "upper")
+    assert line.evidence > 100.0 and line.amplitude > 0.1 and line.steady < 3.0
+    assert vibration.find(replace(flight, runs=(run,))) == ()
+
+
+def test_a_line_is_worth_as_much_by_its_median_second():
+    """Of one channel: of a line as strong as noise is the median of noncentral chi-square."""
+    lines = [vibration._line(shaken({"ay": 0.25}, seed=seed), "upper") for seed in range(6)]
+    F = 1.0 + 0.25**2 * 100 / (4.0 * SIGMA**2)
+    middle = ncx2.median(2, 2.0 * (F - 1.0)) / (2.0 * math.log(2.0))
+    expected = 40 * (middle - 1.0 - math.log(middle))
+    assert np.mean([line.steady for line in lines]) == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize("turns", [49.6, 49.2, 46.0])
+def test_poses_show_no_line_nearly_at_half_their_rate(turns):
+    """Of 100 a second: less than a turn in a second before it, a sine is hardly read."""
+    flight = shaken({}, seconds=10)
+    (run,) = flight.runs
+    speed = np.full_like(run.command, 2.0 * np.pi * turns)
+    measured = {"h": 1e-3 * np.random.default_rng(1).standard_normal(run.t.size)}
+    turning = vibration._Turning(replace(run, command=speed, measured=measured), "upper", 1.0)
+    assert bool(list(turning.segments("h"))) == (turns < 48.0)
 
 
 def test_a_clock_that_starts_late_changes_nothing():

@@ -54,7 +54,9 @@ class Line:
     """A line found in one kind of channels.
 
     kind: a key of KINDS. rotor: at whose speed, times slip. amplitude: root mean square over the
-    channels, in their unit, with its std. evidence: nats. channels: where it shows, strongest first.
+    channels, in their unit, with its std. evidence: nats. steady: nats of the channel that shows it
+    best, by its median segment: a rotor shakes in all of them. channels: where it shows, strongest
+    first.
     ratios: run -> power over its neighbours', segment by segment.
     """
 
@@ -64,6 +66,7 @@ class Line:
     amplitude: float
     std: float
     evidence: float
+    steady: float
     channels: tuple[str, ...]
     ratios: Mapping[str, Sequence[float]]
 
@@ -81,7 +84,9 @@ def find(flight: Flight) -> tuple[Line, ...]:
         return tuple(
             x
             for x in lines
-            if x and x.evidence > SETTINGS.evidence and x.amplitude > smallest[x.kind]
+            if x
+            and min(x.evidence, x.steady) > SETTINGS.evidence
+            and x.amplitude > smallest[x.kind]
         )
 
     return max(map(of, ROTORS), key=lambda lines: sum(x.evidence for x in lines))
@@ -136,9 +141,12 @@ class _Second:
 
     @property
     def resolved(self) -> bool:
-        """Whether the readings are more than two per turn of the rotor."""
+        """Whether the readings are more than two per turn of the rotor, by a turn in all.
+
+        Nearer to two its sine is hardly read, and one reading that is off is a line.
+        """
         turns = (self.azimuth[-1] - self.azimuth[0]) / (2.0 * np.pi)
-        return bool(2.0 * turns < self.t.size - 1)
+        return bool(2.0 * (turns + 1.0) < self.t.size - 1)
 
     def _waves(self, beside: np.ndarray) -> np.ndarray:
         """Sines and cosines beside the rotor's frequency by so much (f,) [Hz], shape (f, 2, n)."""
@@ -270,6 +278,7 @@ def _line_at(flight: Flight, rotor: str, kind: str, slip: float) -> Line | None:
         amplitude=amplitude,
         std=float(np.hypot(std, SMEAR * amplitude)),
         evidence=_evidence([r for own in ratio.values() for r in own]),
+        steady=max(_steady_evidence(own) for own in ratio.values() if own),
         channels=tuple(sorted((c for c in shown if shown[c] > SHOWS), key=lambda c: -shown[c]))
         or tuple(shown),
         ratios=by_run,
@@ -287,6 +296,11 @@ def _powers(segments: Sequence[tuple[_Second, np.ndarray]]) -> tuple[list[float]
         powers.append(own)
         beside += [p for f, p in zip(NEIGHBOURS, rest, strict=True) if abs(f - second.ahead) > 1.0]
     return powers, float(np.mean(beside)) if beside else 0.0
+
+
+def _steady_evidence(ratios: Sequence[float]) -> float:
+    """As `_evidence`, with the median, which no single segment moves, for their mean: log 2 of it."""
+    return _evidence([float(np.median(ratios)) / float(np.log(2.0))] * len(ratios))
 
 
 def _evidence(ratios: Sequence[float]) -> float:
