@@ -75,9 +75,9 @@ def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) ->
         v = record.z[k] - H @ x
         v[0] = wrap_angles(v[:1])[0]
         there = np.flatnonzero(np.isfinite(v))
-        R_k = R.copy()
+        R_k = R.copy() if record.blur is None else R + record.blur[k]
         for i in there:
-            s2 = H[i] @ P @ H[i] + R[i]
+            s2 = H[i] @ P @ H[i] + R_k[i]
             found["outside"].append(1.0 / s2 if v[i] ** 2 > GATE**2 * s2 else 0.0)
             if v[i] ** 2 > GATE**2 * s2:
                 R_k[i] += v[i] ** 2 / GATE**2 - s2
@@ -134,6 +134,7 @@ def fast_filter(
     )  # fmt: skip
     kept = pass_data.Covariances(np.zeros((n, 2, 2)), np.arange(n))
     run = pass_data.RunData(np.append(np.diff(record.t), 0.0), record.command, record.z)
+    run = run if record.blur is None else run._replace(blur=record.blur)
     start = pass_data.Variances(Pendulum.start_at, np.diag(Pendulum.start_std**2), R, q, DECAY)
     log_likelihood, beyond = kalman.filter_pass(
         compiled_model.CompiledModel.of(model), run, start, p, GATE, refresh, trace, kept
@@ -142,9 +143,12 @@ def fast_filter(
 
 
 @pytest.mark.parametrize("sine", [0.0, 1.0], ids=["linear", "nonlinear"])
-@pytest.mark.parametrize("clock", ["even", "jitters"])
+@pytest.mark.parametrize("clock", ["even", "jitters", "wrong"])
 def test_the_pass_is_the_textbooks_filter(sine, clock):
-    """States, covariances, innovations, gains, Jacobians and likelihood; with holes and outliers."""
+    """States, covariances, innovations, gains, Jacobians and likelihood; with holes and outliers.
+
+    Where the clock is wrong, each reading has a variance of its own beside its channel's.
+    """
     values = {**TRUTH, "sine": sine}
     record = with_holes(swing(11, n=200, values=values), 0.3, seed=2)
     z = record.z.copy()
@@ -153,11 +157,12 @@ def test_the_pass_is_the_textbooks_filter(sine, clock):
     t = record.t
     if clock == "jitters":
         t = DT * np.cumsum(np.random.default_rng(3).uniform(0.3, 2.0, 200))
-    record = replace(record, z=z, t=t)
+    R = np.array([NOISE.reading[c] for c in CHANNELS]) ** 2
+    blur = R * np.random.default_rng(4).exponential(2.0, z.shape) if clock == "wrong" else None
+    record = replace(record, z=z, t=t, blur=blur)
     model = Pendulum()
     p = model.vector(values)
     q = model.process_noise(NOISE, p).intensity
-    R = np.array([NOISE.reading[c] for c in CHANNELS]) ** 2
     dense = dense_filter(record, p, R, q)
     log_likelihood, beyond, trace, kept = fast_filter(record, p, R, q)
     assert beyond == dense["beyond"] >= 2

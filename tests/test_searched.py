@@ -85,8 +85,11 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
 
 
 def believes_its_sensors(monkeypatch) -> None:
-    """No errors that last, and white rotor speeds."""
+    """No errors that last, times that are right, white rotor speeds, gusts that push or turn."""
     monkeypatch.setattr(searched, "with_lasting_errors", lambda problem, fit, noise: None)
+    monkeypatch.setattr(searched, "with_wrong_times", lambda problem, fit: None)
+    monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: None)
+    monkeypatch.setattr(searched, "_may_hide_jitter", lambda found: False)
     monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
 
 
@@ -234,6 +237,75 @@ def test_jitter_is_asked_first_where_rotor_speeds_show_it_and_gusts_beside_it(
     assert found.fit.noise.level("force_xy") == (0.7 if gained else 0.2)
 
 
+@pytest.mark.parametrize(("wrong", "problem"), [(True, "wrong"), (False, "right")])
+def test_where_times_are_wrong_all_is_searched_so(monkeypatch, wrong, problem):
+    """Before anything else is asked that readings show."""
+    right, other = (
+        SimpleNamespace(name=name, report=lambda text: None) for name in ("right", "wrong")
+    )
+    asked = []
+
+    def one(problem: Any, noise: Noise) -> Searched:
+        asked.append(problem.name)
+        fit = Fit((), {}, noise)
+        return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
+
+    believes_its_sensors(monkeypatch)
+    monkeypatch.setattr(searched, "_searched", one)
+    monkeypatch.setattr(searched, "with_wrong_times", lambda problem, fit: other if wrong else None)
+    monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: None)
+    monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
+    found = searched.searched(right, FINE, {})  # type: ignore[arg-type]
+    assert found.problem.name == problem and asked == (["right", "wrong"] if wrong else ["right"])
+
+
+@pytest.mark.parametrize(
+    ("costs", "coloured", "used"),
+    [((100.0, 90.0), 0.5, True), ((90.0, 100.0), 0.0, False), ((100.0, 90.0), 0.75, False)],
+)
+def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
+    monkeypatch, costs, coloured, used
+):
+    """From the search that ended likelier; low-passes stay."""
+    plain, joint = (
+        SimpleNamespace(
+            name=name, model=SimpleNamespace(channels=tuple("abcd")), report=lambda text: None,
+            engine=SimpleNamespace(filter=lambda values, noise: []),
+        )
+        for name in ("plain", "joint")
+    )  # fmt: skip
+    fit = Fit((), {}, FINE)
+    first = Searched(plain, fit, fit, fit, None, low_passes={"ax": LowPass(0.008)})  # type: ignore[arg-type]
+    whites = [k >= 4 * coloured for k in range(4)]
+    shown = {c: SimpleNamespace(white=w) for c, w in zip("abcd", whites, strict=True)}
+    monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: (joint, fit))
+    monkeypatch.setattr(
+        searched, "_searched", lambda problem, noise, coarse: replace(first, problem=problem)
+    )
+    monkeypatch.setattr(
+        searched, "cost", lambda problem, fit, quadratic: costs[problem.name == "joint"]
+    )
+    monkeypatch.setattr(searched, "whiteness", lambda passes, channels: shown)
+    found = searched._with_joint_gusts(first, FINE)
+    assert (found.problem is joint) == used and found.low_passes == first.low_passes
+    assert found is first or used
+
+
+@pytest.mark.parametrize(
+    ("alone", "aboard", "active", "may"),
+    [
+        (True, {"psi"}, ("yaw_damping",), True),
+        (True, {"psi"}, (), False),
+        (True, {"psi", "rpm_upper"}, ("yaw_damping",), False),  # rotor speeds would show it
+        (False, {"r"}, ("yaw_damping",), False),  # so would a gyro
+    ],
+)
+def test_jitter_is_asked_by_poses_alone_where_something_is_named(alone, aboard, active, may):
+    problem = SimpleNamespace(sees_poses_alone=alone, aboard=frozenset(aboard))
+    found = SimpleNamespace(problem=problem, fit=Fit(active, {}, FINE))
+    assert searched._may_hide_jitter(found) == may  # type: ignore[arg-type]
+
+
 def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypatch):
     """Without what cannot be told from what is left of it."""
     t, smooth = 0.01 * np.arange(30), np.linspace(0.0, 1.0, 30)
@@ -379,6 +451,7 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     behind, without = one("behind", ("wind",)), one("without", names)
     behind = replace(behind, low_passes={"p": LowPass(0.01)})
     monkeypatch.setattr(searched, "_searched", lambda problem, noise: one("first", ()))
+    monkeypatch.setattr(searched, "_in_wrong_times", lambda first, noise: first)
     monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: behind)
     monkeypatch.setattr(
         searched, "_with_errors",

@@ -53,6 +53,7 @@ from coax_env.diagnosis.shocks import engine_of
 from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
 from coax_env.estimation.changing_model import clock_of
+from coax_env.estimation.clock_errors import with_clock_error
 from coax_env.estimation.fitted_vehicle import double_counting
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
@@ -182,6 +183,7 @@ def diagnose(
         of_sensors.append(sensor_low_pass.remark(first.low_passes, unasked))
     problem, bare, refitted = first.problem, first.bare, first.refitted
     held = records_before(held, CHANNELS, first.low_passes)
+    held = with_clock_error(held, problem.clock_error)
     passes_before = problem.engine.filter(bare.values, bare.noise)
     state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)

@@ -211,7 +211,8 @@ def _scaled(
         x, P = run.states[row], run.start_covariances[slot[row]]
         known, *moved = read(np.vstack([x, x + np.diag(scale)]), row)
         H = (np.array(moved) - known).T / scale
-        std = np.sqrt(np.einsum("ij,jk,ik->i", H, P, H) + reading**2)
+        blur = 0.0 if run.record.blur is None else run.record.blur[row]
+        std = np.sqrt(np.einsum("ij,jk,ik->i", H, P, H) + reading**2 + blur)
         late = _late_rows(run.record.t, z, row)
         last = {int(k): read(run.states[k : k + 1], k)[0] for k in np.unique(late[late >= 0])}
         for c in np.flatnonzero(late >= 0):

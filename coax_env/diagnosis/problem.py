@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from coax_env.diagnosis.settings import SETTINGS, Settings
+from coax_env.estimation.clock_errors import with_clock_error
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.helicopter import HeliModel
@@ -81,6 +82,7 @@ class Problem:
         progress: called with a line of text.
         unlike_gusts: whether gusts turned out not to be as the filter has them (evidence.py).
         smoothed: whether readings were taken back through a low-pass (sensor_low_pass.py).
+        clock_error: std of the rows' times [s], 0 where they are right (wrong_times.py).
     """
 
     model: HeliModel
@@ -92,6 +94,7 @@ class Problem:
     progress: Progress | None = None
     unlike_gusts: bool = False
     smoothed: bool = False
+    clock_error: float = 0.0
 
     @classmethod
     def of(
@@ -158,6 +161,11 @@ class Problem:
         """
         engine = Engine(self.model, records, self.engine.threads)
         return replace(self, engine=engine, smoothed=smoothed or self.smoothed)
+
+    def with_clock_error(self, std: float) -> "Problem":
+        """With readings of motion as good as the rows' times are, whose std is this [s]."""
+        records = with_clock_error(self.engine.records, std)
+        return replace(self.with_records(records), clock_error=std)
 
     # --- what is free with some effects active --------------------------------------------------------
 

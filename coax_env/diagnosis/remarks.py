@@ -36,6 +36,7 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
         *_seen_late(problem),
         *_unlike_gusts(problem),
         *_smoothed(problem),
+        *_wrong_times(problem),
         *_swings(problem),
         *_joint_gusts(fit),
         *_lasting_errors(fit),
@@ -123,6 +124,15 @@ def _seen_late(problem: Problem) -> list[str]:
     return [
         f"{why}, and what looks like a weak or late answer must be worth"
         f" {problem.settings.unseen_inflation:g} times as much"
+    ]
+
+
+def _wrong_times(problem: Problem) -> list[str]:
+    if problem.clock_error == 0.0:
+        return []
+    return [
+        f"the times of the log's rows are wrong by {1e3 * problem.clock_error:.2g} ms (std), or poses"
+        " were smoothed as though they were even: readings that move fast are believed less"
     ]
 
 

@@ -21,7 +21,8 @@ every memory at once look like a low-pass. Low-passes are then fitted once more.
 Where gusts have a frequency it is done again with that in the filter (estimation/swinging_gusts.py), if
 nothing is coloured then: what a model lacks may swing, too. Jitter that the yaw rate alone shows is
 asked then, by poses alone where anything is named, and gusts once more beside it. Last it is asked
-whether gusts push and turn at once (correlated_gusts.py).
+whether gusts push and turn at once (correlated_gusts.py); no more than half of what is read may be
+coloured then, since what a model lacks makes such gusts, too: on a real helicopter an arm of 0.7 m.
 
 And where commands are late, by a delay of the readings' own (estimation/helicopter.py), if that is
 likelier: what was found beside a delay that is off by a part of a row may stand for that part.
@@ -44,6 +45,7 @@ from coax_env.diagnosis.sensor_errors import with_lasting_errors
 from coax_env.diagnosis.sensor_low_pass import GROUPS, hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_swings
+from coax_env.diagnosis.wrong_times import with_wrong_times
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.low_pass import LowPass, before_low_pass, records_before
@@ -102,6 +104,8 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     first = _searched(problem, noise)
     if _is_coloured(first, ROTOR_SPEEDS):
         first, noise = _jittery(first, noise)
+    first = _in_wrong_times(first, noise)
+    problem = first.problem
     smoothed = _before_low_passes(first, noise)
     best, begun = _with_errors(smoothed or first, noise, clock)
     if smoothed is not None and _is_coloured(best, INERTIAL):
@@ -115,6 +119,19 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         return best
     found = _in_unrest(best, begun, clock, erring=begun is not noise)
     return replace(found, low_passes=best.low_passes)
+
+
+def _in_wrong_times(first: Searched, noise: Noise) -> Searched:
+    """The search with rows whose times are wrong, where they are; what was found, where not.
+
+    Args:
+        first: the search with times as logged. noise: levels to start from.
+    """
+    problem = with_wrong_times(first.problem, first.fit)
+    if problem is None:
+        return first
+    problem.report("searching again with readings as good as the times of their rows")
+    return _searched(problem, noise)
 
 
 def _before_low_passes(first: Searched, noise: Noise) -> Searched | None:
@@ -216,7 +233,7 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
                 return other
         if _is_coloured(best, SHOWN_BY) or _may_hide_jitter(best):
             best, noise = _jittery(best, noise)
-        best = _with_joint_gusts(best, noise)
+    best = _with_joint_gusts(best, noise)
     if erring:
         return best
     problem = best.problem
@@ -358,6 +375,13 @@ def _may_hide_jitter(found: Searched) -> bool:
     return unseen and bool(found.fit.active)
 
 
+def _is_mostly_coloured(found: Searched) -> bool:
+    """Whether more than half of the channels are."""
+    passes = found.problem.engine.filter(found.fit.values, found.fit.noise)
+    shown = whiteness(passes, found.problem.model.channels).values()
+    return 2 * sum(not judged.white for judged in shown) > len(shown)
+
+
 def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
     """The search with rotors that jitter, where that gains more than a tie, and levels it started from.
 
@@ -398,9 +422,8 @@ def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:
     problem, fit = joint
     problem.report("searching again with gusts that push and turn at once")
     other = _likelier(_searched(problem, noise, found.coarse), fit)
-    if not cost(problem, other.fit, other.quadratic) < cost(
-        found.problem, found.fit, found.quadratic
-    ):
+    ours, theirs = (cost(f.problem, f.fit, f.quadratic) for f in (other, found))
+    if not ours < theirs or _is_mostly_coloured(other):
         return found
     return replace(other, low_passes=found.low_passes)
 

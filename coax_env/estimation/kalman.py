@@ -93,8 +93,8 @@ def _innovations(model, z, u, p, fresh, w):
 
 
 @compiled(**REORDER)
-def _gate(z, R, gate, log_likelihood, w):
-    """Variances of a row's readings, before any of them has been taken in.
+def _gate(run, k, R, gate, log_likelihood, w):
+    """Variances of the readings of row `k`, before any of them has been taken in.
 
     One further than `gate` sigmas from its prediction gets the variance that puts it at the gate.
 
@@ -102,13 +102,15 @@ def _gate(z, R, gate, log_likelihood, w):
         The log-likelihood, less what that takes off it, and how many readings are beyond the gate.
     """
     beyond = 0
-    for i in range(z.size):
-        if not math.isnan(z[i]):
-            w.noise[i] = R[i]
-            w.beyond[i] = 0.0
-            if w.v[i] * w.v[i] <= gate * gate * R[i]:
-                continue  # however well the state is known
+    for i in range(R.size):
+        if not math.isnan(run.z[k, i]):
             variance = R[i]
+            if run.blur.size:
+                variance += run.blur[k, i]
+            w.noise[i] = variance
+            w.beyond[i] = 0.0
+            if w.v[i] * w.v[i] <= gate * gate * variance:
+                continue  # however well the state is known
             for c in range(w.H.counts[i]):
                 a = w.H.places[i, c]
                 total = 0.0
@@ -244,7 +246,7 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
             _store_row(w.x, trace.path.predicted[k])
         if not _innovations(model, z, u, p, fresh, w):
             return -np.inf, deweighted, False
-        log_likelihood, beyond = _gate(z, assumed.R, gate, log_likelihood, w)
+        log_likelihood, beyond = _gate(run, k, assumed.R, gate, log_likelihood, w)
         deweighted += beyond
         for a in range(r):
             w.correction[a] = 0.0

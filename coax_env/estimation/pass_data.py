@@ -14,13 +14,15 @@ class RunData(NamedTuple):
     """What a pass is given of a run.
 
     dt: (n,) seconds from each row to the next. u: (n, nu). z: (n, m), NaN where missing.
-    strength: of its process noise, see state_space.Strength.
+    strength: of its process noise, see state_space.Strength. blur: (n, m) variance of each reading
+    beyond its channel's; empty: none.
     """
 
     dt: np.ndarray
     u: np.ndarray
     z: np.ndarray
     strength: Strength = STEADY
+    blur: np.ndarray = np.zeros((0, 0))
 
 
 class Variances(NamedTuple):
@@ -89,7 +91,7 @@ class Covariances(NamedTuple):
 
 
 STRENGTH = types.NamedTuple([INDICES, MATRIX], Strength)
-RUN_DATA = types.NamedTuple([VECTOR, MATRIX, MATRIX, STRENGTH], RunData)
+RUN_DATA = types.NamedTuple([VECTOR, MATRIX, MATRIX, STRENGTH, MATRIX], RunData)
 VARIANCES = types.NamedTuple([VECTOR, MATRIX, VECTOR, VECTOR, VECTOR], Variances)
 GAINS = types.NamedTuple([float32[:, ::1], VECTOR, float32[:, :, ::1], INDICES], Gains)
 PATH = types.NamedTuple(

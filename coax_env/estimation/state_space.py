@@ -59,6 +59,7 @@ class Record:
     run: name of the run of which it is a part; empty where it is a run itself.
     input_innovations: (n, k) what each command shows beyond the readings before it, or None
     (input_innovations.py). battery: (n,) its voltage [V], or None. strength: of its process noise.
+    blur: (n, m) variance of each reading beyond its level's (clock_errors.py), or None.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Record:
     run: str = ""
     battery: np.ndarray | None = None
     strength: Strength = STEADY
+    blur: np.ndarray | None = None
 
     @property
     def whole(self) -> str:
@@ -91,6 +93,7 @@ def part(record: Record, rows: np.ndarray) -> Record:
         input_innovations=of(record.input_innovations),
         battery=of(record.battery),
         strength=record.strength.part(rows),
+        blur=of(record.blur),
     )
 
 
