@@ -296,7 +296,7 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
     sound = Against(
         channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
-        alternatives=(), nats=100.0, shaken=False,
+        alternatives=(), nats=100.0, shaken=False, poses_alone=False,
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -389,6 +389,17 @@ def test_what_stands_for_something_else_has_no_name(
         not named or limited or coloured or undetermined or falls or beside or kept != 1.0
         or nats < SETTINGS.sure_evidence
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("poses_alone", "nats", "falls", "named"),
+    [(True, 30.0, True, False), (True, 30.0, False, True), (True, 50.0, True, True),
+     (False, 30.0, True, True)],
+)  # fmt: skip
+def test_by_poses_alone_little_evidence_speaks_against_a_name(poses_alone, nats, falls, named):
+    """Beside it one thing more takes the name; by itself it does not."""
+    of = known_of(nats=nats, falls_at=("half of all",) * falls, poses_alone=poses_alone)
+    assert without_name({"yaw_damping": of}, SETTINGS) == (set() if named else {"yaw_damping"})
 
 
 @pytest.mark.parametrize(("share", "doubted"), [(0.5, False), (0.6, True)])

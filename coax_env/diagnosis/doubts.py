@@ -2,7 +2,8 @@
 
 What stands at the limit of what is believed and is not determined, or does not hold under other noise
 or on parts of the flights, stands for something else. Two of these take a name, too: noise left where
-it shows, little evidence there, other noise, parts of the flights, such a one beside it.
+it shows, little evidence there or by poses alone, other noise, parts of the flights, such a one
+beside it.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -43,6 +44,7 @@ class Against:
         determined: whether the flights say more of one of its numbers than the prior did.
         alternatives: effects that would do as well.
         nats: its evidence. shaken: whether gusts come in single shocks.
+        poses_alone: whether neither gyros nor accelerometers were read.
     """
 
     channels: tuple[str, ...]
@@ -57,6 +59,7 @@ class Against:
     alternatives: tuple[str, ...]
     nats: float
     shaken: bool
+    poses_alone: bool
 
     @property
     def at_limit(self) -> bool:
@@ -98,7 +101,8 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
     standing_in = {e: of for e, of in against.items() if of.stands_for_something_else(chosen)}
 
     def voices(effect: str, of: Against) -> int:
-        weak = bool(of.coloured) and of.nats < chosen.sure_evidence
+        unseen = bool(of.coloured) or of.poses_alone
+        weak = unseen and of.nats < chosen.sure_evidence
         beside = any(_shows_beside(effect, of, standing_in))
         parts = of.is_gone_on_parts(chosen)
         return sum((bool(of.coloured), weak, bool(of.falls_at), parts, beside))

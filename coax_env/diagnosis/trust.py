@@ -106,6 +106,7 @@ def trusts(
             alternatives=tuple(found[effect]),
             nats=worth[effect],
             shaken=shaken,
+            poses_alone=problem.sees_poses_alone,
         )
     nameless = without_name(against, problem.settings)
     return {
