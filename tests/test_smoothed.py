@@ -49,6 +49,14 @@ def test_as_seldom_as_the_cut_off_asks(cut_off, rows):
         assert rows[0] <= kept(run_of(theta=MOTION + 0.01 * smooth), "theta") <= rows[1]
 
 
+def test_where_motion_is_louder_than_noise_below_the_cut_off():
+    """Pushes make it steep at any distance, ten times, and less so than a low-pass does."""
+    pushed = 0.05 * T[1] * np.cumsum(np.cumsum(RNG.standard_normal(T.size)) * 0.01)
+    pushed += 5e-5 * RNG.standard_normal(T.size)
+    smooth = filtfilt(*butter(2, 7.0, fs=100.0), pushed) + 1e-7 * WHITE
+    assert 4 <= kept(run_of(phi=smooth), "phi") <= 8
+
+
 @pytest.mark.parametrize(
     "values",
     [
@@ -56,7 +64,8 @@ def test_as_seldom_as_the_cut_off_asks(cut_off, rows):
         MOTION,  # none
         MOTION + 1e-5 * np.round(100.0 * WHITE),  # in steps
         MOTION + 0.01 * lfilter([0.4], [1.0, -0.6], WHITE),  # lasts, and is not smooth
-        np.cumsum(np.cumsum(WHITE)) * 1e-5,  # moves as gusts do, without noise
+        np.cumsum(np.cumsum(WHITE)) * 1e-5,  # moves as white pushes do, without noise
+        np.cumsum(np.cumsum(lfilter([0.02], [1.0, -0.98], WHITE))) * 1e-4,  # as gusts do
     ],
 )
 def test_others_stay_as_they_are(values):
