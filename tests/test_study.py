@@ -32,6 +32,7 @@ from study import (
     table,
     threshold,
 )
+from study import expected as expecting
 from study.baselines import Gram, by_bic, by_f, sparse, stepwise
 from study.expected import catalogue_values, expected_evidence, gust_levels, true_noise
 from study.one_flight import fly_and_diagnose, hide
@@ -724,6 +725,19 @@ def test_expected_evidence_grows_with_the_square_of_the_size(damped: tuple) -> N
     none, one, two = worth(0.0), worth(0.1), worth(0.2)
     assert none < 0.0 and one > none
     assert (two - none) / (one - none) == pytest.approx(4.0, rel=0.15)
+
+
+def test_where_the_filter_loses_the_machine_an_effect_is_worth_what_its_slopes_say(
+    damped: tuple, monkeypatch
+) -> None:
+    """Of a small size they say the same; of one that diverged 5e60 nats were expected."""
+    planned, folder, truth = damped
+    flight = read_flight(folder)
+    small = truth | {"values": {n: 0.1 * v for n, v in truth["values"].items()}}
+    flown = expected_evidence(planned, flight, small, ())["yaw_damping"]
+    monkeypatch.setattr(expecting, "DIVERGED", 0.0)
+    by_slopes = expected_evidence(planned, flight, small, ())["yaw_damping"]
+    assert by_slopes == pytest.approx(flown, rel=0.05)
 
 
 def test_a_deadband_is_expected_to_be_worth_what_the_play_that_names_it_is(damped: tuple) -> None:
