@@ -730,14 +730,13 @@ def test_expected_evidence_grows_with_the_square_of_the_size(damped: tuple) -> N
 def test_where_the_filter_loses_the_machine_an_effect_is_worth_what_its_slopes_say(
     damped: tuple, monkeypatch
 ) -> None:
-    """Of a small size they say the same; of one that diverged 5e60 nats were expected."""
-    planned, folder, truth = damped
-    flight = read_flight(folder)
-    small = truth | {"values": {n: 0.1 * v for n, v in truth["values"].items()}}
-    flown = expected_evidence(planned, flight, small, ())["yaw_damping"]
+    """Of one that diverged 5e60 nats were expected; of a damping they say much the same as itself."""
+    _, folder, truth = damped
+    planned, flight = damped[0], read_flight(folder)
+    flown = expected_evidence(planned, flight, truth, ())["yaw_damping"]
     monkeypatch.setattr(expecting, "DIVERGED", 0.0)
-    by_slopes = expected_evidence(planned, flight, small, ())["yaw_damping"]
-    assert by_slopes == pytest.approx(flown, rel=0.05)
+    by_slopes = expected_evidence(planned, flight, truth, ())["yaw_damping"]
+    assert flown is not None and by_slopes == pytest.approx(flown, rel=0.3) and flown > 20.0
 
 
 def test_a_deadband_is_expected_to_be_worth_what_the_play_that_names_it_is(damped: tuple) -> None:
