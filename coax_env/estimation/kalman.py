@@ -93,8 +93,8 @@ def _innovations(model, z, u, p, fresh, w):
 
 
 @compiled(**REORDER)
-def _gate(run, k, R, gate, log_likelihood, w):
-    """Variances of the readings of row `k`, before any of them has been taken in.
+def _gate(z, R, blur, gate, log_likelihood, w):
+    """Variances of a row's readings, before any of them has been taken in.
 
     One further than `gate` sigmas from its prediction gets the variance that puts it at the gate.
 
@@ -102,11 +102,11 @@ def _gate(run, k, R, gate, log_likelihood, w):
         The log-likelihood, less what that takes off it, and how many readings are beyond the gate.
     """
     beyond = 0
-    for i in range(R.size):
-        if not math.isnan(run.z[k, i]):
+    for i in range(z.size):
+        if not math.isnan(z[i]):
             variance = R[i]
-            if run.blur.size:
-                variance += run.blur[k, i]
+            if blur.size > i:
+                variance += blur[i]
             w.noise[i] = variance
             w.beyond[i] = 0.0
             if w.v[i] * w.v[i] <= gate * gate * variance:
@@ -224,6 +224,7 @@ def _store_square(A, order, out):
 def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
     """`filter_pass` in arrays that are there; and whether a reading came to show more states."""
     n, m = run.z.shape
+    last = run.blur.shape[0] - 1
     r = w.K.size
     keep, follow = trace.gains.H.shape[0] > 0, trace.path.predicted.shape[0] == n
     log_likelihood = 0.0
@@ -246,7 +247,9 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
             _store_row(w.x, trace.path.predicted[k])
         if not _innovations(model, z, u, p, fresh, w):
             return -np.inf, deweighted, False
-        log_likelihood, beyond = _gate(run, k, assumed.R, gate, log_likelihood, w)
+        log_likelihood, beyond = _gate(
+            z, assumed.R, run.blur[min(k, last)], gate, log_likelihood, w
+        )
         deweighted += beyond
         for a in range(r):
             w.correction[a] = 0.0

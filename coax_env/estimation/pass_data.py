@@ -15,14 +15,14 @@ class RunData(NamedTuple):
 
     dt: (n,) seconds from each row to the next. u: (n, nu). z: (n, m), NaN where missing.
     strength: of its process noise, see state_space.Strength. blur: (n, m) variance of each reading
-    beyond its channel's; empty: none.
+    beyond its channel's; (1, 0): none.
     """
 
     dt: np.ndarray
     u: np.ndarray
     z: np.ndarray
     strength: Strength = STEADY
-    blur: np.ndarray = np.zeros((0, 0))
+    blur: np.ndarray = np.zeros((1, 0))
 
 
 class Variances(NamedTuple):

@@ -143,7 +143,7 @@ class RunPasses:
         u = self.model.inputs(record, p)
         x0, P0 = self.starts[i]
         P0 = P0 + np.diag(self.model.start_noise(noise))
-        blur = np.zeros((0, 0)) if record.blur is None else np.ascontiguousarray(record.blur)
+        blur = np.zeros((1, 0)) if record.blur is None else np.ascontiguousarray(record.blur)
         e = np.full((n, m), np.nan)
         states = np.zeros((n, nx))
         count, rows, buffers = (0, 0, Buffers()) if keep is None else (self._readings[i], n, keep)
