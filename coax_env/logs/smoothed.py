@@ -36,7 +36,7 @@ steps of the readings may hide it, and where noise is flat enough. A sensor's ha
 CoaX up to 20, a vibration at 40 Hz; **synthetic** ones behind 10 Hz at a rate of 100 Hz have 700 to
 2,800."""
 OF_PUSHES = 12.0
-"""The same where no distance is flat enough: a cut-off so low that below it motion is louder than noise.
+"""The same where none is flat enough: a cut-off so low that below it motion is louder than noise.
 White pushes make motion 10 times as dense in the middle, gusts with a memory 34; ours."""
 FARTHEST = 0.1
 """s that readings may be apart at most; ours."""
