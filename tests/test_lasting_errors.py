@@ -186,24 +186,29 @@ ABOARD = frozenset({"p", "q", "r", "ax", "ay", "az"})
 
 
 @pytest.mark.parametrize(
-    ("coloured", "aboard", "gain", "left", "used"),
+    ("coloured", "aboard", "active", "gain", "left", "used"),
     [
-        ("phi", ABOARD, 100.0, "", True),
-        ("vn", ABOARD, 100.0, "", True),
-        ("q", ABOARD, 100.0, "", False),  # nothing asks for it
-        ("phi", ABOARD - {"p"}, 100.0, "", False),  # no gyro tells it from motion
-        ("h", ABOARD - {"az"}, 100.0, "", False),  # no accelerometer does
-        ("phi", ABOARD, 10.0, "", False),  # not worth the threshold
-        ("phi", ABOARD, 100.0, "psi", False),  # what a model lacks may last, too
-        ("phi", ABOARD, 100.0, "p", True),  # gusts of another law
+        ("phi", ABOARD, (), 100.0, "", True),
+        ("vn", ABOARD, (), 100.0, "", True),
+        ("q", ABOARD, (), 100.0, "", False),  # nothing asks for it
+        ("phi", ABOARD - {"p"}, (), 100.0, "", False),  # no gyro tells it from motion
+        ("h", ABOARD - {"az"}, (), 100.0, "", False),  # no accelerometer does
+        ("phi", ABOARD, (), 10.0, "", False),  # not worth the threshold
+        ("phi", ABOARD, (), 100.0, "psi", False),  # what a model lacks may last, too
+        ("phi", ABOARD, (), 100.0, "p", True),  # gusts of another law
+        ("", frozenset(), ("attitude_bias",), 100.0, "", True),  # their mean has been named
+        ("", frozenset(), ("attitude_bias",), 10.0, "", False),
+        ("", frozenset(), ("rotor_drag",), 100.0, "", False),
+        ("phi", frozenset(), (), 100.0, "", False),
+        ("", ABOARD, ("attitude_bias",), 100.0, "", False),  # gyros would have shown them
     ],
 )
 def test_errors_last_where_that_is_worth_it_and_no_motion_stays_coloured(
-    monkeypatch, coloured, aboard, gain, left, used
+    monkeypatch, coloured, aboard, active, gain, left, used
 ):
     """The fits are stand-ins, which gain at once what they may."""
     first = Noise({"force_xy": 1.0}, {"phi": 0.01, "vn": 0.5})
-    fit = Fit((), {}, first, objective=500.0)
+    fit = Fit(active, {}, first, objective=500.0)
     gained = lambda problem, fit: replace(fit, objective=500.0 - gain)  # noqa: E731
     answers = [
         {channel: COLOURED if channel == one else WHITE for channel in CHANNELS}
@@ -216,6 +221,7 @@ def test_errors_last_where_that_is_worth_it_and_no_motion_stays_coloured(
     problem = SimpleNamespace(
         engine=SimpleNamespace(filter=lambda values, noise: []), aboard=aboard, model=PLAIN,
         settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
+        sees_poses_alone=not aboard,
     )  # fmt: skip
     problem.with_model = lambda model: SimpleNamespace(**{**vars(problem), "model": model})
     found = sensor_errors.with_lasting_errors(problem, fit, first)  # type: ignore[arg-type]
