@@ -69,7 +69,7 @@ def test_the_variance_is_that_of_readings_at_wrong_times():
     [
         (0.3, 0.1, 100.0, True),
         (0.0, 0.0, 100.0, False),  # nothing to explain
-        (0.3, 0.2, 100.0, False),  # nor does it explain that
+        (0.3, 0.25, 100.0, False),  # nor does it explain that
         (0.3, 0.1, 10.0, False),  # not worth the threshold
     ],
 )

@@ -2,8 +2,8 @@
 
 Readings of motion are then off by their rates times the error of the times, loud in a dash and quiet in
 hover, which no level of their noise says (estimation/clock_errors.py). What a model lacks shows in a
-dash as well: half of the colour of motion must be gone then, or the times are taken to be right. (Of
-two real helicopters whose motion no model in reach makes white they were wrong by 0.7 and 17 ms.)
+dash as well: a quarter of the colour of motion must be gone then, or the times are taken to be right.
+(Of two real helicopters whose motion no model in reach makes white they were wrong by 0.7 and 17 ms.)
 """
 
 import math
@@ -18,8 +18,8 @@ from coax_env.model.layout import MOTION
 
 LEAST, MOST = 5e-5, 0.02
 """s of the std of the times that are tried: below, half a mm at 10 m/s; above, two rows of 100 Hz."""
-LEFT = 0.5
-"""Share of the colour of motion that may be left then; ours. It was 0.1 to 0.2 on three **synthetic**
+LEFT = 0.75
+"""Share of the colour of motion that may be left then; ours. It was 0.1 to 0.5 on four **synthetic**
 flights whose times were wrong, 1.0 and 1.3 on the real ones above."""
 TURNS = 3
 """Of that and the noise levels, at most; ours."""
