@@ -177,6 +177,31 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
     assert found.problem is (swinging if white else fading) and found.low_passes == {}
 
 
+@pytest.mark.parametrize(("left", "asked"), [(False, ["swings"]), (True, ["swings", "shocks"])])
+def test_swings_are_asked_before_shocks_and_stand_where_none_are_left(monkeypatch, left, asked):
+    """A model of gusts that fade sees shocks in them."""
+    done: list[str] = []
+    fit = Fit((), {}, FINE)
+    fading, swinging, shaken = (
+        Searched(SimpleNamespace(name=name), fit, fit, fit, None)  # type: ignore[arg-type]
+        for name in ("fading", "swinging", "shaken")
+    )
+
+    def of(name: str, found: Searched) -> Searched:
+        done.append(name)
+        return found
+
+    believes_its_sensors(monkeypatch)
+    monkeypatch.setattr(
+        searched, "in_shocks", lambda problem, fit: problem.name == "fading" or left
+    )
+    monkeypatch.setattr(searched, "_in_swings", lambda best, noise: of("swings", swinging))
+    monkeypatch.setattr(searched, "_changed", lambda best, clock: None)
+    monkeypatch.setattr(searched, "_searched_in_shocks", lambda best, noise: of("shocks", shaken))
+    found = searched._in_unrest(fading, FINE, {}, erring=True)
+    assert done == asked and found is (shaken if left else swinging)
+
+
 @pytest.mark.parametrize(
     ("rotors", "rate", "gained", "order"),
     [
@@ -292,15 +317,19 @@ def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
 
 
 @pytest.mark.parametrize(
-    ("alone", "aboard", "active", "may"),
+    ("alone", "aboard", "active", "coloured", "may"),
     [
-        (True, {"psi"}, ("yaw_damping",), True),
-        (True, {"psi"}, (), False),
-        (True, {"psi", "rpm_upper"}, ("yaw_damping",), False),  # rotor speeds would show it
-        (False, {"r"}, ("yaw_damping",), False),  # so would a gyro
+        (True, {"psi"}, ("yaw_damping",), False, True),
+        (True, {"psi"}, (), False, False),
+        (True, {"psi", "rpm_upper"}, ("yaw_damping",), False, False),  # rotor speeds would show it
+        (False, {"r"}, ("yaw_damping",), False, False),  # so would a gyro
+        (True, {"psi"}, ("yaw_damping",), True, False),  # the model lacks something else
     ],
 )
-def test_jitter_is_asked_by_poses_alone_where_something_is_named(alone, aboard, active, may):
+def test_jitter_is_asked_by_poses_alone_where_something_is_named(
+    monkeypatch, alone, aboard, active, coloured, may
+):
+    monkeypatch.setattr(searched, "_is_mostly_coloured", lambda found: coloured)
     problem = SimpleNamespace(sees_poses_alone=alone, aboard=frozenset(aboard))
     found = SimpleNamespace(problem=problem, fit=Fit(active, {}, FINE))
     assert searched._may_hide_jitter(found) == may  # type: ignore[arg-type]
