@@ -89,6 +89,19 @@ def test_a_run_that_diverged_and_channels_that_are_not_compared_do_not_count():
     assert found["channels"]["h"]["before"] == pytest.approx(0.5)
 
 
+def test_a_run_that_does_not_read_a_channel_counts_for_the_others():
+    """Its blocks are drawn with all others; what it does not read is neither right nor wrong."""
+    rng = np.random.default_rng(8)
+    both = run({"phi": rng.normal(0.0, 0.2, 40), "h": rng.normal(0.0, 0.3, 40)}, "both")
+    one = run({"phi": rng.normal(0.0, 0.2, 80)}, "no height", 80)
+    found = gain([both, one], [both, one], [both, one], {"phi": 0.0, "h": 0.0})
+    for channel, flown in (("phi", [both, one]), ("h", [both])):
+        errors = np.concatenate([r.channels[channel].error for r in flown])
+        known = found["channels"][channel]
+        assert known["before"] == pytest.approx(np.sqrt(np.mean(errors**2)))
+        assert known["ci95"][0] < known["after"] < known["ci95"][1]
+
+
 def test_intervals_without_scatter_are_points():
     found = gain(run({"h": 0.5}), run({"h": 0.4}), run({"h": math.hypot(0.3, 0.1)}))
     assert found["ci95"] == pytest.approx([75.0, 75.0])

@@ -110,15 +110,20 @@ def _nanmean(table: np.ndarray) -> Any:
 def _block_sums(runs: Sequence[RunReplay], still: bool = False) -> dict[str, np.ndarray]:
     """Per channel: (blocks, 2) of summed squared error and count, over all runs that flew.
 
+    The blocks are the same of every channel: one that a run does not read has nothing in its blocks.
+
     Args:
         runs: flown open loop.
         still: the errors of the prediction that nothing changes.
     """
+    flown = [run.still if still else {c: f.error for c, f in run.channels.items()} for run in runs]
+    every = dict.fromkeys(channel for errors in flown for channel in errors)
     sums: dict[str, list[tuple[float, float]]] = {}
-    for run in runs:
-        errors = run.still if still else {c: flown.error for c, flown in run.channels.items()}
-        for channel, error in errors.items():
-            for first in range(0, error.size, BLOCK):
+    for run, errors in zip(runs, flown, strict=True):
+        size = max((error.size for error in errors.values()), default=0)
+        for channel in every:
+            error = errors.get(channel, np.full(size, np.nan))
+            for first in range(0, size, BLOCK):
                 block = error[first : first + BLOCK]
                 block = block[np.isfinite(block)]
                 if run.diverged:

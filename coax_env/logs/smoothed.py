@@ -38,6 +38,9 @@ CoaX up to 20, a vibration at 40 Hz; **synthetic** ones behind 10 Hz at a rate o
 OF_PUSHES = 12.0
 """The same where none is flat enough: a cut-off so low that below it motion is louder than noise.
 White pushes make motion 10 times as dense in the middle, gusts with a memory 34; ours."""
+NEAR = 0.03
+"""s that readings are apart at most where it is asked whether they are smoothed: farther apart the real
+first CoaX's vibration makes them 60 times as dense, and motion more than noise does; ours."""
 FARTHEST = 0.1
 """s that readings may be apart at most; ours."""
 LOST = 1.9
@@ -57,7 +60,7 @@ def read_apart(
         holds: channel -> what the card says; one that never holds stays as it is.
     """
     pieces = {c: _pieces(runs, c) for c in MOTION if holds.get(c) is not False}
-    steep = {c: _steepest(own) for c, (own, _) in pieces.items()}
+    steep = {c: _steepest(*own) for c, own in pieces.items()}
     rows = max((_apart(*pieces[c]) for c, times in steep.items() if times > STEEP), default=1)
     if rows == 1:
         return list(runs)
@@ -82,11 +85,17 @@ def are_steep(runs: Sequence[Repaired]) -> bool:
     Args:
         runs: of one flight.
     """
-    return any(_steepest(_pieces(runs, channel)[0]) > STEEP for channel in MOTION)
+    return any(_steepest(*_pieces(runs, channel)) > STEEP for channel in MOTION)
 
 
-def _steepest(pieces: Sequence[np.ndarray]) -> float:
-    return max(steepness(pieces, rows) for rows in (1, 2))
+def _steepest(pieces: Sequence[np.ndarray], step: float) -> float:
+    """The most of any distance up to NEAR: nearer, the last digit of a fast log hides it.
+
+    Args:
+        pieces: readings, one after the other. step: between two [s].
+    """
+    most = max(int(NEAR / step), 2) if step > 0.0 else 2
+    return max(steepness(pieces, rows) for rows in range(1, most + 1))
 
 
 def _apart(pieces: Sequence[np.ndarray], step: float) -> int:
