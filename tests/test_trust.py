@@ -297,6 +297,7 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
         channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
         alternatives=(), nats=100.0, shaken=False, poses_alone=False,
+        clock_error=0.0,
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -411,6 +412,14 @@ def test_nothing_is_sure_where_the_model_leaves_colour_in_most_channels(share, d
     assert not without_name(against, SETTINGS)
     shown = {"servo_play": known_of(elsewhere=share, coloured=("q",))}
     assert len(list(doubts("servo_play", shown, SETTINGS))) == 1
+
+
+def test_nothing_is_sure_where_rows_have_wrong_times():
+    """Errors of neighbouring rows are taken for independent; what smooths them makes them one."""
+    against = {"marker_offset": known_of(clock_error=6.9e-4)}
+    (text,) = doubts("marker_offset", against, SETTINGS)
+    assert text == "the times of the log's rows are wrong by 0.69 ms"
+    assert not without_name(against, SETTINGS)
 
 
 def test_nothing_is_sure_where_a_run_is_much_louder_than_its_noise():

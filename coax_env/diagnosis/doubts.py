@@ -45,6 +45,7 @@ class Against:
         alternatives: effects that would do as well.
         nats: its evidence. shaken: whether gusts come in single shocks.
         poses_alone: whether neither gyros nor accelerometers were read.
+        clock_error: std by which the times of the log's rows are wrong [s].
     """
 
     channels: tuple[str, ...]
@@ -60,6 +61,7 @@ class Against:
     nats: float
     shaken: bool
     poses_alone: bool
+    clock_error: float
 
     @property
     def at_limit(self) -> bool:
@@ -146,6 +148,8 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
     if of.alternatives:
         others = and_list([plain(name) for name in of.alternatives])
         yield f"these flights cannot distinguish it from {others}"
+    if of.clock_error > 0.0:
+        yield f"the times of the log's rows are wrong by {1e3 * of.clock_error:.2g} ms"
     yield from weak(of.nats, of.shaken, chosen)
 
 

@@ -107,6 +107,7 @@ def trusts(
             nats=worth[effect],
             shaken=shaken,
             poses_alone=problem.sees_poses_alone,
+            clock_error=problem.clock_error,
         )
     nameless = without_name(against, problem.settings)
     return {
