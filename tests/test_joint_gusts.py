@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
 from coax_env import diagnose, load_vehicle
-from coax_env.diagnosis import correlated_gusts as asking
+from coax_env.diagnosis import joint_gusts as asking
 from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter import HeliModel

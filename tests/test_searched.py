@@ -87,7 +87,7 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
 def believes_its_sensors(monkeypatch) -> None:
     """No errors that last, times that are right, white rotor speeds, gusts that push or turn."""
     monkeypatch.setattr(searched, "with_lasting_errors", lambda problem, fit, noise: None)
-    monkeypatch.setattr(searched, "with_wrong_times", lambda problem, fit: None)
+    monkeypatch.setattr(searched, "with_clock_errors", lambda problem, fit: None)
     monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: None)
     monkeypatch.setattr(searched, "_may_hide_jitter", lambda found: False)
     monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
@@ -277,7 +277,9 @@ def test_where_times_are_wrong_all_is_searched_so(monkeypatch, wrong, problem):
 
     believes_its_sensors(monkeypatch)
     monkeypatch.setattr(searched, "_searched", one)
-    monkeypatch.setattr(searched, "with_wrong_times", lambda problem, fit: other if wrong else None)
+    monkeypatch.setattr(
+        searched, "with_clock_errors", lambda problem, fit: other if wrong else None
+    )
     monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: None)
     monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
     found = searched.searched(right, FINE, {})  # type: ignore[arg-type]
@@ -480,7 +482,7 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     behind, without = one("behind", ("wind",)), one("without", names)
     behind = replace(behind, low_passes={"p": LowPass(0.01)})
     monkeypatch.setattr(searched, "_searched", lambda problem, noise: one("first", ()))
-    monkeypatch.setattr(searched, "_in_wrong_times", lambda first, noise: first)
+    monkeypatch.setattr(searched, "_with_clock_errors", lambda first, noise: first)
     monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: behind)
     monkeypatch.setattr(
         searched, "_with_errors",

@@ -414,7 +414,7 @@ def test_nothing_is_sure_where_the_model_leaves_colour_in_most_channels(share, d
     assert len(list(doubts("servo_play", shown, SETTINGS))) == 1
 
 
-def test_nothing_is_sure_where_rows_have_wrong_times():
+def test_nothing_is_sure_where_rows_have_clock_errors():
     """Errors of neighbouring rows are taken for independent; what smooths them makes them one."""
     against = {"marker_offset": known_of(clock_error=6.9e-4)}
     (text,) = doubts("marker_offset", against, SETTINGS)

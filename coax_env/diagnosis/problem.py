@@ -82,7 +82,7 @@ class Problem:
         progress: called with a line of text.
         unlike_gusts: whether gusts turned out not to be as the filter has them (evidence.py).
         smoothed: whether readings were taken back through a low-pass (sensor_low_pass.py).
-        clock_error: std of the rows' times [s], 0 where they are right (wrong_times.py).
+        clock_error: std of the rows' times [s], 0 where they are right (clock_errors.py).
     """
 
     model: HeliModel

@@ -36,7 +36,7 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
         *_seen_late(problem),
         *_unlike_gusts(problem),
         *_smoothed(problem),
-        *_wrong_times(problem),
+        *_clock_errors(problem),
         *_swings(problem),
         *_joint_gusts(fit),
         *_lasting_errors(fit),
@@ -127,7 +127,7 @@ def _seen_late(problem: Problem) -> list[str]:
     ]
 
 
-def _wrong_times(problem: Problem) -> list[str]:
+def _clock_errors(problem: Problem) -> list[str]:
     if problem.clock_error == 0.0:
         return []
     return [

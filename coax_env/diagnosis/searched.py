@@ -12,6 +12,9 @@ Where measured rotor speeds stay coloured, it is done again with rotors that jit
 (estimation/rotor_jitter.py), if these are worth more than a tie: after a search, since a motor's lag
 colours them too and must be found as what it is, and first, since nothing else touches these readings.
 
+Where motion stays coloured then, it is asked whether the times of the log's rows are wrong
+(clock_errors.py), and the search done again with readings that are as good as these.
+
 Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) it is done again, with
 what was before it. This comes next: errors that last would take a part of it up. Where errors of
 readings last (sensor_errors.py) it is done again with these in it; where inertial sensors stay coloured
@@ -22,7 +25,7 @@ Where gusts have a frequency it is done again with that in the filter (estimatio
 nothing is coloured then: what a model lacks may swing, too. Swings look like single shocks to a model
 of gusts that fade, so they are asked first, and stand where no shocks are left. Jitter that the yaw
 rate alone shows is asked then, by poses alone where anything is named, and gusts once more beside it.
-Last it is asked whether gusts push and turn at once (correlated_gusts.py); no more than half of what is
+Last it is asked whether gusts push and turn at once (joint_gusts.py); no more than half of what is
 read may be coloured then, since what a model lacks makes such gusts, too: on a real helicopter an arm
 of 0.7 m.
 
@@ -36,8 +39,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from coax_env.diagnosis.correlated_gusts import in_joint_gusts
+from coax_env.diagnosis.clock_errors import with_clock_errors
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
+from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
 from coax_env.diagnosis.problem import ROTOR_SPEEDS, Fit, Problem
@@ -47,7 +51,6 @@ from coax_env.diagnosis.sensor_errors import with_lasting_errors
 from coax_env.diagnosis.sensor_low_pass import GROUPS, hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_swings
-from coax_env.diagnosis.wrong_times import with_wrong_times
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.low_pass import LowPass, before_low_pass, records_before
@@ -106,7 +109,7 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     first = _searched(problem, noise)
     if _is_coloured(first, ROTOR_SPEEDS):
         first, noise = _jittery(first, noise)
-    first = _in_wrong_times(first, noise)
+    first = _with_clock_errors(first, noise)
     problem = first.problem
     smoothed = _before_low_passes(first, noise)
     best, begun = _with_errors(smoothed or first, noise, clock)
@@ -123,13 +126,13 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     return replace(found, low_passes=best.low_passes)
 
 
-def _in_wrong_times(first: Searched, noise: Noise) -> Searched:
+def _with_clock_errors(first: Searched, noise: Noise) -> Searched:
     """The search with rows whose times are wrong, where they are; what was found, where not.
 
     Args:
         first: the search with times as logged. noise: levels to start from.
     """
-    problem = with_wrong_times(first.problem, first.fit)
+    problem = with_clock_errors(first.problem, first.fit)
     if problem is None:
         return first
     problem.report("searching again with readings as good as the times of their rows")

@@ -27,7 +27,7 @@ WITHIN = 0.1
 """Of its logarithm, to which it is looked for; ours."""
 
 
-def with_wrong_times(problem: Problem, fit: Fit) -> Problem | None:
+def with_clock_errors(problem: Problem, fit: Fit) -> Problem | None:
     """The problem whose rows' times are wrong, where that is worth the threshold.
 
     Args:

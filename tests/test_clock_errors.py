@@ -11,7 +11,7 @@ from injector_craft import COAX
 from injector_sensors import POSE, SENSORS
 
 from coax_env import diagnose
-from coax_env.diagnosis import wrong_times as asking
+from coax_env.diagnosis import clock_errors as asking
 from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.clock_errors import rates, with_clock_error
@@ -48,7 +48,7 @@ def test_rates_are_those_of_the_motion(every):
     assert not found[~np.isfinite(record.z[:, PLACE["pn"]]), PLACE["pn"]].any()
 
 
-def test_the_variance_is_that_of_readings_at_wrong_times():
+def test_the_variance_is_that_of_readings_at_clock_errors():
     """In a dash and at its ends, where the machine turns and stands: over 400 flights."""
     off = np.array([flown(2e-3, seed).z - flown().z for seed in range(400)])[:, :, PLACE["pn"]]
     (record,) = with_clock_error([flown()], 2e-3)
@@ -73,7 +73,7 @@ def test_the_variance_is_that_of_readings_at_wrong_times():
         (0.3, 0.1, 10.0, False),  # not worth the threshold
     ],
 )
-def test_wrong_times_are_asked_for_where_they_explain_the_colour(
+def test_clock_errors_are_asked_for_where_they_explain_the_colour(
     monkeypatch, before, after, gain, used
 ):
     """The likelihood is a parabola about 1.5 ms; whether readings are white is a stand-in."""
@@ -97,11 +97,11 @@ def test_wrong_times_are_asked_for_where_they_explain_the_colour(
     monkeypatch.setattr(asking, "noise_fitted", lambda problem, fit: fit)
     monkeypatch.setattr(asking, "fitted", lambda problem, fit: replace(fit, objective=500.0 - gain))
     fit = Fit((), {}, Noise({}), objective=500.0)
-    found = asking.with_wrong_times(problem_with(0.0), fit)
+    found = asking.with_clock_errors(problem_with(0.0), fit)
     assert (found is not None) == used
     if found is not None:
         assert found.clock_error == pytest.approx(1.5e-3, rel=0.15)
-    assert asking.with_wrong_times(problem_with(1e-3), fit) is None  # known already
+    assert asking.with_clock_errors(problem_with(1e-3), fit) is None  # known already
 
 
 @pytest.mark.slow
