@@ -215,6 +215,6 @@ def test_shares_are_found_and_nothing_is_named(tmp_path):
     assert found.findings["causes"] == []
     said = [line for line in found.remarks if line.startswith("gusts push and turn at once")]
     assert len(said) == 1
-    arm = float(said[0].split("moment xy per force xy ")[1].split(",")[0])
+    arm = float(said[0].split("moment xy per force xy ")[1].split(" m")[0])
     levels = injector_air._levels(air, COAX)
     assert arm == pytest.approx(-0.9 * levels[4] / levels[0], rel=0.15)

@@ -15,7 +15,7 @@ from coax_env.estimation.helicopter_noise import (
     error_memory,
     level_unit,
 )
-from coax_env.estimation.joint_gusts import SHARES
+from coax_env.estimation.joint_gusts import SHARES, is_arm
 from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
@@ -146,11 +146,11 @@ def _swings(problem: Problem) -> list[str]:
 def _joint_gusts(fit: Fit) -> list[str]:
     """Which gusts push and turn at once, where some do."""
     said = [
-        f"{name.partition('.')[2].replace('_', ' ')} {fit.values[name]:+.2g}"
+        f"{name.partition('.')[2].replace('_', ' ')} {fit.values[name]:+.2g}{' m' * is_arm(name)}"
         for name in SHARES
         if name in fit.values
     ]
-    return [f"gusts push and turn at once [m, or a number]: {', '.join(said)}"] if said else []
+    return [f"gusts push and turn at once: {', '.join(said)}"] if said else []
 
 
 def _lasting_errors(fit: Fit) -> list[str]:

@@ -162,12 +162,14 @@ def free_shares(names: Sequence[str], vehicle: Vehicle) -> list[FreeParameter]:
     Args:
         names: of SHARES. vehicle: a moment per force is an arm, of a rotor's radius or so.
     """
-    free = []
-    for name in names:
-        i, j = next(iter(SHARES[name]))
-        is_arm = i < _FIRST_MOMENT <= j
-        free.append(FreeParameter(name, 0.0, vehicle.values()["rotor_radius"] if is_arm else 1.0))
-    return free
+    arm = vehicle.values()["rotor_radius"]
+    return [FreeParameter(name, 0.0, arm if is_arm(name) else 1.0) for name in names]
+
+
+def is_arm(share: str) -> bool:
+    """Whether a share is of a moment in a force, and so a length [m]."""
+    first, second = next(iter(SHARES[share]))
+    return first < _FIRST_MOMENT <= second
 
 
 def score_slopes(in_noise: np.ndarray, driven: np.ndarray) -> dict[str, np.ndarray]:
