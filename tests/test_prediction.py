@@ -15,6 +15,7 @@ from coax_env import InputError, load_vehicle
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import GUST_LEVELS, MEMORIES
+from coax_env.estimation.joint_gusts import LEVER
 from coax_env.estimation.prediction import (
     ChannelReplay,
     RunReplay,
@@ -198,9 +199,13 @@ def test_gusts_are_reported_by_axis():
         "force_xy": 0.2, "force_z": 0.3, "moment_xy": 4e-3, "moment_z": 5e-3,
         **dict.fromkeys(MEMORIES, 0.8),
     }  # fmt: skip
-    assert gusts_of(Noise(levels)) == {
-        "force_N": [0.2, 0.2, 0.3], "moment_Nm": [4e-3, 4e-3, 5e-3], "memory_s": 0.8,
+    own = gusts_of(Noise(levels))
+    assert own == {
+        "force_N": [0.2, 0.2, 0.3], "moment_Nm": pytest.approx([4e-3, 4e-3, 5e-3]), "memory_s": 0.8,
     }  # fmt: skip
+    arm = 0.015  # a push that also tilts adds 3 mN m
+    joint = gusts_of(Noise(levels), {LEVER: -arm})
+    assert joint == own | {"moment_Nm": pytest.approx([5e-3, 5e-3, 5e-3])}
 
 
 def flight(seconds: float) -> Flight:

@@ -220,7 +220,7 @@ def diagnose(
         findings={
             "verdict": findings.verdict(causes, unexplained),
             "causes": causes,
-            "gusts": gusts_of(fit.noise),
+            "gusts": gusts_of(fit.noise, fit.values),
             "noise": findings.noise_levels(fit.noise),
             "unexplained": unexplained,
             "gain": gain,

@@ -172,6 +172,19 @@ def is_arm(share: str) -> bool:
     return first < _FIRST_MOMENT <= second
 
 
+def felt_gusts(levels: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
+    """Std of the six gusts as the body feels them, with their shares of those before (6,).
+
+    Args:
+        levels: (6,) std of each gust's own state. values: of the parameters, by name.
+    """
+    root = np.eye(6)
+    for name, pairs in SHARES.items():
+        for (first, second), sign in pairs.items():
+            root[second, first] = sign * values.get(name, 0.0)
+    return np.sqrt(root**2 @ levels**2)
+
+
 def score_slopes(in_noise: np.ndarray, driven: np.ndarray) -> dict[str, np.ndarray]:
     """Slope of the log-likelihood in each share's correlation at none, by blocks of time (blocks,).
 

@@ -10,6 +10,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,14 @@ from coax_env.estimation import compiled_model
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
-from coax_env.estimation.helicopter_noise import AXES, fitted_levels, sensor_std, starting_noise
+from coax_env.estimation.helicopter_noise import (
+    AXES,
+    fitted_levels,
+    gust_levels,
+    sensor_std,
+    starting_noise,
+)
+from coax_env.estimation.joint_gusts import felt_gusts
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Noise
@@ -31,6 +39,7 @@ from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 from coax_env.progress import Progress
 
+NO_VALUES: Mapping[str, float] = MappingProxyType({})
 HEADING = CHANNELS.index("psi")
 WARM_UP = 1.0  # [s] of filtering before the first start
 EVERY = 0.25  # [s] between starts
@@ -343,15 +352,16 @@ def replay(
     return Replay(findings, runs, noise, flight, vehicle, horizon)
 
 
-def gusts_of(noise: Noise) -> dict[str, Any]:
-    """Gust levels as findings.json has them; the memory is that of the axes that move a state most."""
+def gusts_of(noise: Noise, values: Mapping[str, float] = NO_VALUES) -> dict[str, Any]:
+    """Gust levels as findings.json has them; the memory is that of the axes that move a state most.
+
+    Args:
+        noise: levels. values: of the parameters, in which shares of joint gusts may be.
+    """
     level = noise.process
     strongest = max(AXES, key=lambda axes: level[axes] / noise.floor.get(axes, 1.0))
-    return {
-        "force_N": [level["force_xy"], level["force_xy"], level["force_z"]],
-        "moment_Nm": [level["moment_xy"], level["moment_xy"], level["moment_z"]],
-        "memory_s": level[f"memory_{strongest}"],
-    }
+    std = felt_gusts(gust_levels(noise), values).tolist()
+    return {"force_N": std[:3], "moment_Nm": std[3:], "memory_s": level[f"memory_{strongest}"]}
 
 
 def run_table(run: RunReplay, noise: Mapping[str, float]) -> dict[str, Any]:
