@@ -727,16 +727,17 @@ def test_expected_evidence_grows_with_the_square_of_the_size(damped: tuple) -> N
     assert (two - none) / (one - none) == pytest.approx(4.0, rel=0.15)
 
 
-def test_where_the_filter_loses_the_machine_an_effect_is_worth_what_its_slopes_say(
+def test_far_from_the_truth_an_effect_is_worth_what_its_slopes_say_at_most(
     damped: tuple, monkeypatch
 ) -> None:
-    """Of one that diverged 5e60 nats were expected; of a damping they say much the same as itself."""
-    _, folder, truth = damped
-    planned, flight = damped[0], read_flight(folder)
-    flown = expected_evidence(planned, flight, truth, ())["yaw_damping"]
-    monkeypatch.setattr(expecting, "DIVERGED", 0.0)
+    """An unbalanced torque was expected to be worth 5e60 nats; of a damping both say much the same."""
+    planned, folder, truth = damped
+    flight = read_flight(folder)
+    near = expected_evidence(planned, flight, truth, ())["yaw_damping"]
+    assert near is not None and near > 20.0
+    monkeypatch.setattr(expecting, "GATE", 0.0)
     by_slopes = expected_evidence(planned, flight, truth, ())["yaw_damping"]
-    assert flown is not None and by_slopes == pytest.approx(flown, rel=0.3) and flown > 20.0
+    assert by_slopes == pytest.approx(near, rel=0.3) and by_slopes <= near
 
 
 def test_a_deadband_is_expected_to_be_worth_what_the_play_that_names_it_is(damped: tuple) -> None:

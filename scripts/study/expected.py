@@ -23,7 +23,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.shocks import in_shocks, with_shocks
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise, still_air
-from coax_env.estimation.run_passes import RunPass
+from coax_env.estimation.run_passes import GATE, RunPass
 from coax_env.estimation.state_space import Noise
 from coax_env.logs.flight import Flight
 from coax_env.model.effects import CATALOGUE
@@ -48,9 +48,6 @@ PRIOR_SHARE = 0.1
 EMPTY: Mapping[str, float] = MappingProxyType({})
 LEVEL_STEP = 0.1
 """Step of the logarithm of a level of the noise."""
-DIVERGED = 1e4
-"""std by which a prediction is off where a filter has lost the machine: 1e30 on a flight by poses alone
-whose torques are not balanced, which was expected to be worth 5e60 nats then."""
 
 
 def catalogue_values(values: Mapping[str, float]) -> dict[str, float]:
@@ -181,9 +178,23 @@ class _Truth:
     listed: Sequence[str]
 
     def worth(self, effect: str) -> float:
-        """Nats of an effect, less the Occam factor."""
+        """Nats of an effect, less the Occam factor.
+
+        Where a prediction without it is beyond the filter's gate, at most what its slopes say: the way
+        there is not straight, and what is free beside it would not let it come so far. An unbalanced
+        torque, which the torque coefficients take up, was expected to be worth 5,500 to 5e60 nats.
+        """
+        off = self.problem.off_values(effect)
+        away = self._as_it_is.beside(self._changed(values=off))
+        worth = self._nats(effect, away)
+        if np.abs(away).max(initial=0.0) < GATE:
+            return worth
+        moved = [(off[name] - self.values[name]) * self._slopes[name] for name in off]
+        return min(worth, self._nats(effect, np.sum(moved, axis=0)))
+
+    def _nats(self, effect: str, away: np.ndarray) -> float:
+        """The same by how far predictions without it are away, (2 readings,)."""
         problem = self.problem
-        away = self._away(effect)
         own = problem.acting_names(effect)
         mine = np.array([self._slopes[name] for name in own])
         rest = problem.free([e for e in self.listed if e != effect])
@@ -195,18 +206,6 @@ class _Truth:
         prior = np.array([f.std for f in problem.own[effect] if f.name in own])
         posterior = np.outer(prior, prior) * (mine @ left[1:].T) + np.eye(len(own))
         return float(0.5 * away @ left[0] - 0.5 * np.linalg.slogdet(posterior)[1])
-
-    def _away(self, effect: str) -> np.ndarray:
-        """How far predictions without an effect are away, (2 readings,).
-
-        By its slopes where the filter without it diverges: what is free beside it would not let it.
-        """
-        off = self.problem.off_values(effect)
-        away = self._as_it_is.beside(self._changed(values=off))
-        if np.abs(away).max(initial=0.0) < DIVERGED:
-            return away
-        moved = [(off[name] - self.values[name]) * self._slopes[name] for name in off]
-        return np.sum(moved, axis=0)
 
     def _changed(
         self, values: Mapping[str, float] = EMPTY, levels: Mapping[str, float] = EMPTY
