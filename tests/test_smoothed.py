@@ -11,7 +11,7 @@ from injector_craft import COAX
 from scipy.signal import butter, filtfilt, lfilter
 
 from coax_env import diagnose
-from coax_env.diagnosis.findings import alike_in_seldom_poses
+from coax_env.diagnosis.confounding import alike_by_poses_alone
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.logs.flight import read_flight
@@ -146,18 +146,16 @@ def test_nothing_is_named_where_poses_were_smoothed(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("effect", "seldom", "aboard", "alike"),
+    ("effect", "aboard", "alike"),
     [
-        ("command_delay", True, ("phi", "pn"), ["pose_delay"]),
-        ("pose_delay", True, ("phi", "pn"), ["command_delay"]),
-        ("command_delay", False, ("phi", "pn"), []),
-        ("command_delay", True, ("phi", "az"), []),  # an accelerometer feels when a command acts
-        ("wind", True, ("phi", "pn"), []),
+        ("command_delay", ("phi", "pn"), ["pose_delay"]),
+        ("pose_delay", ("phi", "pn"), ["command_delay"]),
+        ("command_delay", ("phi", "az"), []),  # an accelerometer feels when a command acts
+        ("wind", ("phi", "pn"), []),
     ],
 )
-def test_by_seldom_poses_alone_late_commands_and_late_poses_are_one(effect, seldom, aboard, alike):
+def test_by_poses_alone_late_commands_and_late_poses_are_one(effect, aboard, alike):
     problem = SimpleNamespace(
-        sees_poses_alone="az" not in aboard, reads_seldom=seldom,
-        candidates=("command_delay", "pose_delay", "wind"),
-    )  # fmt: skip
-    assert alike_in_seldom_poses(problem, effect) == alike  # type: ignore[arg-type]
+        sees_poses_alone="az" not in aboard, candidates=("command_delay", "pose_delay", "wind")
+    )
+    assert alike_by_poses_alone(problem, effect) == alike  # type: ignore[arg-type]

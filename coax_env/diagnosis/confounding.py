@@ -23,8 +23,20 @@ NEAR_TIES = 3.0
 TWIN_STEPS = 6
 """Gauss-Newton steps from a lag to a delay of nothing, which is far; ours."""
 
+LATE = frozenset({"command_delay", "pose_delay"})
+"""By poses alone one lateness: what was commanded is seen so much later. The likelihood prefers one only
+because a late pose is taken from the state that a row has, to second order in its delay, which loses
+what gusts did since: all of four late poses were named late commands on **synthetic** flights."""
+
 Alternatives = Mapping[str, Mapping[str, Fit]]
 """Cause -> its confounded alternatives -> the fit with each in the cause's place."""
+
+
+def alike_by_poses_alone(problem: Problem, effect: str) -> list[str]:
+    """What a cause cannot be told from where neither gyros nor accelerometers are read."""
+    if effect not in LATE or not problem.sees_poses_alone:
+        return []
+    return sorted((LATE - {effect}) & set(problem.candidates))
 
 
 def channels_of(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.confounding import Alternatives
+from coax_env.diagnosis.confounding import Alternatives, alike_by_poses_alone
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
@@ -89,12 +89,6 @@ def causes(
     return sorted(mixtures_as_one(entries), key=lambda c: (c["trust"] != "sure", -c["evidence"]))
 
 
-LATE = frozenset({"command_delay", "pose_delay"})
-"""Between seldom poses one lateness: a late pose is taken from the state a row's end has, to second
-order in its delay, which loses what gusts did since. Two of two late poses that came 50 ms apart were
-named late commands, on **synthetic** flights."""
-
-
 def confusable_with(problem: Problem, effect: str, alternatives: Iterable[str]) -> list[str]:
     """What a cause may as well be: its alternatives, and those that no flight or not this one tells.
 
@@ -102,14 +96,7 @@ def confusable_with(problem: Problem, effect: str, alternatives: Iterable[str]) 
         problem: of the flight. effect: the cause. alternatives: that were fitted.
     """
     never = effects.found_by_the_name_of(effect)
-    return list(dict.fromkeys([*alternatives, *never, *alike_in_seldom_poses(problem, effect)]))
-
-
-def alike_in_seldom_poses(problem: Problem, effect: str) -> list[str]:
-    """What a cause cannot be told from by poses alone, more than Settings.slow_rows apart."""
-    if effect not in LATE or not problem.sees_poses_alone or not problem.reads_seldom:
-        return []
-    return sorted((LATE - {effect}) & set(problem.candidates))
+    return list(dict.fromkeys([*alternatives, *never, *alike_by_poses_alone(problem, effect)]))
 
 
 def mixtures_as_one(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:

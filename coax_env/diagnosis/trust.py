@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from coax_env.diagnosis.confounding import Alternatives, channels_of
+from coax_env.diagnosis.confounding import Alternatives, alike_by_poses_alone, channels_of
 from coax_env.diagnosis.doubts import LOUD, Against, doubts, on_parts, sizes, without_name
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.noise_variation import not_holding
@@ -103,7 +103,7 @@ def trusts(
             runs=runs,
             sizes=sizes(problem, fit, effect),
             determined=any(known[effect][name] for name in problem.acting_names(effect)),
-            alternatives=tuple(found[effect]),
+            alternatives=(*found[effect], *alike_by_poses_alone(problem, effect)),
             nats=worth[effect],
             shaken=shaken,
             poses_alone=problem.sees_poses_alone,
