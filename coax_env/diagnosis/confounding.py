@@ -24,9 +24,9 @@ TWIN_STEPS = 6
 """Gauss-Newton steps from a lag to a delay of nothing, which is far; ours."""
 
 LATE = frozenset({"command_delay", "pose_delay"})
-"""By poses alone one lateness: what was commanded is seen so much later. The likelihood prefers one only
-because a late pose is taken from the state that a row has, to second order in its delay, which loses
-what gusts did since: all of four late poses were named late commands on **synthetic** flights."""
+"""By poses alone one lateness: what was commanded is seen so much later. The likelihood prefers one
+only because a late pose is taken from the state that a row has, to second order in its delay: what gusts
+did since is lost. All of four late poses were named late commands on **synthetic** flights."""
 
 Alternatives = Mapping[str, Mapping[str, Fit]]
 """Cause -> its confounded alternatives -> the fit with each in the cause's place."""
