@@ -25,8 +25,8 @@ TWIN_STEPS = 6
 
 LATE = frozenset({"command_delay", "pose_delay"})
 """By poses alone one lateness: what was commanded is seen so much later. The likelihood prefers one
-only because a late pose is taken from the state that a row has, to second order in its delay: what gusts
-did since is lost. All of four late poses were named late commands on **synthetic** flights."""
+only because a late pose is taken from the state that a row has, to second order in its delay, where
+what gusts did since is lost. All of four late poses were named late commands (**synthetic**)."""
 
 Alternatives = Mapping[str, Mapping[str, Fit]]
 """Cause -> its confounded alternatives -> the fit with each in the cause's place."""
