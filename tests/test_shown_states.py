@@ -33,7 +33,8 @@ def passes():
     engine = Engine(HeliModel(vehicle), [part(record, record.t < record.t[0] + 3.0)])
     noise = starting_noise(flight, vehicle)
     p = engine.model.vector(engine.model.bare_values, noise)
-    decaying = np.flatnonzero(engine.model.process_noise(noise, p)[1] > 0.0)
+    decay = engine.model.process_noise(noise, p).decay[: engine.model.exact.size]
+    decaying = np.flatnonzero(decay > 0.0)
     both = [
         engine.filter_run(0, p, noise, Buffers(), Buffers(), rows, decaying)
         for rows in (None, np.array([50]))
