@@ -54,9 +54,9 @@ class Line:
     """A line found in one kind of channels.
 
     kind: a key of KINDS. rotor: at whose speed, times slip. amplitude: root mean square over the
-    channels, in their unit, with its std. evidence: nats. steady: nats of the channel that shows it
-    best, by its median segment: a rotor shakes in all of them. channels: where it shows, strongest
-    first.
+    channels, in their unit, with its std. evidence: nats. steady: nats of all channels, or of the one
+    that shows it best, by their median segment: a rotor shakes in all of them. channels: where it shows,
+    strongest first.
     ratios: run -> power over its neighbours', segment by segment.
     """
 
@@ -271,14 +271,15 @@ def _line_at(flight: Flight, rotor: str, kind: str, slip: float) -> Line | None:
     spread = float(np.std(squares, ddof=1) / np.sqrt(len(squares)))
     std = spread / max(2.0 * amplitude, float(np.sqrt(spread)))
     shown = {c: float(np.mean(r)) for c, r in ratio.items() if r}
+    every = [r for own in ratio.values() for r in own]
     return Line(
         kind=kind,
         rotor=rotor,
         slip=slip,
         amplitude=amplitude,
         std=float(np.hypot(std, SMEAR * amplitude)),
-        evidence=_evidence([r for own in ratio.values() for r in own]),
-        steady=max(_steady_evidence(own) for own in ratio.values() if own),
+        evidence=_evidence(every),
+        steady=max(_steady_evidence(own) for own in (every, *ratio.values()) if own),
         channels=tuple(sorted((c for c in shown if shown[c] > SHOWS), key=lambda c: -shown[c]))
         or tuple(shown),
         ratios=by_run,
