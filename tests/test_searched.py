@@ -90,6 +90,7 @@ def believes_its_sensors(monkeypatch) -> None:
     monkeypatch.setattr(searched, "with_clock_errors", lambda problem, fit: None)
     monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: None)
     monkeypatch.setattr(searched, "_may_hide_jitter", lambda found: False)
+    monkeypatch.setattr(searched, "_is_much_coloured", lambda found: False)
     monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
 
 
@@ -287,24 +288,32 @@ def test_where_times_are_wrong_all_is_searched_so(monkeypatch, wrong, problem):
 
 
 @pytest.mark.parametrize(
-    ("costs", "coloured", "used"),
-    [((100.0, 90.0), 0.5, True), ((90.0, 100.0), 0.0, False), ((100.0, 90.0), 0.75, False)],
+    ("costs", "before", "after", "used"),
+    [
+        ((100.0, 90.0), 0.09, 0.09, True),
+        ((90.0, 100.0), 0.0, 0.0, False),
+        ((100.0, 90.0), 0.05, 0.11, False),
+        ((100.0, 90.0), 0.11, 0.05, False),
+    ],
 )
 def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
-    monkeypatch, costs, coloured, used
+    monkeypatch, costs, before, after, used
 ):
     """From the search that ended likelier; low-passes stay."""
     plain, joint = (
         SimpleNamespace(
             name=name, model=SimpleNamespace(channels=tuple("abcd")), report=lambda text: None,
-            engine=SimpleNamespace(filter=lambda values, noise: []),
+            engine=SimpleNamespace(filter=lambda values, noise, name=name: name),
         )
         for name in ("plain", "joint")
     )  # fmt: skip
     fit = Fit((), {}, FINE)
     first = Searched(plain, fit, fit, fit, None, low_passes={"ax": LowPass(0.008)})  # type: ignore[arg-type]
-    whites = [k >= 4 * coloured for k in range(4)]
-    shown = {c: SimpleNamespace(white=w) for c, w in zip("abcd", whites, strict=True)}
+    mean = {"plain": before, "joint": after}
+    shown = lambda name, channels: {  # noqa: E731
+        "a": SimpleNamespace(coloured_share=2.0 * mean[name]),
+        "b": SimpleNamespace(coloured_share=0.0),
+    }
     monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: (joint, fit))
     monkeypatch.setattr(
         searched, "_searched", lambda problem, noise, coarse: replace(first, problem=problem)
@@ -312,7 +321,7 @@ def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
     monkeypatch.setattr(
         searched, "cost", lambda problem, fit, quadratic: costs[problem.name == "joint"]
     )
-    monkeypatch.setattr(searched, "whiteness", lambda passes, channels: shown)
+    monkeypatch.setattr(searched, "whiteness", shown)
     found = searched._with_joint_gusts(first, FINE)
     assert (found.problem is joint) == used and found.low_passes == first.low_passes
     assert found is first or used
@@ -331,7 +340,7 @@ def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
 def test_jitter_is_asked_by_poses_alone_where_something_is_named(
     monkeypatch, alone, aboard, active, coloured, may
 ):
-    monkeypatch.setattr(searched, "_is_mostly_coloured", lambda found: coloured)
+    monkeypatch.setattr(searched, "_is_much_coloured", lambda found: coloured)
     problem = SimpleNamespace(sees_poses_alone=alone, aboard=frozenset(aboard))
     found = SimpleNamespace(problem=problem, fit=Fit(active, {}, FINE))
     assert searched._may_hide_jitter(found) == may  # type: ignore[arg-type]

@@ -55,8 +55,8 @@ class Line:
 
     kind: a key of KINDS. rotor: at whose speed, times slip. amplitude: root mean square over the
     channels, in their unit, with its std. evidence: nats. steady: nats of all channels, or of the one
-    that shows it best, by their median segment: a rotor shakes in all of them. channels: where it shows,
-    strongest first.
+    that shows it best, by their median segment: a rotor shakes in all of them. channels: where it
+    shows, strongest first.
     ratios: run -> power over its neighbours', segment by segment.
     """
 
