@@ -25,7 +25,6 @@ from coax_env.estimation.joint_gusts import (
     JointModel,
     free_shares,
     is_joint,
-    joint_in,
     score_slopes,
 )
 from coax_env.estimation.lasting_errors import ErringModel
@@ -139,7 +138,7 @@ def test_every_pair_of_gusts_has_one_share_and_a_push_to_any_side_one_arm():
 
 def test_it_stands_around_the_helicopter_or_one_whose_rotors_jitter():
     model = ErringModel(SwingingModel(JitteryModel.like(PLAIN), (0.5,) * 6)).reading_after(0.02)
-    joint = joint_in(model)
+    joint = with_innermost(model, JointModel)
     assert not is_joint(model) and is_joint(joint)
     assert isinstance(joint, ErringModel) and isinstance(joint.inner, SwingingModel)
     assert isinstance(joint.inner.inner, JointModel) and joint.read_delay == 0.02

@@ -8,12 +8,11 @@ dash as well: a quarter of the colour of motion must be gone then, or the times 
 
 import math
 
-import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.fits import fitted, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation.whiteness import Whiteness, whiteness
+from coax_env.estimation.whiteness import Whiteness, colour, whiteness
 from coax_env.model.layout import MOTION
 
 LEAST, MOST = 5e-5, 0.02
@@ -33,7 +32,10 @@ def with_clock_errors(problem: Problem, fit: Fit) -> Problem | None:
     Args:
         problem, fit: after a search.
     """
-    if problem.clock_error > 0.0 or _is_white(problem, fit):
+    if problem.clock_error > 0.0:
+        return None
+    before = _of_motion(problem, fit)
+    if all(judged.white for judged in before):
         return None
     trial, best = fit, problem
     for _ in range(TURNS):
@@ -44,7 +46,7 @@ def with_clock_errors(problem: Problem, fit: Fit) -> Problem | None:
             break
     gained = fit.objective - trial.objective
     problem.report(f"times wrong by {1e3 * best.clock_error:.2g} ms: {gained:.1f} nats")
-    explained = _colour(best, trial) < LEFT * _colour(problem, fit)
+    explained = colour(_of_motion(best, trial)) < LEFT * colour(before)
     if gained < problem.settings.evidence or not explained:
         return None
     return best
@@ -68,12 +70,3 @@ def _of_motion(problem: Problem, fit: Fit) -> list[Whiteness]:
     passes = problem.engine.filter(fit.values, fit.noise)
     shown = whiteness(passes, problem.model.channels)
     return [shown[channel] for channel in MOTION if channel in shown]
-
-
-def _is_white(problem: Problem, fit: Fit) -> bool:
-    return all(judged.white for judged in _of_motion(problem, fit))
-
-
-def _colour(problem: Problem, fit: Fit) -> float:
-    """Share of the innovations of motion that their own past predicts, in the mean of the channels."""
-    return float(np.mean([judged.coloured_share for judged in _of_motion(problem, fit)]))

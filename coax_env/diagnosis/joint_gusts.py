@@ -12,7 +12,8 @@ import numpy as np
 
 from coax_env.diagnosis.fits import fitted, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation.joint_gusts import free_shares, is_joint, joint_in, score_slopes
+from coax_env.estimation.joint_gusts import JointModel, free_shares, is_joint, score_slopes
+from coax_env.estimation.wrapping_model import with_innermost
 from coax_env.model.layout import GUSTS
 
 ASKS_FROM = 3.0
@@ -31,7 +32,8 @@ def in_joint_gusts(problem: Problem, fit: Fit) -> tuple[Problem, Fit] | None:
     if not asked:
         return None
     shares = free_shares(asked, problem.model.vehicle)
-    wider = problem.with_model(joint_in(problem.model)).with_free(shares)
+    joint = with_innermost(problem.model, JointModel)
+    wider = problem.with_model(joint).with_free(shares)
     trial = fit.at({f.name: f.value for f in shares})
     last = math.inf
     for _ in range(TURNS):

@@ -59,7 +59,7 @@ from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import REACTION, JitteryModel, with_jitter
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.whiteness import is_white, whiteness
+from coax_env.estimation.whiteness import colour, is_white, whiteness
 from coax_env.estimation.wrapping_model import with_innermost
 from coax_env.model.layout import INERTIAL
 
@@ -404,8 +404,7 @@ def _may_hide_jitter(found: Searched) -> bool:
 def _is_much_coloured(found: Searched) -> bool:
     """Whether more than MUCH of the innovations is foretold by their own past."""
     passes = found.problem.engine.filter(found.fit.values, found.fit.noise)
-    shown = whiteness(passes, found.problem.model.channels).values()
-    return float(np.mean([judged.coloured_share for judged in shown])) > MUCH
+    return colour(whiteness(passes, found.problem.model.channels).values()) > MUCH
 
 
 def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.estimation import helicopter_noise
 from coax_env.estimation.helicopter import HeliModel, Motion, _take_in_innovations
+from coax_env.estimation.helicopter_noise import AXES, GUST_AXES, JOINT, PAIRS_OF_GUSTS
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.wrapping_model import WrappingModel
 from coax_env.kernel.compilation import compiled
@@ -24,7 +24,7 @@ from coax_env.model import state as S
 from coax_env.model.layout import AXES_OF_GUSTS, N_CHANNELS, N_FULL
 from coax_env.model.vehicle import Vehicle
 
-PAIRS = helicopter_noise.PAIRS_OF_GUSTS
+PAIRS = PAIRS_OF_GUSTS
 """Of gusts, the first of which has a share in the second."""
 LEVER = "joint_gusts.moment_xy_per_force_xy"
 _OF_LEVER = {(0, 4): 1.0, (1, 3): -1.0}
@@ -47,6 +47,7 @@ inner_drift: Any = None
 INNER = N_FULL  # its number of states, put in by `WrappingModel`
 WORK = dynamics.WORK_SIZE  # the size of its scratch; behind it the inner state, drift and readings
 _COUNT = len(PAIRS)
+_MEMORIES = P.GUST_MEMORIES.start + np.array([AXES.index(axes) for axes in GUST_AXES])
 
 
 @compiled()
@@ -64,13 +65,7 @@ def _joined(x, states, p, out):
 @compiled()
 def _left(i, dt, p):
     """Share that is left of a gust's own state after `dt` seconds."""
-    if i < 2:
-        return math.exp(-dt / p[P.MEMORY_FORCE_XY])
-    if i == 2:
-        return math.exp(-dt / p[P.MEMORY_FORCE_Z])
-    if i < 5:
-        return math.exp(-dt / p[P.MEMORY_MOMENT_XY])
-    return math.exp(-dt / p[P.MEMORY_MOMENT_Z])
+    return math.exp(-dt / p[_MEMORIES[i]])
 
 
 def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
@@ -127,11 +122,8 @@ class JointModel(WrappingModel):
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
         """The inner model's parameter vector, and behind it the shares, by PAIRS."""
         inner = {name: value for name, value in values.items() if name not in SHARES}
-        shares = np.zeros(_COUNT)
-        for name, pairs in SHARES.items():
-            for pair, sign in pairs.items():
-                shares[PAIRS.index(pair)] = sign * values.get(name, 0.0)
-        return np.append(self.inner.vector(inner, noise), shares)
+        first, second = np.array(PAIRS).T
+        return np.append(self.inner.vector(inner, noise), _shares(values)[second, first])
 
     def added_variances(self, noise: Noise) -> np.ndarray:
         """None."""
@@ -142,18 +134,20 @@ class JointModel(WrappingModel):
         return np.zeros(0), np.zeros(0)
 
 
-def joint_in(model: HeliModel) -> HeliModel:
-    """A model in joint gusts; what swings, and errors of its readings that last, stay around it."""
-    if isinstance(model, WrappingModel):
-        return model.around(joint_in(model.inner))
-    return JointModel(model)
-
-
 def is_joint(model: HeliModel) -> bool:
     """Whether a model is in joint gusts already."""
     if isinstance(model, WrappingModel):
         return isinstance(model, JointModel) or is_joint(model.inner)
     return False
+
+
+def _shares(values: Mapping[str, float]) -> np.ndarray:
+    """(6, 6) what each gust has of those before it, below the diagonal."""
+    shares = np.zeros((6, 6))
+    for name, pairs in SHARES.items():
+        for (first, second), sign in pairs.items():
+            shares[second, first] = sign * values.get(name, 0.0)
+    return shares
 
 
 def free_shares(names: Sequence[str], vehicle: Vehicle) -> list[FreeParameter]:
@@ -178,11 +172,7 @@ def felt_gusts(levels: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
     Args:
         levels: (6,) std of each gust's own state. values: of the parameters, by name.
     """
-    root = np.eye(6)
-    for name, pairs in SHARES.items():
-        for (first, second), sign in pairs.items():
-            root[second, first] = sign * values.get(name, 0.0)
-    return np.sqrt(root**2 @ levels**2)
+    return np.sqrt((np.eye(6) + _shares(values)) ** 2 @ levels**2)
 
 
 def score_slopes(in_noise: np.ndarray, driven: np.ndarray) -> dict[str, np.ndarray]:
@@ -192,7 +182,7 @@ def score_slopes(in_noise: np.ndarray, driven: np.ndarray) -> dict[str, np.ndarr
         in_noise: (blocks, e) in the intensity of each entry of the process noise.
         driven: (6,) intensity of what drives each gust.
     """
-    joint = in_noise[:, helicopter_noise.JOINT]
+    joint = in_noise[:, JOINT]
     std = np.sqrt(driven)
     return {
         name: np.sum(

@@ -7,7 +7,7 @@ noise that was assumed.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,6 +84,11 @@ def correlation(one: np.ndarray, other: np.ndarray) -> float:
     """Of two series (n,) about 0, as innovations are; 0 where one is 0 throughout."""
     power = float(one @ one) * float(other @ other)
     return float(one @ other) / math.sqrt(power) if power > 0.0 else 0.0
+
+
+def colour(judged: Collection[Whiteness]) -> float:
+    """Share of the innovations that their own past predicts, in the mean of some channels."""
+    return float(np.mean([of.coloured_share for of in judged]))
 
 
 def is_white(passes: Sequence[RunPass], channels: Sequence[str]) -> bool:

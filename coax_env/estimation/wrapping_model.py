@@ -141,10 +141,10 @@ class WrappingModel(HeliModel):
 
 
 def with_innermost(model: HeliModel, kind: type[HeliModel]) -> HeliModel:
-    """The same wraps around the helicopter with another motion.
+    """The same wraps around the helicopter with another motion, or with one wrap more around it.
 
     Args:
-        model: with wraps or without. kind: of the helicopter's motion.
+        model: with wraps or without. kind: of the helicopter's motion, or of the innermost wrap.
     """
     if isinstance(model, WrappingModel):
         return model.around(with_innermost(model.inner, kind))
