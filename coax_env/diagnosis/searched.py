@@ -45,6 +45,7 @@ from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
 from coax_env.diagnosis.problem import ROTOR_SPEEDS, Fit, Problem
+from coax_env.diagnosis.run_air import with_own_air
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.sensor_errors import with_lasting_errors
@@ -112,7 +113,7 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     first = _searched(problem, noise)
     if _is_coloured(first, ROTOR_SPEEDS):
         first, noise = _jittery(first, noise)
-    first = _with_clock_errors(first, noise)
+    first = _with_clock_errors(_with_own_air(first, noise), noise)
     problem = first.problem
     smoothed = _before_low_passes(first, noise)
     best, begun = _with_errors(smoothed or first, noise, clock)
@@ -225,6 +226,7 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
         clock: of all runs in the order in which they were flown.
         erring: whether readings have errors that last; readings are not believed less then.
     """
+    best = _with_own_air(best, noise)
     shaken = in_shocks(best.problem, best.fit)
     if shaken:
         swung = _in_swings(best, noise)
@@ -255,6 +257,20 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
             break
         best = other
     return best
+
+
+def _with_own_air(found: Searched, noise: Noise) -> Searched:
+    """The search in air of each run's own, where runs have such; what was found, where not.
+
+    Args:
+        found: in the same air on all runs. noise: levels that it started from.
+    """
+    own = with_own_air(found.problem, found.fit)
+    if own is None or _is_much_coloured(*own):
+        return found
+    problem, _ = own
+    problem.report("searching again in air of each run's own")
+    return _searched(problem, noise)
 
 
 def _in_swings(found: Searched, noise: Noise) -> Searched | None:
@@ -398,13 +414,13 @@ def _may_hide_jitter(found: Searched) -> bool:
     """
     problem = found.problem
     unseen = problem.sees_poses_alone and problem.aboard.isdisjoint(ROTOR_SPEEDS)
-    return unseen and bool(found.fit.active) and not _is_much_coloured(found)
+    return unseen and bool(found.fit.active) and not _is_much_coloured(problem, found.fit)
 
 
-def _is_much_coloured(found: Searched) -> bool:
+def _is_much_coloured(problem: Problem, fit: Fit) -> bool:
     """Whether more than MUCH of the innovations is foretold by their own past."""
-    passes = found.problem.engine.filter(found.fit.values, found.fit.noise)
-    return colour(whiteness(passes, found.problem.model.channels).values()) > MUCH
+    passes = problem.engine.filter(fit.values, fit.noise)
+    return colour(whiteness(passes, problem.model.channels).values()) > MUCH
 
 
 def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
@@ -441,14 +457,16 @@ def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:
     Args:
         found: with such gusts already, or without. noise: levels that it started from.
     """
-    joint = None if _is_much_coloured(found) else in_joint_gusts(found.problem, found.fit)
+    if _is_much_coloured(found.problem, found.fit):
+        return found
+    joint = in_joint_gusts(found.problem, found.fit)
     if joint is None:
         return found
     problem, fit = joint
     problem.report("searching again with gusts that push and turn at once")
     other = _likelier(_searched(problem, noise, found.coarse), fit)
     ours, theirs = (cost(f.problem, f.fit, f.quadratic) for f in (other, found))
-    if not ours < theirs or _is_much_coloured(other):
+    if not ours < theirs or _is_much_coloured(other.problem, other.fit):
         return found
     return replace(other, low_passes=found.low_passes)
 

@@ -14,6 +14,7 @@ from scipy.stats import kurtosis
 
 from coax_env.diagnosis.fits import fitted, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.run_air import has_own_air, like_fitted
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.gust_strength import with_strengths
 from coax_env.estimation.helicopter import Moment
@@ -63,10 +64,14 @@ def only_shock(problem: Problem, fit: Fit) -> Moment | None:
 
 
 def _increments(problem: Problem, fit: Fit) -> list[np.ndarray]:
-    """Of each run, (rows, axes) how far the gusts have moved since SECONDS before."""
+    """Of each run, (rows, axes) how far the gusts have moved since SECONDS before.
+
+    In air of each run's own over what is usual on the run, or the roughest ones would be shocks.
+    """
     moving, apart = _moving(fit), _apart(problem)
     passes = problem.engine.filter(fit.values, fit.noise)
-    return [np.diff(run.states[::apart, moving], axis=0) for run in passes]
+    moved = [np.diff(run.states[::apart, moving], axis=0) for run in passes]
+    return [own / np.std(own, axis=0) for own in moved] if has_own_air(problem) else moved
 
 
 def _apart(problem: Problem) -> int:
@@ -91,12 +96,12 @@ def with_shocks(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
 
 
 def engine_of(problem: Problem, records: Sequence[Record], fit: Fit) -> Engine:
-    """An engine over other records, the strengths of their gusts fitted where the problem has some.
+    """An engine over other records, their air and strengths fitted where those of the problem are.
 
     Args:
         problem: whose model it has. records: that were not fitted. fit: of the model that flies them.
     """
-    engine = Engine(problem.model, records)
+    engine = like_fitted(problem, Engine(problem.model, records), fit)
     if not _has_strengths(problem):
         return engine
     shaken = with_strengths(engine, fit.values, fit.noise, _moving(fit))

@@ -14,14 +14,15 @@ from coax_env.estimation import frozen_gains, noise_score
 from coax_env.estimation.beginnings import Asked, Beginning
 from coax_env.estimation.freed_memory import return_freed_memory
 from coax_env.estimation.linearised_runs import (
-    BLOCK,
     BLOCKS_AT_ONCE,
     LinearisedRun,
+    ParameterMoves,
     beginnings_of_run,
+    blocks_of,
     linearise_run,
     moves_of,
 )
-from coax_env.estimation.noise_score import Slopes
+from coax_env.estimation.noise_score import Slopes, in_common
 from coax_env.estimation.quadratic import Linearised, Quadratic, penalty
 from coax_env.estimation.run_passes import GATE, Buffers, RunPass, RunPasses, trace_of
 from coax_env.estimation.sparse import padded
@@ -138,7 +139,7 @@ class Engine(RunPasses):
         def one(i: int) -> RunPass:
             starts = None if start_rows is None else start_rows[i]
             buffers = Buffers() if keep else None
-            return self.filter_run(i, p, noise, buffers, start_rows=starts)[0]
+            return self.filter_run(i, *self.of_run(i, values, noise, p), buffers, start_rows=starts)[0]
 
         return self.each(one, which)
 
@@ -167,6 +168,30 @@ class Engine(RunPasses):
                 return known.score.log_likelihood
         return float(sum(p.log_likelihood for p in self.filter(values, noise, which=which)))
 
+    def of_run(
+        self, i: int, values: Mapping[str, float], noise: Noise, p: np.ndarray
+    ) -> tuple[np.ndarray, Noise]:
+        """Parameter vector and noise of a run, in the air that it has of its own.
+
+        Args:
+            i: index of the run. values: of the parameters, by name. noise: of all runs.
+            p: vector of these.
+        """
+        own = noise.on(self.records[i])
+        return (p, noise) if own is noise else (self.model.vector(values, own), own)
+
+    def _moves(
+        self,
+        i: int,
+        values: Mapping[str, float],
+        noise: Noise,
+        free: Sequence[FreeParameter],
+        moves: ParameterMoves,
+    ) -> ParameterMoves:
+        """`moves_of` what is differentiated in, in the air of a run; `moves`: of all runs."""
+        own = noise.on(self.records[i])
+        return moves if own is noise else moves_of(self.model, values, own, free)
+
     def linearise(
         self,
         values: Mapping[str, float],
@@ -194,8 +219,10 @@ class Engine(RunPasses):
             return_freed_memory()
 
         def one(i: int) -> LinearisedRun:
+            own = self._moves(i, values, noise, free, moves)
             with self.borrowed_buffers() as buffers:
-                return linearise_run(self, i, p, noise, moves, buffers, BLOCKS_AT_ONCE)
+                there = self.of_run(i, values, noise, p)
+                return linearise_run(self, i, *there, own, buffers, BLOCKS_AT_ONCE)
 
         return self._gathered(p, noise, free, self.each(one))
 
@@ -249,8 +276,10 @@ class Engine(RunPasses):
             s = np.zeros((rows[i].size, nx, padded(len(free) + 1)), np.float32)
             kept = frozen_gains.Kept(s, np.full(n, -1, np.int64))
             kept.places[rows[i]] = np.arange(rows[i].size)
+            own = self._moves(i, values, noise, free, moves)
             with self.borrowed_buffers() as buffers:
-                found = linearise_run(self, i, p, noise, moves, buffers, n, kept)
+                there = self.of_run(i, values, noise, p)
+                found = linearise_run(self, i, *there, own, buffers, n, kept)
                 begun = beginnings_of_run(self, i, found, rows[i], kept, asked)
             return replace(found, J=found.J[:0].copy()), begun
 
@@ -310,7 +339,8 @@ class Engine(RunPasses):
         def one(i: int) -> float:
             run = passes[i]
             e = np.zeros(run.record.z.shape)
-            return 0.5 * float(np.sum(e**2)) if self.frozen(i, run, p, e) else np.inf
+            own, _ = self.of_run(i, values, noise, p)
+            return 0.5 * float(np.sum(e**2)) if self.frozen(i, run, own, e) else np.inf
 
         return sum(self.each(one)) + penalty(free, values)
 
@@ -381,8 +411,8 @@ class Engine(RunPasses):
         for known in tuple(self._scored):
             if known.is_at(p, noise):
                 return known.score
-        blocks = [((r.t - r.t[0]) / BLOCK).astype(np.int64) for r in self.records]
-        log_likelihood, slopes = self._slopes(p, noise, blocks)
+        blocks = [blocks_of(r.t) for r in self.records]
+        log_likelihood, slopes = self._slopes(values, noise, blocks)
         score = NoiseScore(
             float(sum(log_likelihood)),
             np.concatenate([s.in_noise for s in slopes]),
@@ -410,15 +440,19 @@ class Engine(RunPasses):
         """
         p = self.model.vector(values, noise)
         q, _ = self.model.process_noise(noise, p)
-        log_likelihood, slopes = self._slopes(p, noise, [r.strength.block for r in self.records])
+        log_likelihood, slopes = self._slopes(values, noise, [r.strength.block for r in self.records])
         expected = [q * s.noise_expected for s in slopes]
         shown = [q * (s.in_noise + s.noise_expected) for s in slopes]
         return float(sum(log_likelihood)), shown, expected
 
     def _slopes(
-        self, p: np.ndarray, noise: Noise, blocks: Sequence[np.ndarray]
+        self, values: Mapping[str, float], noise: Noise, blocks: Sequence[np.ndarray]
     ) -> tuple[list[float], list[Slopes]]:
-        """Each record's log-likelihood and its slopes, by blocks (n,) of its rows."""
+        """Each record's log-likelihood and its slopes, by blocks (n,) of its rows.
+
+        Slopes are in the noise of all runs; that of a run in air of its own is a multiple of it.
+        """
+        p = self.model.vector(values, noise)
         q, decay = self.model.process_noise(noise, p)
         nx, m = self.starts[0][0].size, len(self.model.channels)
         decaying = np.flatnonzero(decay[:nx] > 0.0)
@@ -429,14 +463,19 @@ class Engine(RunPasses):
                 np.zeros(shape), np.zeros(shape), np.zeros(nx), np.zeros((shape[0], m)),
                 np.zeros(shape), np.zeros(nx), np.zeros(m),
             )  # fmt: skip
+            p_own, own = self.of_run(i, values, noise, p)
+            drives, fades = (q, decay) if own is noise else self.model.process_noise(own, p_own)
             with self.borrowed_buffers() as buffers:
-                run, path = self.filter_run(i, p, noise, buffers, buffers, decaying=decaying)
+                run, path = self.filter_run(i, p_own, own, buffers, buffers, decaying=decaying)
                 if np.isfinite(run.log_likelihood):
                     noise_score.score_pass(
                         self.intervals[i], self.records[i].strength, trace_of(run, path),
-                        self.compiled.noise_places, q, decay, GATE, self.refresh[i], blocks[i],
+                        self.compiled.noise_places, drives, fades, GATE, self.refresh[i], blocks[i],
                         slopes,
                     )  # fmt: skip
+            if own is not noise:
+                begun, begins = self.model.start_noise(noise), self.model.start_noise(own)
+                slopes = in_common(slopes, _over(drives, q), _over(fades, decay), _over(begins, begun))
             return run.log_likelihood, slopes
 
         log_likelihood, slopes = zip(*self.each(one), strict=True)
@@ -449,6 +488,11 @@ def _without_gains(passes: Sequence[RunPass]) -> list[RunPass]:
         replace(run, **{name: np.empty_like(getattr(run, name)[:0]) for name in OF_GAINS})
         for run in passes
     ]
+
+
+def _over(own: np.ndarray, common: np.ndarray) -> np.ndarray:
+    """How many times a run's own each number of all runs is; 1 where that is none."""
+    return np.divide(own, common, out=np.ones_like(own), where=common != 0.0)
 
 
 def _half_squares(passes: Sequence[RunPass]) -> float:

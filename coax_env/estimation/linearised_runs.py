@@ -260,6 +260,15 @@ def beginnings_of_run(
     ]
 
 
+def blocks_of(t: np.ndarray) -> np.ndarray:
+    """The block of BLOCK seconds that each row of a run is in (n,).
+
+    Args:
+        t: (n,) of its rows [s].
+    """
+    return ((t - t[0]) / BLOCK).astype(np.int64)
+
+
 def _block_edges(run: RunPass) -> tuple[np.ndarray, np.ndarray]:
     """First rows of blocks of BLOCK seconds, and the end (blocks + 1,); readings before each row."""
     t = run.record.t

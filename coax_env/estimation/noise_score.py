@@ -91,6 +91,24 @@ class Slopes(NamedTuple):
 SLOPES = types.NamedTuple([MATRIX, MATRIX, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR], Slopes)
 
 
+def in_common(
+    slopes: Slopes, drives: np.ndarray, fades: np.ndarray, begins: np.ndarray
+) -> Slopes:
+    """Slopes in the noise of all runs, of which that of this run is a multiple.
+
+    Args:
+        slopes: in that of the run. drives, fades: (e,) times that it has the intensity and the decay of
+            each entry. begins: (nx,) each variance of the first state.
+    """
+    return slopes._replace(
+        in_noise=slopes.in_noise * drives,
+        in_decay=slopes.in_decay * fades,
+        in_start=slopes.in_start * begins,
+        noise_expected=slopes.noise_expected * drives,
+        start_expected=slopes.start_expected * begins,
+    )
+
+
 class _Backward(NamedTuple):
     """The arrays that a pass works in, of the states that any reading shows, in their order."""
 

@@ -100,9 +100,10 @@ def replay_runs(
     passes = engine.filter(values, noise, start_rows=starts)
     p = engine.model.vector(values, noise)
     parts: dict[str, list[RunReplay]] = {}
-    for run, dt in zip(passes, engine.intervals, strict=True):
+    for i, (run, dt) in enumerate(zip(passes, engine.intervals, strict=True)):
+        own, _ = engine.of_run(i, values, noise, p)
         parts.setdefault(run.record.whole, []).append(
-            _replay_run(engine, run, dt, p, horizon, floor)
+            _replay_run(engine, run, dt, own, horizon, floor)
         )
     return [_joined(name, of_run) for name, of_run in parts.items()]
 

@@ -60,6 +60,7 @@ class Record:
     input_innovations: (n, k) what each command shows beyond the readings before it, or None
     (input_innovations.py). battery: (n,) its voltage [V], or None. strength: of its process noise.
     blur: (n, m) variance of each reading beyond its level's (clock_errors.py), or None.
+    air: level of the process noise -> times which it is on this run (run_air.py).
     """
 
     name: str
@@ -72,6 +73,7 @@ class Record:
     battery: np.ndarray | None = None
     strength: Strength = STEADY
     blur: np.ndarray | None = None
+    air: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def whole(self) -> str:
@@ -124,6 +126,12 @@ class Noise:
         return replace(
             self, process=process, reading={n: levels.get(n, v) for n, v in self.reading.items()}
         )
+
+    def on(self, record: Record) -> "Noise":
+        """That of a run, in the air that it has of its own."""
+        if not record.air:
+            return self
+        return self.with_levels({n: f * self.process[n] for n, f in record.air.items()})
 
     def at_bound(self, name: str) -> bool:
         """Whether a level stands at the least or most that it can be, within a hundredth."""
