@@ -19,6 +19,12 @@ from coax_env.estimation.state_space import Noise, Record
 from coax_env.model.layout import GYROS
 
 
+@pytest.fixture(autouse=True)
+def _one_air(monkeypatch):
+    """On all runs, but where a test says otherwise."""
+    monkeypatch.setattr(searched, "with_own_air", lambda problem, fit: None)
+
+
 def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
     """Twice as fine and more; those that are coarser already are left alone."""
     reading = {"phi": 0.0029, "theta": 0.0031, "h": 0.0024, "q": 0.5}
@@ -90,7 +96,7 @@ def believes_its_sensors(monkeypatch) -> None:
     monkeypatch.setattr(searched, "with_clock_errors", lambda problem, fit: None)
     monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: None)
     monkeypatch.setattr(searched, "_may_hide_jitter", lambda found: False)
-    monkeypatch.setattr(searched, "_is_much_coloured", lambda found: False)
+    monkeypatch.setattr(searched, "_is_much_coloured", lambda problem, fit: False)
     monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
 
 
@@ -340,10 +346,27 @@ def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
 def test_jitter_is_asked_by_poses_alone_where_something_is_named(
     monkeypatch, alone, aboard, active, coloured, may
 ):
-    monkeypatch.setattr(searched, "_is_much_coloured", lambda found: coloured)
+    monkeypatch.setattr(searched, "_is_much_coloured", lambda problem, fit: coloured)
     problem = SimpleNamespace(sees_poses_alone=alone, aboard=frozenset(aboard))
     found = SimpleNamespace(problem=problem, fit=Fit(active, {}, FINE))
     assert searched._may_hide_jitter(found) == may  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("coloured", [True, False])
+def test_air_of_each_runs_own_stands_where_little_is_coloured_in_it(monkeypatch, coloured):
+    """What is coloured without it says nothing: such air colours innovations itself."""
+    own = SimpleNamespace(name="own", report=lambda text: None)
+    there = Fit(("motor_lag",), {}, FINE)
+    monkeypatch.setattr(searched, "with_own_air", lambda problem, fit: (own, there))
+    monkeypatch.setattr(
+        searched,
+        "_is_much_coloured",
+        lambda problem, fit: coloured or (problem, fit) != (own, there),
+    )
+    monkeypatch.setattr(searched, "_searched", lambda problem, noise: (problem.name, noise))
+    found = SimpleNamespace(problem=SimpleNamespace(), fit=Fit((), {}, FINE))
+    again = searched._with_own_air(found, FINE)  # type: ignore[arg-type]
+    assert again is found if coloured else again == ("own", FINE)
 
 
 def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypatch):

@@ -18,7 +18,7 @@ from coax_env.model.layout import GUSTS, N_FULL
 DT = 0.01
 
 
-def flown(increments: np.ndarray, level: float = 0.2) -> tuple[Any, Any]:
+def flown(increments: np.ndarray, level: float = 0.2, own_air: bool = False) -> tuple[Any, Any]:
     """Of two runs, the first of 100 s, whose gusts move so from tenth to tenth of a second."""
     cut = [increments[:1000], increments[1000:]]
     states = [np.zeros((10 * (len(own) + 1), N_FULL)) for own in cut]
@@ -26,7 +26,9 @@ def flown(increments: np.ndarray, level: float = 0.2) -> tuple[Any, Any]:
         walk = np.concatenate([np.zeros((1, own.shape[1])), np.cumsum(own, axis=0)])
         there[:, GUSTS] = np.repeat(walk, 10, axis=0)
     records = [
-        SimpleNamespace(t=5.0 + DT * np.arange(len(there)), whole=name)
+        SimpleNamespace(
+            t=5.0 + DT * np.arange(len(there)), whole=name, air={"force_xy": 1.0} if own_air else {}
+        )
         for there, name in zip(states, "ab", strict=True)
     ]
     passes = [SimpleNamespace(states=there) for there in states]
@@ -53,6 +55,18 @@ def test_one_axis_in_shocks_is_enough() -> None:
     increments = draw("normal")
     increments[::500, 4] *= 20.0
     assert fitted(increments) > 10.0 * SETTINGS.shocks
+
+
+def test_a_rough_run_is_no_shock_where_each_has_air_of_its_own() -> None:
+    """The first of two runs, a twentieth of all, is shaken five times as much: a mixture."""
+    increments = draw("normal")
+    increments[:1000] *= 5.0
+    share, rough = 0.05, 25.0
+    mixed = 3.0 * (1.0 + share * (rough**2 - 1.0)) / (1.0 + share * (rough - 1.0)) ** 2 - 3.0
+    assert fitted(increments) == pytest.approx(mixed, rel=0.1)
+    assert gust_kurtosis(*flown(increments, own_air=True)) == pytest.approx(0.0, abs=0.2)
+    increments[7_000, 2] = 60.0
+    assert gust_kurtosis(*flown(increments, own_air=True)) > 10.0 * SETTINGS.shocks
 
 
 def test_the_only_shock_is_where_the_jump_was() -> None:

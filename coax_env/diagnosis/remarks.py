@@ -7,6 +7,7 @@ import numpy as np
 
 from coax_env.diagnosis.confounding import Alternatives
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.run_air import has_own_air
 from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter_noise import (
@@ -18,6 +19,7 @@ from coax_env.estimation.helicopter_noise import (
 from coax_env.estimation.joint_gusts import SHARES, is_arm
 from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.run_air import strength_and_memory
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.model.effects import CATALOGUE
 from coax_env.model.layout import AXES_OF_GUSTS, ERRING_GROUPS
@@ -37,6 +39,7 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
         *_unlike_gusts(problem),
         *_smoothed(problem),
         *_clock_errors(problem),
+        *_own_air(problem),
         *_swings(problem),
         *_joint_gusts(fit),
         *_lasting_errors(fit),
@@ -133,6 +136,18 @@ def _clock_errors(problem: Problem) -> list[str]:
     return [
         f"the times of the log's rows are wrong by {1e3 * problem.clock_error:.2g} ms (std), or poses"
         " were smoothed as though they were even: readings that move fast are believed less"
+    ]
+
+
+def _own_air(problem: Problem) -> list[str]:
+    """How far the runs' gusts are apart, where each has air of its own."""
+    if not has_own_air(problem):
+        return []
+    of_runs = np.array([strength_and_memory(record.air) for record in problem.engine.records])
+    (least, shortest), (most, longest) = of_runs.min(axis=0), of_runs.max(axis=0)
+    return [
+        f"each run has air of its own: gusts {least:.2g} to {most:.2g} times as strong as common ones,"
+        f" and {shortest:.2g} to {longest:.2g} times as long"
     ]
 
 

@@ -31,6 +31,7 @@ helicopter_noise.py  its noise levels, with units, bounds and where they start
 rotor_jitter.py      rotor speeds that jitter, with a memory
 swinging_gusts.py    gusts with a frequency
 low_pass.py          readings as they were before a sensor's low-pass
+run_air.py           gusts of another strength and memory from run to run
 gust_strength.py     gusts in single shocks: a strength for each block of time
 changing_model.py    effects that begin, end or grow at a moment
 flown.py             what of a flight was flown
