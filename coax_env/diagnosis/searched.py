@@ -45,6 +45,7 @@ from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
 from coax_env.diagnosis.problem import ROTOR_SPEEDS, Fit, Problem
+from coax_env.diagnosis.rotor_jitter import in_jitter
 from coax_env.diagnosis.run_air import with_own_air
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
@@ -55,13 +56,11 @@ from coax_env.diagnosis.swings import with_swings
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.low_pass import LowPass, before_low_pass, records_before
-from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.rotor_jitter import REACTION, JitteryModel, with_jitter
+from coax_env.estimation.rotor_jitter import with_jitter
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import colour, is_white, whiteness
-from coax_env.estimation.wrapping_model import with_innermost
 from coax_env.model.layout import INERTIAL
 
 COARSENESS = (1.0, 3.0)
@@ -424,31 +423,22 @@ def _is_much_coloured(problem: Problem, fit: Fit) -> bool:
 
 
 def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
-    """The search with rotors that jitter, where that gains more than a tie, and levels it started from.
+    """The search with rotors that jitter, where that ends likelier, and levels it started from.
 
     Args:
         found: with such rotors already, or without. noise: levels that it started from.
     """
-    problem, fit, chosen = found.problem, found.fit, found.problem.settings
-    if JITTER_LEVEL in fit.noise.process:
+    jittery = in_jitter(found.problem, found.fit, found.quadratic)
+    if jittery is None:
         return found, noise
-    wider = problem.with_model(with_innermost(problem.model, JitteryModel)).with_free([REACTION])
-    start = with_jitter(fit.noise, wider.model)
-    levels = (*fit.levels, JITTER_LEVEL, JITTER_MEMORY)
-    trial = replace(fit.at({REACTION.name: REACTION.value}), levels=levels)
-    jittery = fit_noise(
-        wider.engine, trial.values, start, levels,
-        chosen.first_noise_evaluations, chosen.step_gain, problem.noise_fit_seconds,
-    )  # fmt: skip
-    gained = wider.engine.log_likelihood(trial.values, jittery)
-    gained -= problem.engine.log_likelihood(fit.values, fit.noise)
-    problem.report(f"rotor speeds that jitter: {gained:.1f} nats")
-    if gained < chosen.tie:
-        return found, noise
-    problem.report("searching again with rotor speeds that jitter")
-    of_jitter = {name: jittery.level(name) for name in (JITTER_LEVEL, JITTER_MEMORY)}
-    noise = with_jitter(noise, wider.model).with_levels(of_jitter)
-    return _searched(wider, noise), noise
+    wider, fit = jittery
+    wider.report("searching again with rotor speeds that jitter")
+    of_jitter = {name: fit.noise.level(name) for name in (JITTER_LEVEL, JITTER_MEMORY)}
+    begun = with_jitter(noise, wider.model).with_levels(of_jitter)
+    other = _searched(wider, begun)
+    ours, theirs = (cost(f.problem, f.fit, f.quadratic) for f in (other, found))
+    wider.report(f"rotor speeds that jitter after the search: {theirs - ours:.1f} nats")
+    return (other, begun) if ours < theirs else (found, noise)
 
 
 def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:

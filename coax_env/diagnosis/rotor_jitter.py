@@ -1,0 +1,63 @@
+"""Whether rotor speeds jitter, asked after a search (estimation/rotor_jitter.py).
+
+Beside what was found, and in the place of what jitter looks like: a yaw rate that is shaken and comes
+back is a damped one under white noise, and once both are fitted jitter gains nothing beside them.
+"""
+
+from dataclasses import replace
+
+from coax_env.diagnosis.fits import at_optimum, fitted, noise_fitted
+from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem
+from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.rotor_jitter import REACTION, JitteryModel, with_jitter
+from coax_env.estimation.wrapping_model import with_innermost
+
+STANDING_IN = "white_moment_z"
+"""The level that stands for a jitter's reaction where there is none."""
+LEFT_BESIDE, LEFT_INSTEAD = 0.3, 0.0
+"""Share of that from which jitter is fitted, or it would stay what it has become; ours. On four
+**synthetic** flights whose rotors jitter beside names 2, 26, 79 and 9,400 nats from there for 2, 10, 77
+and 9,100 from all of it, and 22 for -18 in the place of names."""
+TURNS = 2
+"""Of levels and numbers; ours."""
+
+
+def in_jitter(problem: Problem, fit: Fit, quadratic: Quadratic) -> tuple[Problem, Fit] | None:
+    """The problem whose rotors jitter and the fit to it, where that is worth more than a tie.
+
+    Args:
+        problem, fit: after a search. quadratic: linearised there.
+    """
+    if JITTER_LEVEL in fit.noise.process:
+        return None
+    wider = problem.with_model(with_innermost(problem.model, JitteryModel)).with_free([REACTION])
+    trial = _fitted(wider, fit, LEFT_BESIDE)
+    alike = [effect for effect in fit.active if effect in WEAK_OR_LATE]
+    if alike and fit.objective - trial.objective < problem.settings.tie:
+        fixed = {
+            name: value
+            for effect in alike
+            for name, value in (problem.off_values(effect) | problem.file_values(effect)).items()
+        }
+        rest = [effect for effect in fit.active if effect not in alike]
+        without = at_optimum(problem, fit, quadratic, rest, fixed)
+        trial = _fitted(wider, without, LEFT_INSTEAD)
+    gained = fit.objective - trial.objective
+    problem.report(f"rotor speeds that jitter: {gained:.1f} nats")
+    return (wider, trial) if gained > problem.settings.tie else None
+
+
+def _fitted(wider: Problem, fit: Fit, left: float) -> Fit:
+    """With jitter, from a share of the white noise that stood for it."""
+    noise = with_jitter(fit.noise, wider.model)
+    least = max(left * noise.level(STANDING_IN), noise.floor[STANDING_IN])
+    levels = (*fit.levels, JITTER_LEVEL, JITTER_MEMORY)
+    trial = replace(
+        fit.at({REACTION.name: REACTION.value}),
+        noise=noise.with_levels({STANDING_IN: least}),
+        levels=levels,
+    )
+    for _ in range(TURNS):
+        trial = fitted(wider, noise_fitted(wider, trial))
+    return trial
