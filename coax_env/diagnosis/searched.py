@@ -231,6 +231,9 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
         swung = _in_swings(best, noise)
         if swung is not None and not in_shocks(swung.problem, swung.fit):
             return swung
+        best, noise = _with_jitter(best, noise)
+        shaken = in_shocks(best.problem, best.fit)
+    if shaken:
         best = _changed(best, clock) or _searched_in_shocks(best, noise)
     asked = None
     while best is not asked:
@@ -238,8 +241,7 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
         swung = None if shaken else _in_swings(best, noise)
         if swung is not None:
             return swung
-        if _is_coloured(best, SHOWN_BY) or _may_hide_jitter(best):
-            best, noise = _jittery(best, noise)
+        best, noise = _with_jitter(best, noise)
     best = _with_joint_gusts(best, noise)
     if erring:
         return best
@@ -256,6 +258,12 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
             break
         best = other
     return best
+
+
+def _with_jitter(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
+    """As `_jittery`, where what is coloured or named asks for it."""
+    asks = _is_coloured(found, SHOWN_BY) or _may_hide_jitter(found)
+    return _jittery(found, noise) if asks else (found, noise)
 
 
 def _with_own_air(found: Searched, noise: Noise) -> Searched:

@@ -27,10 +27,9 @@ from coax_env.diagnosis.onsets.changing import Changing, Onset, beginning, may_b
 from coax_env.diagnosis.onsets.every_moment import Scored, scored
 from coax_env.diagnosis.onsets.growth import changing_model
 from coax_env.diagnosis.onsets.trial import fitted_change
-from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
+from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
-from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.shocks import ABOUT
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter import Moment
@@ -98,7 +97,7 @@ def _next(
     chosen = state.problem.settings
     best = None
     steady, found = scored(replace(state, fit=without_drifts(state.fit)))
-    near = [s for s in _standing(found, chosen) if about is None or _is_about(s.moment, about)]
+    near = [s for s in _standing(state.problem, found) if about is None or _is_about(s.moment, about)]
     near = _beyond_drifts(state, steady, near)
     if near and near[0].nats < chosen.clear_evidence * chosen.evidence:
         near = _beside_commands(steady, near)
@@ -118,10 +117,23 @@ def _is_about(moment: Moment, other: Moment) -> bool:
     return moment.run == other.run and abs(moment.t - other.t) <= ABOUT
 
 
-def _standing(found: Sequence[Scored], chosen: Settings) -> list[Scored]:
+def _standing(problem: Problem, found: Sequence[Scored]) -> list[Scored]:
     """Those that are worth a fit: beside no change, and beside a cause that was always there."""
-    least, tie = chosen.trial_share * chosen.evidence, chosen.trial_share * chosen.tie
-    return [s for s in found if s.nats > least and s.beside > tie]
+    share, tie = problem.settings.trial_share, problem.settings.tie
+    return [
+        s for s in found if s.nats > share * _evidence(problem, s.effect) and s.beside > share * tie
+    ]
+
+
+def _evidence(problem: Problem, effect: str) -> float:
+    """nats that a change must be worth to be named.
+
+    By poses alone more of what looks like a weak or late answer, a constant delay too: from some moment
+    on it has but a part of the flight to stand on.
+    """
+    chosen = problem.settings
+    unseen = problem.sees_poses_alone and effect in WEAK_OR_LATE
+    return chosen.evidence * (chosen.unseen_inflation if unseen else 1.0)
 
 
 def _beyond_drifts(state: Changing, steady: Changing, near: Sequence[Scored]) -> list[Scored]:
@@ -157,13 +169,14 @@ def _asking(state: Changing, near: Sequence[Scored]) -> Problem:
 def _still_standing(state: Changing) -> tuple[Changing, set[str]]:
     """The state scored, and the effects whose change is worth a fit in it."""
     state, found = scored(state)
-    return state, {s.effect for s in _standing(found, state.problem.settings)}
+    return state, {s.effect for s in _standing(state.problem, found)}
 
 
 def _least(state: Changing, effect: str) -> float:
     """nats that a change is worth at least: as a name, or beside one that stands already, a tie."""
-    chosen = state.problem.settings
-    return chosen.tie if effect in state.fit.active else chosen.evidence
+    if effect in state.fit.active:
+        return state.problem.settings.tie
+    return _evidence(state.problem, effect)
 
 
 def _searched_again(trial: Changing, bare: Fit, onsets: Mapping[str, Onset]) -> Changing:
