@@ -931,7 +931,8 @@ def weighed(form: str, inflation: float):
     names = ["gyro_bias.x", *([] if form == "begins" else [of_part("gyro_bias.x", BEFORE)])]
     problem = SimpleNamespace(
         engine=engine, model=SimpleNamespace(channels=("p", "q")), settings=SETTINGS, seconds=100.0,
-        acting_names=lambda effect: names, free_names=lambda active: ["mass", *names],
+        sees_poses_alone=False, acting_names=lambda effect: names,
+        free_names=lambda active: ["mass", *names],
     )  # fmt: skip
     extra = names if form == "ends" else names[-1:]
 

@@ -6,14 +6,21 @@ helicopter's by a command and a yaw rate that are shifted, and its likelihood's 
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import injector
 import numpy as np
 import pytest
 from injector_air import GUSTY
+from study import arms
+from study.one_flight import hide
 
 from coax_env import diagnose, load_vehicle, simulate
+from coax_env.diagnosis import rotor_jitter as asking
+from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.searched import SHOWN_BY
+from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import (
@@ -188,6 +195,56 @@ def test_a_planted_level_and_memory_return(engine_and_noise):
     found = fit_noise(engine, engine.model.bare_values, noise, fitted_levels(noise), 20, 0.1)
     assert found.level(JITTER_LEVEL) == pytest.approx(0.6, rel=0.15)
     assert found.level(JITTER_MEMORY) == pytest.approx(0.06, rel=0.35)
+
+
+@pytest.mark.parametrize(
+    ("active", "beside", "instead", "tried", "used"),
+    [
+        (("wind", "yaw_damping"), 7.0, None, [("wind", "yaw_damping")], True),
+        (("wind", "yaw_damping"), 2.0, 7.0, [("wind", "yaw_damping"), ("wind",)], True),
+        (("wind", "yaw_damping"), 2.0, -9.0, [("wind", "yaw_damping"), ("wind",)], False),
+        (("wind",), 2.0, 7.0, [("wind",)], False),  # which looks like no jitter
+    ],
+)
+def test_jitter_is_asked_beside_names_and_in_the_place_of_those_like_it(
+    monkeypatch, active, beside, instead, tried, used
+):
+    """From little of the white noise that stands for it, then from none."""
+    given: Any = Fit(active, {"yaw_damping.coefficient": 1.0}, Noise({}), objective=500.0)
+    seen, lefts = [], []
+
+    def trial(wider: Any, fit: Fit, left: float) -> Fit:
+        seen.append(fit.active)
+        lefts.append(left)
+        return replace(fit, objective=500.0 - (beside if fit.active == active else instead))
+
+    def at_optimum(problem: Any, fit: Fit, quadratic: Any, rest: Any, fixed: Any) -> Fit:
+        assert fixed == {"yaw_damping.coefficient": 0.0, "inertia_zz": 2.0}
+        return replace(fit, active=tuple(rest))
+
+    problem: Any = SimpleNamespace(
+        model=PLAIN, settings=SETTINGS, report=lambda text: None, with_free=lambda free: problem,
+        off_values=lambda effect: {"yaw_damping.coefficient": 0.0},
+        file_values=lambda effect: {"inertia_zz": 2.0},
+    )  # fmt: skip
+    problem.with_model = lambda model: problem if isinstance(model, JitteryModel) else None
+    monkeypatch.setattr(asking, "_fitted", trial)
+    monkeypatch.setattr(asking, "at_optimum", at_optimum)
+    found = asking.in_jitter(problem, given, None)  # type: ignore[arg-type]
+    assert (found is not None) == used and seen == tried
+    assert lefts == [asking.LEFT_BESIDE, asking.LEFT_INSTEAD][: len(tried)]
+    there = replace(given, noise=Noise({JITTER_LEVEL: 0.1}))
+    assert asking.in_jitter(problem, there, None) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 11])
+def test_by_poses_alone_jitter_is_no_answer_in_yaw(tmp_path, number):
+    """Clean **synthetic** flights at 60 Hz: a yaw damping of 49 nats, a yaw inertia of 20 before."""
+    hide(arms.planned("mixed_poses", "clean", number, 607), tmp_path / "flight")
+    found = diagnose(tmp_path / "flight")
+    assert found.findings["causes"] == []
+    assert found.findings["noise"][JITTER_MEMORY]["value"] == pytest.approx(0.05, rel=0.4)
 
 
 @pytest.mark.slow

@@ -7,14 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coax_env import load_vehicle
 from coax_env.diagnosis import searched
 from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.searched import Searched
 from coax_env.diagnosis.sensor_low_pass import hidden_behind
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.estimation.helicopter import Moment
-from coax_env.estimation.helicopter_noise import LEAST_READING_STD
+from coax_env.estimation.helicopter import HeliModel, Moment
+from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.low_pass import LowPass
+from coax_env.estimation.rotor_jitter import with_jitter
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.model.layout import GYROS
 
@@ -350,6 +352,34 @@ def test_jitter_is_asked_by_poses_alone_where_something_is_named(
     problem = SimpleNamespace(sees_poses_alone=alone, aboard=frozenset(aboard))
     found = SimpleNamespace(problem=problem, fit=Fit(active, {}, FINE))
     assert searched._may_hide_jitter(found) == may  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("cost", "used"), [(90.0, True), (110.0, False)])
+def test_jitter_stands_where_the_search_in_it_ends_likelier(monkeypatch, cost, used):
+    """With the level and memory from which that search began."""
+    noise = with_jitter(FINE, HeliModel(load_vehicle("lama400d")))
+    there = Fit((), {}, noise.with_levels({JITTER_LEVEL: 0.4, JITTER_MEMORY: 0.07}))
+    wider = SimpleNamespace(report=lambda text: None, model=HeliModel(load_vehicle("lama400d")))
+    costs = {"found": 100.0, "wider": cost}
+    monkeypatch.setattr(searched, "in_jitter", lambda problem, fit, quadratic: (wider, there))
+    monkeypatch.setattr(
+        searched,
+        "cost",
+        lambda problem, fit, quadratic: costs["wider" if problem is wider else "found"],
+    )
+
+    def of(problem: Any, noise: Noise) -> Searched:
+        fit = Fit((), {}, noise)
+        return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(searched, "_searched", of)
+    found = of(SimpleNamespace(), FINE)
+    again, begun = searched._jittery(found, FINE)
+    assert (again.problem is wider) == used and (again is found) != used
+    if used:
+        assert (begun.level(JITTER_LEVEL), begun.level(JITTER_MEMORY)) == (0.4, 0.07)
+    else:
+        assert begun is FINE
 
 
 @pytest.mark.parametrize("coloured", [True, False])

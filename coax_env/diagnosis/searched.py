@@ -21,10 +21,14 @@ readings last (sensor_errors.py) it is done again with these in it; where inerti
 behind a low-pass, without it too, and that stands if it is likelier and has no name more: errors of
 every memory at once look like a low-pass. Low-passes are then fitted once more.
 
+Where runs have air of their own (run_air.py) it is done again in that: after the first search, since
+noise of one level makes many names, and once more here.
+
 Where gusts have a frequency it is done again with that in the filter (estimation/swinging_gusts.py), if
 nothing is coloured then: what a model lacks may swing, too. Swings look like single shocks to a model
 of gusts that fade, so they are asked first, and stand where no shocks are left. Jitter that the yaw
-rate alone shows is asked then, by poses alone where anything is named, and gusts once more beside it.
+rate alone shows is asked then, by poses alone where anything is named, before strengths of single
+shocks take it up, and gusts once more beside it.
 Last it is asked whether gusts push and turn at once (joint_gusts.py). Both are asked only where little
 of what is read is coloured, since what a model lacks looks like jitter and like such gusts, too: on a
 real helicopter they had an arm of 0.7 m.
