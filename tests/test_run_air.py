@@ -141,9 +141,16 @@ def test_the_levels_of_a_run_are_drawn_to_those_of_its_kind(monkeypatch):
     assert np.all(np.diff(scatter, axis=0) > 0.0) and np.max(scatter[0]) < 0.1
 
 
-@pytest.mark.parametrize(("gained", "used"), [(100.0, True), (17.0, False)])
-def test_it_must_be_worth_its_numbers_beside_the_threshold(monkeypatch, gained, used):
-    """Two runs with a level each, four times the common one: 14 nats, two more, and 1.9 for that."""
+@pytest.mark.parametrize(
+    ("factors", "gained", "used"),
+    [
+        ((4.0, 0.25), 100.0, True),
+        ((4.0, 0.25), 17.0, False),
+        ((1.2, 0.9), 100.0, False),  # too near to each other to be another air
+    ],
+)
+def test_it_must_be_worth_its_numbers_beside_the_threshold(monkeypatch, factors, gained, used):
+    """Two runs with a level each, four times the common one and a quarter: 14 + 2 + 1.9 nats."""
     rough, calm, _ = flown()
     noise = Noise({"force_xy": 1.0, **dict.fromkeys((*AXES[1:], *MEMORIES), 1e-9)},
                   floor=dict.fromkeys((*AXES[1:], *MEMORIES), 1e-9))  # fmt: skip
@@ -155,7 +162,8 @@ def test_it_must_be_worth_its_numbers_beside_the_threshold(monkeypatch, gained, 
 
     def found(engine, values, noise, levels):
         assert set(levels) == {"force_xy", "memory_force_xy"}, "axes without gusts have none"
-        return [replace(record, air={"force_xy": 4.0}) for record in engine.records]
+        both = zip(engine.records, factors, strict=True)
+        return [replace(record, air={"force_xy": factor}) for record, factor in both]
 
     monkeypatch.setattr(asking, "in_own_air", found)
     monkeypatch.setattr(asking, "gain_promised", lambda *of: 50.0)

@@ -4,16 +4,28 @@ What a model lacks shakes it more on some runs than on others, which looks like 
 this is asked beside what was found, and the search is done again from nothing, in such air.
 """
 
+from collections.abc import Sequence
+
+import numpy as np
 
 from coax_env.diagnosis.fits import fitted, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter_noise import GUST_LEVELS, MEMORIES
-from coax_env.estimation.run_air import gain_promised, in_own_air, unlikely
+from coax_env.estimation.run_air import (
+    gain_promised,
+    in_own_air,
+    strength_and_memory,
+    unlikely,
+)
 from coax_env.estimation.state_space import Record
 
 NATS_A_LEVEL = 1.0
 """That a level of a run's own must be worth: by chance it is worth half a nat; ours."""
+APART = (1.5, 3.0)
+"""Times that the roughest run must be as rough as the calmest, or the longest memory as long as the
+shortest: less changes little, and gusts that swing want it, too (100 nats for 1.3 and 1.9 times on a
+**synthetic** flight, whose spin-up reaction and frequencies were lost so); ours."""
 TURNS = 2
 """Of levels of the runs and of all, at most; ours."""
 
@@ -45,7 +57,12 @@ def with_own_air(problem: Problem, fit: Fit) -> tuple[Problem, Fit] | None:
     gained = fit.objective - trial.objective - unlikely(records)
     problem.report(f"air of each run's own: {gained:.1f} nats")
     asked = NATS_A_LEVEL * sum(len(record.air) for record in records)
-    return (problem, trial) if gained > chosen.evidence + asked else None
+    return (problem, trial) if _are_apart(records) and gained > chosen.evidence + asked else None
+
+
+def _are_apart(records: Sequence[Record]) -> bool:
+    of_runs = np.array([strength_and_memory(record.air) for record in records])
+    return bool(np.any(of_runs.max(axis=0) > APART * of_runs.min(axis=0)))
 
 
 def in_air(problem: Problem, fit: Fit) -> Problem:
