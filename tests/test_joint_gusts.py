@@ -28,7 +28,7 @@ from coax_env.estimation.joint_gusts import (
     score_slopes,
 )
 from coax_env.estimation.lasting_errors import ErringModel
-from coax_env.estimation.rotor_jitter import REACTION, JitteryModel
+from coax_env.estimation.rotor_jitter import JitteryModel
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.swinging_gusts import SwingingModel
 from coax_env.estimation.wrapping_model import with_innermost
@@ -145,7 +145,7 @@ def test_it_stands_around_the_helicopter_or_one_whose_rotors_jitter():
     assert isinstance(joint.inner.inner.inner, JitteryModel)
     other = with_innermost(JointModel(PLAIN), JitteryModel)
     assert isinstance(other, JointModel) and isinstance(other.inner, JitteryModel)
-    assert other.vector({REACTION.name: 0.7, LEVER: 0.1}).size == PLAIN.vector({}).size + 2 + 15
+    assert other.vector({LEVER: 0.1}).size == PLAIN.vector({}).size + 2 + 15
 
 
 def test_the_score_of_a_correlation_is_the_slope_in_its_covariance():

@@ -26,11 +26,12 @@ from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import (
     JITTER_LEVEL,
     JITTER_MEMORY,
+    JITTER_REACTION,
     fitted_levels,
     starting_noise,
 )
 from coax_env.estimation.noise_levels import fit_noise, level_slopes
-from coax_env.estimation.rotor_jitter import JITTER, N_JITTERY, REACTION, JitteryModel, with_jitter
+from coax_env.estimation.rotor_jitter import JITTER, N_JITTERY, JitteryModel, with_jitter
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.model import dynamics
 from coax_env.model import state as S
@@ -39,13 +40,13 @@ from coax_env.model.layout import CHANNELS, N_CHANNELS, N_FULL, RPM_PER_RAD_S
 LAMA = load_vehicle("lama400d").with_values({"rotor_inertia_lower": 6e-4})  # unlike the upper's
 PLAIN = HeliModel(LAMA)
 MODEL = JitteryModel.like(PLAIN)
-LEVELS = Noise({JITTER_LEVEL: 0.5, JITTER_MEMORY: 0.08})
+LEVELS = Noise({JITTER_LEVEL: 0.5, JITTER_MEMORY: 0.08, JITTER_REACTION: 1.0})
 HOVER, COMMAND = dynamics.hover_trim(LAMA)
 DT = 0.01
 
 
 def vector(reaction: float = 1.0) -> np.ndarray:
-    return MODEL.vector({REACTION.name: reaction}, LEVELS)
+    return MODEL.vector({}, LEVELS.with_levels({JITTER_REACTION: reaction}))
 
 
 def state(upper: float, lower: float) -> np.ndarray:
@@ -97,7 +98,7 @@ def test_jitter_is_speed_on_top_of_the_command_and_turns_the_body(reaction):
 
 def test_a_reaction_that_the_vehicle_has_is_not_counted_twice():
     """The effect `spin_up_reaction` gives the body all that a change of speed does: no more is left."""
-    p = MODEL.vector({"spin_up_reaction.gain": 1.0, REACTION.name: 1.0}, LEVELS)
+    p = MODEL.vector({"spin_up_reaction.gain": 1.0}, LEVELS)
     rate = CHANNELS.index("r")
     assert read(MODEL, state(1.5, -0.8), COMMAND, p)[rate] == pytest.approx(0.2)
 
@@ -138,10 +139,14 @@ def test_jitter_begins_at_a_thousandth_of_the_hover_speeds():
     bare = LAMA.with_values({"fuselage_drag_coefficient": 0.0})
     first = 1e-3 * dynamics.hover_trim(bare)[1][:2].mean()
     assert noise.process == pytest.approx(
-        {"force_xy": 1.0, JITTER_LEVEL: first, JITTER_MEMORY: 0.05}
+        {"force_xy": 1.0, JITTER_LEVEL: first, JITTER_MEMORY: 0.05, JITTER_REACTION: 1.0}
     )
-    assert noise.floor == pytest.approx({JITTER_LEVEL: 0.01 * first, JITTER_MEMORY: 0.015})
-    assert noise.ceiling == pytest.approx({JITTER_LEVEL: 50.0 * first, JITTER_MEMORY: 2.0})
+    assert noise.floor == pytest.approx(
+        {JITTER_LEVEL: 0.01 * first, JITTER_MEMORY: 0.015, JITTER_REACTION: 0.05}
+    )
+    assert noise.ceiling == pytest.approx(
+        {JITTER_LEVEL: 50.0 * first, JITTER_MEMORY: 2.0, JITTER_REACTION: 2.0}
+    )
     assert noise.prior == {JITTER_MEMORY: (0.05, 1.0)} and noise.reading == {"p": 0.1}
 
 
@@ -156,9 +161,8 @@ def test_a_record_starts_without_jitter_but_with_its_spread():
     assert not P[N_FULL:].any() and not P[:, N_FULL:].any()
 
 
-@pytest.fixture(scope="module")
-def engine_and_noise():
-    """Six seconds whose measured rotor speeds jitter by 0.6 rad/s for 60 ms, made here."""
+def shaken_for_six_seconds(reaction: float) -> tuple[Engine, Noise]:
+    """Measured rotor speeds that jitter by 0.6 rad/s for 60 ms, and what is taken up of it, made here."""
     flight = simulate(LAMA, "yaw_3211", seed=3, sensors="onboard")
     record = record_of(flight.runs[0])
     rows = record.t < record.t[0] + 6.0
@@ -168,10 +172,24 @@ def engine_and_noise():
     for row in z:
         jitter = left * jitter + math.sqrt(1.0 - left**2) * 0.6 * rng.standard_normal(2)
         row[:2] += RPM_PER_RAD_S * jitter
-        row[CHANNELS.index("r")] += taken_up(*jitter)
+        row[CHANNELS.index("r")] += reaction * taken_up(*jitter)
     short = replace(record, t=record.t[rows], command=record.command[rows], z=z)
-    noise = with_jitter(starting_noise(flight, LAMA), PLAIN)
-    return Engine(MODEL, [short]), noise
+    return Engine(MODEL, [short]), with_jitter(starting_noise(flight, LAMA), PLAIN)
+
+
+@pytest.fixture(scope="module")
+def engine_and_noise():
+    return shaken_for_six_seconds(1.0)
+
+
+@pytest.mark.parametrize("reaction", [0.4, 1.0])
+def test_a_planted_reaction_returns(reaction):
+    """At the level and memory that were planted."""
+    engine, noise = shaken_for_six_seconds(reaction)
+    planted = noise.with_levels({JITTER_LEVEL: 0.6, JITTER_MEMORY: 0.06})
+    wider: Any = SimpleNamespace(engine=engine)
+    found = asking._taken_up(wider, Fit((), engine.model.bare_values, planted))
+    assert found.noise.level(JITTER_REACTION) == pytest.approx(reaction, abs=0.15)
 
 
 def test_slopes_in_level_and_memory_are_those_of_the_likelihood(engine_and_noise):
@@ -223,7 +241,7 @@ def test_jitter_is_asked_beside_names_and_in_the_place_of_those_like_it(
         return replace(fit, active=tuple(rest))
 
     problem: Any = SimpleNamespace(
-        model=PLAIN, settings=SETTINGS, report=lambda text: None, with_free=lambda free: problem,
+        model=PLAIN, settings=SETTINGS, report=lambda text: None,
         off_values=lambda effect: {"yaw_damping.coefficient": 0.0},
         file_values=lambda effect: {"inertia_zz": 2.0},
     )  # fmt: skip

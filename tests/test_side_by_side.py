@@ -9,9 +9,9 @@ from coax_env.estimation import engine as engines
 from coax_env.estimation import run_passes
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
-from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.estimation.helicopter_noise import JITTER_REACTION, starting_noise
 from coax_env.estimation.lasting_errors import ErringModel, with_errors
-from coax_env.estimation.rotor_jitter import REACTION, JitteryModel, with_jitter
+from coax_env.estimation.rotor_jitter import JitteryModel, with_jitter
 from coax_env.estimation.sparse import add_gram, find_non_zeros, padded, with_places
 from coax_env.estimation.state_space import part
 from coax_env.estimation.swinging_gusts import SwingingModel
@@ -98,8 +98,7 @@ def test_derivatives_in_lanes_are_those_one_by_one(flown, kind, active):
     """Likelihood and signatures to the rounding of their differences, effects on or off."""
     vehicle, record, noise, free, values = flown
     if kind in (JitteryModel, erring_and_jittery, of_everything):
-        noise = with_jitter(noise, HeliModel(vehicle))
-        free, values = [*free, REACTION], {**values, REACTION.name: 0.7}
+        noise = with_jitter(noise, HeliModel(vehicle)).with_levels({JITTER_REACTION: 0.7})
     if kind in (erring, erring_and_jittery, of_everything):
         noise = with_errors(noise)
     both = []

@@ -21,7 +21,6 @@ from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import GUST_LEVELS
 from coax_env.estimation.joint_gusts import SHARES
 from coax_env.estimation.parted_engine import AT
-from coax_env.estimation.rotor_jitter import REACTION
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.model import effects
 from coax_env.model import parameters as P
@@ -185,7 +184,7 @@ class Problem:
 
     def free_of_vehicle(self, active: Collection[str]) -> list[FreeParameter]:
         """Those of them that a vehicle file can hold: numbers of the machine as it is at last."""
-        of_filter = {*P.COMMAND_GAINS, REACTION.name, *SHARES}
+        of_filter = {*P.COMMAND_GAINS, *SHARES}
         return [f for f in self.free(active) if f.name not in of_filter and AT not in f.name]
 
     def acting_names(self, effect: str) -> list[str]:

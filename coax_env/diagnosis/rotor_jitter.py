@@ -6,11 +6,19 @@ back is a damped one under white noise, and once both are fitted jitter gains no
 
 from dataclasses import replace
 
+from scipy.optimize import minimize_scalar
+
 from coax_env.diagnosis.fits import at_optimum, fitted, noise_fitted
 from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem
-from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY
+from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, JITTER_REACTION
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.rotor_jitter import REACTION, JitteryModel, with_jitter
+from coax_env.estimation.rotor_jitter import (
+    REACTION,
+    REACTION_BOUNDS,
+    REACTION_STD,
+    JitteryModel,
+    with_jitter,
+)
 from coax_env.estimation.wrapping_model import with_innermost
 
 STANDING_IN = "white_moment_z"
@@ -21,6 +29,8 @@ LEFT_BESIDE, LEFT_INSTEAD = 0.3, 0.0
 and 9,100 from all of it, and 22 for -18 in the place of names."""
 TURNS = 2
 """Of levels and numbers; ours."""
+WITHIN = 0.05
+"""Of the body's share of the rotors' angular momentum, to which it is looked for; ours."""
 
 
 def in_jitter(problem: Problem, fit: Fit, quadratic: Quadratic) -> tuple[Problem, Fit] | None:
@@ -31,7 +41,7 @@ def in_jitter(problem: Problem, fit: Fit, quadratic: Quadratic) -> tuple[Problem
     """
     if JITTER_LEVEL in fit.noise.process:
         return None
-    wider = problem.with_model(with_innermost(problem.model, JitteryModel)).with_free([REACTION])
+    wider = problem.with_model(with_innermost(problem.model, JitteryModel))
     trial = _fitted(wider, fit, LEFT_BESIDE)
     alike = [effect for effect in fit.active if effect in WEAK_OR_LATE]
     if alike and fit.objective - trial.objective < problem.settings.tie:
@@ -53,11 +63,23 @@ def _fitted(wider: Problem, fit: Fit, left: float) -> Fit:
     noise = with_jitter(fit.noise, wider.model)
     least = max(left * noise.level(STANDING_IN), noise.floor[STANDING_IN])
     levels = (*fit.levels, JITTER_LEVEL, JITTER_MEMORY)
-    trial = replace(
-        fit.at({REACTION.name: REACTION.value}),
-        noise=noise.with_levels({STANDING_IN: least}),
-        levels=levels,
-    )
+    trial = replace(fit, noise=noise.with_levels({STANDING_IN: least}), levels=levels)
     for _ in range(TURNS):
-        trial = fitted(wider, noise_fitted(wider, trial))
+        trial = fitted(wider, _taken_up(wider, noise_fitted(wider, trial)))
     return trial
+
+
+def _taken_up(wider: Problem, fit: Fit) -> Fit:
+    """With the reaction of largest posterior."""
+
+    def at(share: float) -> Fit:
+        return replace(fit, noise=fit.noise.with_levels({JITTER_REACTION: share}))
+
+    def cost(share: float) -> float:
+        unusual = 0.5 * ((share - REACTION) / REACTION_STD) ** 2
+        return unusual - wider.engine.log_likelihood(fit.values, at(share).noise)
+
+    found = minimize_scalar(
+        cost, bounds=REACTION_BOUNDS, method="bounded", options={"xatol": WITHIN}
+    )
+    return at(float(found.x))

@@ -58,7 +58,12 @@ from coax_env.diagnosis.sensor_low_pass import GROUPS, hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_swings
 from coax_env.estimation.changing_model import Lap
-from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
+from coax_env.estimation.helicopter_noise import (
+    JITTER_LEVEL,
+    JITTER_MEMORY,
+    JITTER_REACTION,
+    LEAST_READING_STD,
+)
 from coax_env.estimation.low_pass import LowPass, before_low_pass, records_before
 from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
@@ -69,6 +74,7 @@ from coax_env.model.layout import INERTIAL
 
 COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
+JITTER = (JITTER_LEVEL, JITTER_MEMORY, JITTER_REACTION)
 SHOWN_BY = (*ROTOR_SPEEDS, "r")
 """Channels that a rotor's jitter colours."""
 READ_WITHIN = 0.02
@@ -445,7 +451,7 @@ def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
         return found, noise
     wider, fit = jittery
     wider.report("searching again with rotor speeds that jitter")
-    of_jitter = {name: fit.noise.level(name) for name in (JITTER_LEVEL, JITTER_MEMORY)}
+    of_jitter = {name: fit.noise.level(name) for name in JITTER}
     begun = with_jitter(noise, wider.model).with_levels(of_jitter)
     other = _searched(wider, begun)
     ours, theirs = (cost(f.problem, f.fit, f.quadratic) for f in (other, found))
