@@ -162,7 +162,7 @@ def test_a_record_starts_without_jitter_but_with_its_spread():
 
 
 def shaken_for_six_seconds(reaction: float) -> tuple[Engine, Noise]:
-    """Measured rotor speeds that jitter by 0.6 rad/s for 60 ms, and what is taken up of it, made here."""
+    """Measured rotor speeds jitter by 0.6 rad/s for 60 ms, and the body takes it up, made here."""
     flight = simulate(LAMA, "yaw_3211", seed=3, sensors="onboard")
     record = record_of(flight.runs[0])
     rows = record.t < record.t[0] + 6.0
