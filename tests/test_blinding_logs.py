@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from bundled_flight import BUNDLED, copied
 from scipy.interpolate import Akima1DInterpolator, CubicSpline, PchipInterpolator
+from scipy.signal import butter, filtfilt
 from shared_flights import read
 
 import coax_env
@@ -367,6 +368,20 @@ def test_a_cubic_between_readings_is_no_reading(curve, every, rounded):
     new = np.zeros(y.size, bool)
     new[::every] = True
     assert np.mean(interpolated(t[: last + 1], y) == ~new) > 0.97
+
+
+@pytest.mark.parametrize("cut_off", [6.0, 12.0])
+def test_a_fast_log_that_was_smoothed_is_on_no_lines(cut_off):
+    """At 240 Hz half of all rows are on the line between their neighbours to the last digit."""
+    rng = np.random.default_rng(5)
+    t = np.arange(6000) / 240.0
+    b, a = butter(2, cut_off, fs=240.0)
+    y = 0.3 * np.sin(0.9 * t) + 2e-4 * filtfilt(b, a, rng.standard_normal(t.size))
+    y[2000:4000] += 0.2 * np.sin(7.0 * t[2000:4000])
+    y = np.round(y, 5)
+    off = np.abs(y[1:-1] - 0.5 * (y[2:] + y[:-2]))
+    assert np.mean(off <= 1.01e-5) > 0.3 and np.median(off[off > 1.01e-5]) > 3e-5, "as lines do"
+    assert not interpolated(t, y).any()
 
 
 def test_a_smooth_log_without_noise_is_on_no_cubic():

@@ -57,6 +57,21 @@ def test_where_motion_is_louder_than_noise_below_the_cut_off():
     assert 4 <= kept(run_of(phi=smooth), "phi") <= 8
 
 
+@pytest.mark.parametrize(("cut_off", "loud"), [(6.0, 1e-3), (10.0, 3e-4)])
+def test_a_fast_log_is_read_as_seldom_as_its_cut_off_asks_though_its_last_digit_is_white(
+    cut_off, loud
+):
+    """At 240 Hz two rows apart are flat by rounding alone: 1 / 2f is 20 and 12 rows."""
+    fast = np.arange(12_000) / 240.0
+    noise = filtfilt(
+        *butter(2, cut_off, fs=240.0), np.random.default_rng(6).standard_normal(fast.size)
+    )
+    smooth = np.sin(0.6 * fast) + 0.2 * np.sin(5.0 * fast + 1.0) + loud * noise
+    rounded = run_of(fast, theta=np.round(smooth, 5))
+    assert steepness([rounded.measured["theta"]], 2) < 2.5, "which is what hides it"
+    assert 90.0 / cut_off <= kept(rounded, "theta") <= 180.0 / cut_off
+
+
 @pytest.mark.parametrize(
     "values",
     [

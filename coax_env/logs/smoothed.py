@@ -94,17 +94,26 @@ def _steepest(pieces: Sequence[np.ndarray], step: float) -> float:
     Args:
         pieces: readings, one after the other. step: between two [s].
     """
+    return max(_nearby(pieces, step))
+
+
+def _nearby(pieces: Sequence[np.ndarray], step: float) -> list[float]:
+    """Steepness of readings one row apart, two, and so on up to NEAR."""
     most = max(int(NEAR / step), 2) if step > 0.0 else 2
-    return max(steepness(pieces, rows) for rows in range(1, most + 1))
+    return [steepness(pieces, rows) for rows in range(1, most + 1)]
 
 
 def _apart(pieces: Sequence[np.ndarray], step: float) -> int:
     """Readings of which one says as much as all do; 1 where they are steep at any distance.
 
+    Beyond where they are steepest: nearer, what is flat is the last digit's noise.
+
     Args:
         pieces: readings, one after the other. step: between two [s].
     """
-    found = {rows: steepness(pieces, rows) for rows in range(2, int(FARTHEST / step + 1e-6) + 1)}
+    nearest = max(1 + int(np.argmax(_nearby(pieces, step))), 2)
+    every = range(nearest, int(FARTHEST / step + 1e-6) + 1)
+    found = {rows: steepness(pieces, rows) for rows in every}
     for enough in (FLAT, OF_PUSHES):
         for rows, times in found.items():
             if 0.0 < times < enough:
