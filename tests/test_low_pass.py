@@ -1,5 +1,8 @@
 """Readings behind a sensor's low-pass, taken back through it; how it is found in a flight."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import injector
 import numpy as np
 import pytest
@@ -10,8 +13,9 @@ from scipy.stats import multivariate_normal
 
 from coax_env.diagnosis import sensor_low_pass
 from coax_env.diagnosis.diagnose import diagnose
+from coax_env.diagnosis.problem import Fit
 from coax_env.estimation.low_pass import NONE, LowPass, before_low_pass
-from coax_env.estimation.state_space import Record
+from coax_env.estimation.state_space import Noise, Record
 
 STEP = 0.01
 
@@ -98,3 +102,33 @@ def test_the_remark_says_where_it_cuts_off_and_what_is_not_asked():
     assert "roll rate, pitch rate and yaw rate of about 20 Hz (first order)" in said
     assert "thrust exponent" in said
     assert "thrust exponent" not in sensor_low_pass.remark(passes, ())
+
+
+@pytest.mark.parametrize(
+    ("alike", "active", "asked"),
+    [
+        (4.1, (), ["p", "ax"]),
+        (3.9, (), []),
+        (3.9, ("thrust_exponent", "wind"), ["ax"]),  # which looks like it
+        (3.9, ("attitude_delay",), ["p"]),
+    ],
+)
+def test_a_low_pass_is_asked_for_where_it_shows_or_what_looks_like_it_is_named(
+    monkeypatch, alike, active, asked
+):
+    tried = []
+
+    def likeliest(problem: Any, fit: Fit, noise: Noise, group: Any, found: Any) -> Any:
+        tried.append(group[0])
+        return NONE, noise
+
+    monkeypatch.setattr(sensor_low_pass, "_alike", lambda passes, channels, group: alike)
+    monkeypatch.setattr(sensor_low_pass, "_likeliest", likeliest)
+    monkeypatch.setattr(sensor_low_pass, "_refitted", lambda problem, fit, found: fit)
+    problem: Any = SimpleNamespace(
+        has_slow_rows=False,
+        engine=SimpleNamespace(filter=lambda values, noise: []),
+        model=SimpleNamespace(channels=()),
+    )
+    fit = Fit(active, {}, Noise({}))
+    assert sensor_low_pass.low_passes(problem, fit, Noise({})) == {} and tried == asked
