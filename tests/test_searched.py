@@ -387,16 +387,27 @@ def test_air_of_each_runs_own_stands_where_little_is_coloured_in_it(monkeypatch,
     """What is coloured without it says nothing: such air colours innovations itself."""
     own = SimpleNamespace(name="own", report=lambda text: None)
     there = Fit(("motor_lag",), {}, FINE)
-    monkeypatch.setattr(searched, "with_own_air", lambda problem, fit: (own, there))
+    asked = []
+
+    def with_own_air(problem: Any, fit: Fit) -> Any:
+        asked.append(problem)
+        return own, there
+
+    monkeypatch.setattr(searched, "with_own_air", with_own_air)
     monkeypatch.setattr(
         searched,
         "_is_much_coloured",
         lambda problem, fit: coloured or (problem, fit) != (own, there),
     )
     monkeypatch.setattr(searched, "_searched", lambda problem, noise: (problem.name, noise))
-    found = SimpleNamespace(problem=SimpleNamespace(), fit=Fit((), {}, FINE))
-    again = searched._with_own_air(found, FINE)  # type: ignore[arg-type]
-    assert again is found if coloured else again == ("own", FINE)
+    fit = Fit((), {}, FINE)
+    found = Searched(SimpleNamespace(), fit, fit, fit, None)  # type: ignore[arg-type]
+    again: Any = searched._with_own_air(found, FINE)
+    if coloured:
+        assert again == replace(found, air_asked=True)
+        assert searched._with_own_air(again, FINE) == again and len(asked) == 1, "once is enough"
+    else:
+        assert again == ("own", FINE)
 
 
 def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypatch):

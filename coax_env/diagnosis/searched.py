@@ -100,6 +100,7 @@ class Searched:
     coarse: whether readings were taken to be no finer than LEAST_READING_STD.
     changing: with what began or changed in flight, where that has been asked already.
     low_passes: what some channels' readings were taken back through.
+    air_asked: whether it has been asked if runs have air of their own.
     """
 
     problem: Problem
@@ -110,6 +111,7 @@ class Searched:
     coarse: bool = False
     changing: Changing | None = None
     low_passes: Mapping[str, LowPass] = field(default_factory=dict)
+    air_asked: bool = False
 
 
 def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Searched:
@@ -282,9 +284,9 @@ def _with_own_air(found: Searched, noise: Noise) -> Searched:
     Args:
         found: in the same air on all runs. noise: levels that it started from.
     """
-    own = with_own_air(found.problem, found.fit)
+    own = None if found.air_asked else with_own_air(found.problem, found.fit)
     if own is None or _is_much_coloured(*own):
-        return found
+        return replace(found, air_asked=True)
     problem, _ = own
     problem.report("searching again in air of each run's own")
     return _searched(problem, noise)

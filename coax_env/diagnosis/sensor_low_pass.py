@@ -31,7 +31,7 @@ from coax_env.model.layout import ACCELEROMETERS, GYROS
 from coax_env.plain_words import and_list, channel_name, plain
 
 GROUPS = (GYROS, ACCELEROMETERS)
-LIKE = {GYROS: "attitude_delay", ACCELEROMETERS: "thrust_exponent"}
+LIKE: Mapping[tuple[str, ...], str] = {GYROS: "attitude_delay", ACCELEROMETERS: "thrust_exponent"}
 """Group -> the effect that a low-pass of it looks like, too weak to show by itself as it may be: one of
 49 Hz was an exponent of 73 nats on a clean **synthetic** flight."""
 ALIKE = 4.0
