@@ -228,7 +228,7 @@ def test_jitter_is_asked_beside_names_and_in_the_place_of_those_like_it(
     monkeypatch, active, beside, instead, tried, used
 ):
     """From little of the white noise that stands for it, then from none."""
-    given: Any = Fit(active, {"yaw_damping.coefficient": 1.0}, Noise({}), objective=500.0)
+    given: Any = Fit(active, {}, Noise({}), objective=500.0)
     seen, lefts = [], []
 
     def trial(wider: Any, fit: Fit, left: float) -> Fit:
@@ -236,18 +236,14 @@ def test_jitter_is_asked_beside_names_and_in_the_place_of_those_like_it(
         lefts.append(left)
         return replace(fit, objective=500.0 - (beside if fit.active == active else instead))
 
-    def at_optimum(problem: Any, fit: Fit, quadratic: Any, rest: Any, fixed: Any) -> Fit:
-        assert fixed == {"yaw_damping.coefficient": 0.0, "inertia_zz": 2.0}
-        return replace(fit, active=tuple(rest))
+    def without(problem: Any, fit: Fit, quadratic: Any, *effects: str) -> Fit:
+        assert effects == ("yaw_damping",)
+        return replace(fit, active=("wind",))
 
-    problem: Any = SimpleNamespace(
-        model=PLAIN, settings=SETTINGS, report=lambda text: None,
-        off_values=lambda effect: {"yaw_damping.coefficient": 0.0},
-        file_values=lambda effect: {"inertia_zz": 2.0},
-    )  # fmt: skip
+    problem: Any = SimpleNamespace(model=PLAIN, settings=SETTINGS, report=lambda text: None)
     problem.with_model = lambda model: problem if isinstance(model, JitteryModel) else None
     monkeypatch.setattr(asking, "_fitted", trial)
-    monkeypatch.setattr(asking, "at_optimum", at_optimum)
+    monkeypatch.setattr(asking, "without", without)
     found = asking.in_jitter(problem, given, None)  # type: ignore[arg-type]
     assert (found is not None) == used and seen == tried
     assert lefts == [asking.LEFT_BESIDE, asking.LEFT_INSTEAD][: len(tried)]

@@ -104,16 +104,19 @@ def at_optimum(
     return replace(fit.at({**quadratic.moved(move), **fixed}), active=tuple(active))
 
 
-def without(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> Fit:
-    """The fit without an effect, the rest at the quadratic's optimum.
+def without(problem: Problem, fit: Fit, quadratic: Quadratic, *effects: str) -> Fit:
+    """The fit without some effects, the rest at the quadratic's optimum.
 
     Args:
         problem, fit: what may be free, and where.
         quadratic: linearised at the fit.
-        effect: an active one.
+        effects: active ones.
     """
-    fixed = problem.off_values(effect) | problem.file_values(effect)
-    return at_optimum(problem, fit, quadratic, fit.rest(effect), fixed)
+    fixed: dict[str, float] = {}
+    for effect in effects:
+        fixed |= problem.off_values(effect) | problem.file_values(effect)
+    rest = [effect for effect in fit.active if effect not in effects]
+    return at_optimum(problem, fit, quadratic, rest, fixed)
 
 
 def fitted(

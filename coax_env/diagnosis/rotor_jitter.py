@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from scipy.optimize import minimize_scalar
 
-from coax_env.diagnosis.fits import at_optimum, fitted, noise_fitted
+from coax_env.diagnosis.fits import fitted, noise_fitted, without
 from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, JITTER_REACTION
 from coax_env.estimation.quadratic import Quadratic
@@ -45,14 +45,7 @@ def in_jitter(problem: Problem, fit: Fit, quadratic: Quadratic) -> tuple[Problem
     trial = _fitted(wider, fit, LEFT_BESIDE)
     alike = [effect for effect in fit.active if effect in WEAK_OR_LATE]
     if alike and fit.objective - trial.objective < problem.settings.tie:
-        fixed = {
-            name: value
-            for effect in alike
-            for name, value in (problem.off_values(effect) | problem.file_values(effect)).items()
-        }
-        rest = [effect for effect in fit.active if effect not in alike]
-        without = at_optimum(problem, fit, quadratic, rest, fixed)
-        trial = _fitted(wider, without, LEFT_INSTEAD)
+        trial = _fitted(wider, without(problem, fit, quadratic, *alike), LEFT_INSTEAD)
     gained = fit.objective - trial.objective
     problem.report(f"rotor speeds that jitter: {gained:.1f} nats")
     return (wider, trial) if gained > problem.settings.tie else None
