@@ -101,7 +101,7 @@ def test_training(tmp_path, monkeypatch):
     train(tmp_path / "warm", steps=1)
     begun = time.monotonic()
     path = train(tmp_path / "warm", steps=1)
-    wait = time.monotonic() - begun  # for one rollout and its checkpoint, on a machine as busy as now
+    wait = time.monotonic() - begun  # for one rollout and its checkpoint
     rng = random.Random(2)
     out = tmp_path / "killed"
     kills = 0
