@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from coax_env.diagnosis.moves import Proposal, accepted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, replications
 from coax_env.diagnosis.scores import lost
+from coax_env.diagnosis.sensor_low_pass import may_hide_behind
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.diagnosis.trust import beside_large_axes, determined, of_line
 from coax_env.diagnosis.vibration import Line
@@ -412,6 +414,25 @@ def test_nothing_is_sure_where_the_model_leaves_colour_in_most_channels(share, d
     assert not without_name(against, SETTINGS)
     shown = {"servo_play": known_of(elsewhere=share, coloured=("q",))}
     assert len(list(doubts("servo_play", shown, SETTINGS))) == 1
+
+
+@pytest.mark.parametrize(
+    ("effect", "aboard", "excess", "said"),
+    [
+        ("thrust_exponent", {"az", "h"}, -0.4, True),
+        ("thrust_exponent", {"az", "h"}, 0.4, False),  # a lag makes it less
+        ("thrust_exponent", {"h"}, -0.4, False),  # no accelerometer
+        ("axial_damping", {"az", "h"}, -0.4, False),
+    ],
+)
+def test_thrust_that_follows_less_may_be_a_low_pass_too_fast_to_be_seen(
+    effect, aboard, excess, said
+):
+    problem: Any = SimpleNamespace(aboard=frozenset(aboard))
+    fit = Fit((effect,), {f"{effect}.excess": excess}, Noise({}))
+    assert may_hide_behind(problem, fit, effect) == said
+    against = {effect: known_of(smoothed=said)}
+    assert any("low-pass" in doubt for doubt in doubts(effect, against, SETTINGS)) == said
 
 
 def test_nothing_is_sure_where_rows_have_clock_errors():

@@ -46,6 +46,7 @@ class Against:
         nats: its evidence. shaken: whether gusts come in single shocks.
         poses_alone: whether neither gyros nor accelerometers were read.
         clock_error: std by which the times of the log's rows are wrong [s].
+        smoothed: whether a low-pass of a sensor too fast to be seen would do the same.
     """
 
     channels: tuple[str, ...]
@@ -62,6 +63,7 @@ class Against:
     shaken: bool
     poses_alone: bool
     clock_error: float
+    smoothed: bool = False
 
     @property
     def at_limit(self) -> bool:
@@ -150,6 +152,8 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
         yield f"these flights cannot distinguish it from {others}"
     if of.clock_error > 0.0:
         yield f"the times of the log's rows are wrong by {1e3 * of.clock_error:.2g} ms"
+    if of.smoothed:
+        yield "a low-pass of the accelerometers too fast to be seen does the same"
     yield from weak(of.nats, of.shaken, chosen)
 
 

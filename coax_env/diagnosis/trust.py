@@ -19,6 +19,7 @@ from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.noise_variation import not_holding
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, of_runs, replications
+from coax_env.diagnosis.sensor_low_pass import may_hide_behind
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.shocks import in_shocks
 from coax_env.diagnosis.vibration import Line
@@ -108,6 +109,7 @@ def trusts(
             shaken=shaken,
             poses_alone=problem.sees_poses_alone,
             clock_error=problem.clock_error,
+            smoothed=may_hide_behind(problem, fit, effect),
         )
     nameless = without_name(against, problem.settings)
     return {
