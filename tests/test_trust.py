@@ -299,7 +299,7 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
         channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
         alternatives=(), nats=100.0, shaken=False, poses_alone=False,
-        clock_error=0.0,
+        clock_error=0.0, smoothed=False,
     )  # fmt: skip
     return replace(sound, **but)
 

@@ -63,7 +63,7 @@ class Against:
     shaken: bool
     poses_alone: bool
     clock_error: float
-    smoothed: bool = False
+    smoothed: bool
 
     @property
     def at_limit(self) -> bool:

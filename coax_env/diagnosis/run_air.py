@@ -82,7 +82,7 @@ def like_fitted(problem: Problem, engine: Engine, fit: Fit) -> Engine:
     """
     if not has_own_air(problem):
         return engine
-    records: list[Record] = in_own_air(engine, fit.values, fit.noise, _levels(fit))
+    records = in_own_air(engine, fit.values, fit.noise, _levels(fit))
     return Engine(engine.model, records, engine.threads)
 
 

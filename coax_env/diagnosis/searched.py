@@ -75,6 +75,7 @@ from coax_env.model.layout import INERTIAL
 COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
 JITTER = (JITTER_LEVEL, JITTER_MEMORY, JITTER_REACTION)
+"""What is found of jitter before the search in it, and kept."""
 SHOWN_BY = (*ROTOR_SPEEDS, "r")
 """Channels that a rotor's jitter colours."""
 READ_WITHIN = 0.02
@@ -112,6 +113,11 @@ class Searched:
     changing: Changing | None = None
     low_passes: Mapping[str, LowPass] = field(default_factory=dict)
     air_asked: bool = False
+
+    @property
+    def cost(self) -> float:
+        """Minus the log evidence of what was found [nats]."""
+        return cost(self.problem, self.fit, self.quadratic)
 
 
 def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Searched:
@@ -226,7 +232,7 @@ def _lost(problem: Problem, found: Searched) -> float:
     """
     channels = problem.model.channels
     back = (before_low_pass(r, channels, found.low_passes)[1] for r in problem.engine.records)
-    return cost(found.problem, found.fit, found.quadratic) - sum(back)
+    return found.cost - sum(back)
 
 
 def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bool) -> Searched:
@@ -394,8 +400,8 @@ def _likelier(best: Searched, found: Fit) -> Searched:
     if not found.active:
         return best
     fit, quadratic = search(best.problem, found)
-    ours, other = cost(best.problem, best.fit, best.quadratic), cost(best.problem, fit, quadratic)
-    return best if ours <= other else replace(best, fit=fit, quadratic=quadratic)
+    other = replace(best, fit=fit, quadratic=quadratic)
+    return best if best.cost <= other.cost else other
 
 
 def _with_late_readings(problem: Problem, fit: Fit) -> Problem | None:
@@ -456,9 +462,9 @@ def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
     of_jitter = {name: fit.noise.level(name) for name in JITTER}
     begun = with_jitter(noise, wider.model).with_levels(of_jitter)
     other = _searched(wider, begun)
-    ours, theirs = (cost(f.problem, f.fit, f.quadratic) for f in (other, found))
-    wider.report(f"rotor speeds that jitter after the search: {theirs - ours:.1f} nats")
-    return (other, begun) if ours < theirs else (found, noise)
+    gained = found.cost - other.cost
+    wider.report(f"rotor speeds that jitter after the search: {gained:.1f} nats")
+    return (other, begun) if gained > 0.0 else (found, noise)
 
 
 def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:
@@ -475,8 +481,7 @@ def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:
     problem, fit = joint
     problem.report("searching again with gusts that push and turn at once")
     other = _likelier(_searched(problem, noise, found.coarse), fit)
-    ours, theirs = (cost(f.problem, f.fit, f.quadratic) for f in (other, found))
-    if not ours < theirs or _is_much_coloured(other.problem, other.fit):
+    if not other.cost < found.cost or _is_much_coloured(other.problem, other.fit):
         return found
     return replace(other, low_passes=found.low_passes)
 

@@ -177,20 +177,21 @@ class Engine(RunPasses):
             i: index of the run. values: of the parameters, by name. noise: of all runs.
             p: vector of these.
         """
-        own = noise.on(self.records[i])
+        own = noise.times(self.records[i].air)
         return (p, noise) if own is noise else (self.model.vector(values, own), own)
 
-    def _moves(
+    def _moved_of_run(
         self,
         i: int,
         values: Mapping[str, float],
         noise: Noise,
+        p: np.ndarray,
         free: Sequence[FreeParameter],
         moves: ParameterMoves,
-    ) -> ParameterMoves:
-        """`moves_of` what is differentiated in, in the air of a run; `moves`: of all runs."""
-        own = noise.on(self.records[i])
-        return moves if own is noise else moves_of(self.model, values, own, free)
+    ) -> tuple[np.ndarray, Noise, ParameterMoves]:
+        """`of_run`, and `moves_of` what is differentiated in there; `moves`: of all runs."""
+        own_p, own = self.of_run(i, values, noise, p)
+        return own_p, own, moves if own is noise else moves_of(self.model, values, own, free)
 
     def linearise(
         self,
@@ -219,10 +220,9 @@ class Engine(RunPasses):
             return_freed_memory()
 
         def one(i: int) -> LinearisedRun:
-            own = self._moves(i, values, noise, free, moves)
+            there = self._moved_of_run(i, values, noise, p, free, moves)
             with self.borrowed_buffers() as buffers:
-                there = self.of_run(i, values, noise, p)
-                return linearise_run(self, i, *there, own, buffers, BLOCKS_AT_ONCE)
+                return linearise_run(self, i, *there, buffers, BLOCKS_AT_ONCE)
 
         return self._gathered(p, noise, free, self.each(one))
 
@@ -276,10 +276,9 @@ class Engine(RunPasses):
             s = np.zeros((rows[i].size, nx, padded(len(free) + 1)), np.float32)
             kept = frozen_gains.Kept(s, np.full(n, -1, np.int64))
             kept.places[rows[i]] = np.arange(rows[i].size)
-            own = self._moves(i, values, noise, free, moves)
+            there = self._moved_of_run(i, values, noise, p, free, moves)
             with self.borrowed_buffers() as buffers:
-                there = self.of_run(i, values, noise, p)
-                found = linearise_run(self, i, *there, own, buffers, n, kept)
+                found = linearise_run(self, i, *there, buffers, n, kept)
                 begun = beginnings_of_run(self, i, found, rows[i], kept, asked)
             return replace(found, J=found.J[:0].copy()), begun
 

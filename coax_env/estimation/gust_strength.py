@@ -21,6 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from coax_env.estimation.engine import Engine
+from coax_env.estimation.linearised_runs import blocks_of
 from coax_env.estimation.state_space import Noise, Record, Strength
 
 BLOCK = 0.25
@@ -55,7 +56,7 @@ def with_strengths(
 def _parted(record: Record, entries: int) -> Record:
     if not record.strength.steady:
         return record
-    block = ((record.t - record.t[0]) / BLOCK).astype(np.int64)
+    block = blocks_of(record.t, BLOCK)
     return replace(record, strength=Strength(block, np.ones((int(block[-1]) + 1, entries))))
 
 

@@ -260,13 +260,13 @@ def beginnings_of_run(
     ]
 
 
-def blocks_of(t: np.ndarray) -> np.ndarray:
-    """The block of BLOCK seconds that each row of a run is in (n,).
+def blocks_of(t: np.ndarray, seconds: float = BLOCK) -> np.ndarray:
+    """The block of time that each row of a run is in (n,).
 
     Args:
-        t: (n,) of its rows [s].
+        t: (n,) of its rows [s]. seconds: of a block.
     """
-    return ((t - t[0]) / BLOCK).astype(np.int64)
+    return ((t - t[0]) / seconds).astype(np.int64)
 
 
 def _block_edges(run: RunPass) -> tuple[np.ndarray, np.ndarray]:

@@ -71,9 +71,9 @@ def in_own_air(
         record = engine.records[i]
         alone = Engine(engine.model, [replace(record, air={})], threads=1)
 
-        def fitted(begun: Mapping[str, float], median: Mapping[str, float], spread: float) -> Air:
+        def fitted(begun: Air, median: Air, spread: float) -> Air:
             prior = {n: (median.get(n, 1.0) * noise.level(n), spread) for n in levels}
-            start = replace(noise.on(replace(record, air=begun)), prior=prior)
+            start = replace(noise.times(begun), prior=prior)
             own = fit_noise(alone, values, start, levels, EVALUATIONS, TOLERANCE)
             return {n: own.level(n) / noise.level(n) for n in levels}
 

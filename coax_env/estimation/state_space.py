@@ -127,11 +127,11 @@ class Noise:
             self, process=process, reading={n: levels.get(n, v) for n, v in self.reading.items()}
         )
 
-    def on(self, record: Record) -> "Noise":
-        """That of a run, in the air that it has of its own."""
-        if not record.air:
+    def times(self, air: Mapping[str, float]) -> "Noise":
+        """With levels of the process noise so many times as large: those of a run with such air."""
+        if not air:
             return self
-        return self.with_levels({n: f * self.process[n] for n, f in record.air.items()})
+        return self.with_levels({n: f * self.process[n] for n, f in air.items()})
 
     def at_bound(self, name: str) -> bool:
         """Whether a level stands at the least or most that it can be, within a hundredth."""

@@ -60,11 +60,12 @@ def read_apart(
         holds: channel -> what the card says; one that never holds stays as it is.
     """
     pieces = {c: _pieces(runs, c) for c in MOTION if holds.get(c) is not False}
-    steep = {c: _steepest(*own) for c, own in pieces.items()}
-    rows = max((_apart(*pieces[c]) for c, times in steep.items() if times > STEEP), default=1)
+    near = {c: _nearby(*own) for c, own in pieces.items()}
+    steep = [c for c, times in near.items() if max(times) > STEEP]
+    rows = max((_apart(*pieces[c], near[c]) for c in steep), default=1)
     if rows == 1:
         return list(runs)
-    smooth = [c for c, times in steep.items() if times > SLOPING]  # one software, one cut-off
+    smooth = [c for c, times in near.items() if max(times) > SLOPING]  # one software, one cut-off
     found, left_out = [], 0
     for run in runs:
         measured = dict(run.measured)
@@ -85,33 +86,30 @@ def are_steep(runs: Sequence[Repaired]) -> bool:
     Args:
         runs: of one flight.
     """
-    return any(_steepest(*_pieces(runs, channel)) > STEEP for channel in MOTION)
+    return any(max(_nearby(*_pieces(runs, channel))) > STEEP for channel in MOTION)
 
 
-def _steepest(pieces: Sequence[np.ndarray], step: float) -> float:
-    """The most of any distance up to NEAR: nearer, the last digit of a fast log hides it.
+def _nearby(pieces: Sequence[np.ndarray], step: float) -> list[float]:
+    """Steepness of readings one row apart, two, and so on up to NEAR.
+
+    The most of these counts: nearer, the last digit of a fast log hides it.
 
     Args:
         pieces: readings, one after the other. step: between two [s].
     """
-    return max(_nearby(pieces, step))
-
-
-def _nearby(pieces: Sequence[np.ndarray], step: float) -> list[float]:
-    """Steepness of readings one row apart, two, and so on up to NEAR."""
     most = max(int(NEAR / step), 2) if step > 0.0 else 2
     return [steepness(pieces, rows) for rows in range(1, most + 1)]
 
 
-def _apart(pieces: Sequence[np.ndarray], step: float) -> int:
+def _apart(pieces: Sequence[np.ndarray], step: float, near: Sequence[float]) -> int:
     """Readings of which one says as much as all do; 1 where they are steep at any distance.
 
     Beyond where they are steepest: nearer, what is flat is the last digit's noise.
 
     Args:
-        pieces: readings, one after the other. step: between two [s].
+        pieces: readings, one after the other. step: between two [s]. near: `_nearby` of them.
     """
-    nearest = max(1 + int(np.argmax(_nearby(pieces, step))), 2)
+    nearest = max(1 + int(np.argmax(near)), 2)
     every = range(nearest, int(FARTHEST / step + 1e-6) + 1)
     found = {rows: steepness(pieces, rows) for rows in every}
     for enough in (FLAT, OF_PUSHES):
