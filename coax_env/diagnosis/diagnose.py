@@ -14,7 +14,7 @@ vehicle file is refitted on all runs at the end, its structure unchanged.
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +176,7 @@ def diagnose(
     used, held = split(model, records, noise, hold_out, candidates, settings)
 
     problem = Problem.of(model, used, candidates, settings, report)
+    problem = replace(problem, of_onboard_filter=circular)
     clock = clock_of(flight.runs)
     first = searched(problem, noise, clock)
     if first.low_passes:

@@ -81,6 +81,7 @@ class Problem:
         progress: called with a line of text.
         unlike_gusts: whether gusts turned out not to be as the filter has them (evidence.py).
         smoothed: whether readings were taken back through a low-pass (sensor_low_pass.py).
+        of_onboard_filter: whether attitudes are an onboard filter's (onboard_filter.py).
         clock_error: std of the rows' times [s], 0 where they are right (clock_errors.py).
     """
 
@@ -93,6 +94,7 @@ class Problem:
     progress: Progress | None = None
     unlike_gusts: bool = False
     smoothed: bool = False
+    of_onboard_filter: bool = False
     clock_error: float = 0.0
 
     @classmethod

@@ -3,7 +3,10 @@
 Asked after a search, where innovations of attitudes, height, velocities or position stay coloured and
 gyros and accelerometers are aboard that feel the motion itself: by poses alone an error that lasts and
 what moves the body are one. But for an attitude, whose tilt the position feels, and whose mean has been
-named: a bias of 59 nats, sure, was errors that lasted 20 s on a clean **synthetic** flight.
+named: a bias of 59 nats, sure, was errors that lasted 20 s on a clean **synthetic** flight. And always where attitudes are an onboard filter's, which
+are read once a second (onboard_filter.py) and cannot look coloured then: gyros that drift by 0.01 rad/s
+were taken for a stabiliser bar with half its following time, of 17 and 28 nats on clean **synthetic**
+flights (`--arms mixed`, seed 611, clean 6 and 9), where these errors are worth 670 and 150.
 
 Levels and memories of all readings' errors are fitted then, those of gyros and accelerometers too
 (estimation/lasting_errors.py). What a model lacks lasts as well: no reading of the motion may be
@@ -12,6 +15,7 @@ smoothed: asked of them too, errors that were worth 1,700 nats were not used bes
 a clean **synthetic** flight had a false name (`--arms mixed`, seed 100).
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted
@@ -19,7 +23,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import ERROR_LEVELS, ERROR_MEMORIES
 from coax_env.estimation.lasting_errors import ErringModel, with_errors
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.whiteness import whiteness
+from coax_env.estimation.whiteness import Whiteness, whiteness
 from coax_env.model.layout import ACCELEROMETERS, GYROS, MOTION, SENSOR_GROUPS
 from coax_env.plain_words import and_list
 
@@ -48,8 +52,9 @@ def with_lasting_errors(
     asked = [
         group
         for group, felt_by in FELT_BY.items()
-        if any(c in seen and not seen[c].white for c in SENSOR_GROUPS[group])
-        and problem.aboard.issuperset(felt_by)
+        if problem.aboard.issuperset(felt_by)
+        and not problem.aboard.isdisjoint(SENSOR_GROUPS[group])
+        and (problem.of_onboard_filter or _is_coloured(group, seen))
     ]
     if problem.sees_poses_alone and BIAS in fit.active:
         asked.append("attitude")
@@ -65,6 +70,11 @@ def with_lasting_errors(
         return None
     levels = {name: trial.noise.level(name) for name in trial.levels if name in LEVELS_OF_ERRORS}
     return wider, trial, with_errors(noise).with_levels(levels)
+
+
+def _is_coloured(group: str, seen: Mapping[str, Whiteness]) -> bool:
+    """Whether one of a group's channels is."""
+    return any(c in seen and not seen[c].white for c in SENSOR_GROUPS[group])
 
 
 def _erring(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
