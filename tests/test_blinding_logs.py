@@ -316,6 +316,27 @@ def test_a_line_between_readings_is_none_where_it_is_as_coarse_as_half_their_noi
     assert not interpolated(t, 0.0149 * np.round(with_outliers(alone, rng) / 0.0149)).any()
 
 
+@pytest.mark.parametrize("digits", [None, 5])
+@pytest.mark.parametrize("step", [0.012, 0.0175])
+def test_a_coarse_sensor_on_every_second_row_has_all_its_readings(step, digits):
+    """An onboard filter's angle, smooth between its steps. Where a row is missing the other rows have
+    readings from then on: those before were taken for lines between these."""
+    t = 0.01 * np.arange(1400)
+    y = step * np.round(0.2 * np.sin(1.5 * t) / step)
+    y = y if digits is None else np.round(y, digits)
+    rows = np.arange(t.size)
+    read = np.where(rows < 1300, rows % 2 == 0, rows % 2 == 1)
+    assert not interpolated(t, np.where(read, y, np.nan)).any()
+
+
+@pytest.mark.parametrize("steps", [0.8, 0.9, 1.1, 1.2])
+def test_a_coarse_heading_that_turns_by_about_a_step_a_row_has_all_its_readings(steps):
+    """Written with more decimals than its steps have: four of five rows lie on a line."""
+    t = 0.01 * np.arange(1400)
+    heading = 0.0174533 * np.round(steps * np.arange(t.size))
+    assert not interpolated(t, np.round(heading, 5)).any()
+
+
 @pytest.mark.parametrize("every", [2, 5])
 def test_a_held_coarse_sensor_is_known_in_spite_of_outliers(every):
     rng = np.random.default_rng(13)

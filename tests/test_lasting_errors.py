@@ -12,6 +12,7 @@ import injector
 import numpy as np
 import pytest
 from injector_air import GUSTY
+from injector_sensors import SENSORS
 from numpy.testing import assert_allclose
 
 from coax_env import diagnose, load_vehicle
@@ -182,7 +183,7 @@ def test_numbers_hold_the_truth_where_errors_last(wandering):
 
 WHITE = SimpleNamespace(white=True)
 COLOURED = SimpleNamespace(white=False)
-ABOARD = frozenset({"p", "q", "r", "ax", "ay", "az"})
+ABOARD = frozenset({"p", "q", "r", "ax", "ay", "az", "phi", "vn", "h"})
 
 
 @pytest.mark.parametrize(
@@ -201,6 +202,8 @@ ABOARD = frozenset({"p", "q", "r", "ax", "ay", "az"})
         ("", frozenset(), ("rotor_drag",), 100.0, "", False),
         ("phi", frozenset(), (), 100.0, "", False),
         ("", ABOARD, ("attitude_bias",), 100.0, "", False),  # gyros would have shown them
+        ("onboard filter", ABOARD, (), 100.0, "", True),  # read too seldom to look coloured
+        ("onboard filter", ABOARD - {"p", "az"}, (), 100.0, "", False),
     ],
 )
 def test_errors_last_where_that_is_worth_it_and_no_motion_stays_coloured(
@@ -221,7 +224,7 @@ def test_errors_last_where_that_is_worth_it_and_no_motion_stays_coloured(
     problem = SimpleNamespace(
         engine=SimpleNamespace(filter=lambda values, noise: []), aboard=aboard, model=PLAIN,
         settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
-        sees_poses_alone=not aboard,
+        sees_poses_alone=not aboard, of_onboard_filter=coloured == "onboard filter",
     )  # fmt: skip
     problem.with_model = lambda model: SimpleNamespace(**{**vars(problem), "model": model})
     found = sensor_errors.with_lasting_errors(problem, fit, first)  # type: ignore[arg-type]
@@ -277,6 +280,16 @@ def test_attitudes_of_a_sensor_of_their_own_are_not(every, common):
         assert not onboard_filter.of_onboard_filter([turning(seed, "no", every, common)])
 
 
+@pytest.mark.parametrize("carried", ["begin", "no"])
+def test_an_onboard_filter_is_seen_through_coarse_angles(carried):
+    """In steps of 0.3 degrees, where turns from row to row are 0 or whole steps."""
+    runs = [turning(seed, carried) for seed in range(1, 7)]
+    for run in runs:
+        for _, angle in ANGLE_PAIRS:
+            run.measured[angle][:] = 0.005 * np.round(run.measured[angle] / 0.005)
+    assert onboard_filter.of_onboard_filter(runs) == (carried == "begin")
+
+
 def test_an_onboard_filter_is_seen_beside_times_that_were_logged_wrong():
     run = turning(1, "begin")
     wrong = np.random.default_rng(2).uniform(-0.003, 0.003, run.t.size)
@@ -313,6 +326,21 @@ def test_an_onboard_filters_states_are_read_once_a_second():
     assert read["vn"].tolist() == [30, 130, 230, 330, 430]
     assert all(read[c].size == 500 for c in ("p", "az", "rpm_upper"))
     assert np.isfinite(z[30:]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 4])
+def test_an_onboard_filters_drift_is_no_stabiliser_bars(tmp_path, monkeypatch, seed):
+    """Its gyros drift by a third of their noise and its attitudes, read once a second, cannot look
+    coloured: errors that last are asked for all the same, and nothing is named. **Synthetic**."""
+    sensors = SENSORS["fused"]._replace(flicker=dict.fromkeys(GYROS, 0.01))
+    monkeypatch.setitem(SENSORS, "fused", sensors)
+    runs = ("lon_3211", "lat_3211", "low_hover", "heading_turn")
+    injector.fly(tmp_path, {}, gusts=GUSTY, sensors="fused", seed=seed, runs=runs, longest=14.0)
+    found = diagnose(tmp_path)
+    assert found.findings["causes"] == []
+    (said,) = [line for line in found.remarks if line.startswith("readings have errors that last")]
+    assert "gyros" in said
 
 
 @pytest.mark.slow

@@ -25,11 +25,13 @@ from coax_env.model.layout import ANGLES, GYROS, MOTION
 from coax_env.plain_words import and_list, plain, seconds
 
 SHARES = (0.6, 1.4)
-"""Of the gyros' noise that is in an angle carried by them, all three angles. Fused flights had 0.90 to
-1.03; others, **synthetic** and real, 0.5 at most on one of the three at least; noise that gyros and
+"""Of the gyros' noise that is in an angle carried by them, all three angles. Fused flights had 0.81 to
+1.14, all three; others, **synthetic** and real, 0.5 at most on one of the three at least; noise that gyros and
 attitudes have in common from row to row 20 and more; ours."""
 CERTAIN = 5.0
 """std of its own scatter that a share must be; ours."""
+LIKELY = 2.0
+"""std of that by which it may be more than these: of an angle in steps of 1.6 degrees 1.7 +- 0.2; ours."""
 FEWEST = 100
 """Turns between readings that are enough; ours."""
 ORDER = 2
@@ -88,7 +90,7 @@ def _has_noise(turns: Sequence[Turns | None]) -> bool:
     )
     share = 1.0 - float(carried @ (carried - read)) / count
     scatter = math.sqrt(float(read @ read) * float(carried @ carried)) / count**1.5
-    return SHARES[0] < share < SHARES[1] and share > CERTAIN * scatter
+    return SHARES[0] < share < SHARES[1] + LIKELY * scatter and share > CERTAIN * scatter
 
 
 def _turns(run: Run, angle: str, begin: float, end: float) -> Turns | None:
@@ -119,7 +121,9 @@ def _turns(run: Run, angle: str, begin: float, end: float) -> Turns | None:
     row = float(np.median(steps))
     noise = row**2 * _noise(run.measured[GYROS[ANGLES.index(angle)]]) * float(weights @ weights)
     read, carried = (np.diff(x, ORDER)[whole] for x in (read, carried))
-    sound = np.abs(read - carried) < 8.0 * np.median(np.abs(read - carried)) + 1e-12
+    off = np.abs(read - carried)
+    rounding = float(np.diff(np.unique(run.measured[angle][rows])).min(initial=math.inf))
+    sound = off < 8.0 * np.median(off) + 0.5 * rounding * 2.0 ** (ORDER + 1) + 1e-12
     return Turns(read[sound], carried[sound], noise)
 
 

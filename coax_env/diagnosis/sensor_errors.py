@@ -3,10 +3,12 @@
 Asked after a search, where innovations of attitudes, height, velocities or position stay coloured and
 gyros and accelerometers are aboard that feel the motion itself: by poses alone an error that lasts and
 what moves the body are one. But for an attitude, whose tilt the position feels, and whose mean has been
-named: a bias of 59 nats, sure, was errors that lasted 20 s on a clean **synthetic** flight. And always where attitudes are an onboard filter's, which
-are read once a second (onboard_filter.py) and cannot look coloured then: gyros that drift by 0.01 rad/s
-were taken for a stabiliser bar with half its following time, of 17 and 28 nats on clean **synthetic**
-flights (`--arms mixed`, seed 611, clean 6 and 9), where these errors are worth 670 and 150.
+named: a bias of 59 nats, sure, was errors that lasted 20 s on a clean **synthetic** flight.
+
+And always where attitudes are an onboard filter's, which are read once a second (onboard_filter.py) and
+cannot look coloured then: gyros that drift by 0.01 rad/s were taken for a stabiliser bar with half its
+following time, of 17 and 28 nats on clean **synthetic** flights (`--arms mixed`, seed 611, clean 6 and
+9). Such errors are worth 670 and 120 nats there.
 
 Levels and memories of all readings' errors are fitted then, those of gyros and accelerometers too
 (estimation/lasting_errors.py). What a model lacks lasts as well: no reading of the motion may be
