@@ -26,12 +26,12 @@ from coax_env.plain_words import and_list, plain, seconds
 
 SHARES = (0.6, 1.4)
 """Of the gyros' noise that is in an angle carried by them, all three angles. Fused flights had 0.81 to
-1.14, all three; others, **synthetic** and real, 0.5 at most on one of the three at least; noise that gyros and
+1.14; others, **synthetic** and real, 0.5 at most on one of the three at least; noise that gyros and
 attitudes have in common from row to row 20 and more; ours."""
 CERTAIN = 5.0
 """std of its own scatter that a share must be; ours."""
 LIKELY = 2.0
-"""std of that by which it may be more than these: of an angle in steps of 1.6 degrees 1.7 +- 0.2; ours."""
+"""std of that by which it may be more: of an angle in steps of 1.6 degrees 1.7 +- 0.2; ours."""
 FEWEST = 100
 """Turns between readings that are enough; ours."""
 ORDER = 2
