@@ -762,6 +762,25 @@ def test_spin_up_reaction_keeps_the_angular_momentum():
     assert momentum(end) == pytest.approx(momentum(start), rel=1e-9)
 
 
+@pytest.mark.parametrize("lag", [0.0, 1e-4, 0.004, 0.03, 0.5])
+@pytest.mark.parametrize("row", [0.01, 1.0 / 60.0, 0.1])
+def test_the_heading_is_the_integral_of_the_rate_that_a_spin_up_makes(lag, row):
+    """J / I of what the rotor gains, (1 - exp(-t / lag)) of its jump: its integral over a row is in the
+    heading at the row's end, all of it, also where a rotor jumps as the row begins."""
+    free = {"torque_coefficient_upper": 0.0, "torque_coefficient_lower": 0.0}
+    vehicle = COUPLED.with_values(free).with_effect("motor_lag", upper=lag, lower=lag)
+    vehicle = vehicle.with_effect("spin_up_reaction", gain=1.0)
+    start, command = np.zeros(N_FULL), np.array([230.0, 220.0, 0.0, 0.0])
+    start[16:18] = 200.0, 220.0
+    end, work = np.zeros(N_FULL), np.zeros(dynamics.WORK_SIZE)
+    dynamics.step(start, dynamics.kernel_input(command), row, vehicle.vector, work, end)
+    v = COUPLED.values()
+    gained = 30.0 * (v["rotor_inertia_upper"] + v["flybar_inertia"]) / v["inertia_zz"]
+    left = math.exp(-row / lag) if lag else 0.0
+    assert end[5] == pytest.approx(gained * (1.0 - left), rel=1e-6)
+    assert end[12] == pytest.approx(gained * (row - lag * (1.0 - left)), rel=2e-3)
+
+
 def test_a_reading_sees_the_rotors_speed_up_each_with_its_own_lag():
     """Off the axis, the accelerometer reads the yaw that N = g ((J_u + J_f) w_u' - J_l w_l') makes."""
     arm, lags = 0.2, np.array([0.06, 0.11])

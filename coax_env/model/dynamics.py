@@ -231,12 +231,35 @@ def _actuate(x, u, time, f, out):
 
 
 @compiled()
-def _mean_rotor_accelerations(x, u, h, f):
-    """The rotors' mean accelerations over `h` seconds: angular momentum is kept exactly."""
-    omega_u, omega_l = x[S.OMEGA_U], x[S.OMEGA_L]
-    upper, lower = _speeds_asked_for(u, f)
-    f[F.OMEGA_U_DOT] = (_follow(omega_u, upper, h, f[F.MOTOR_LAG_U]) - omega_u) / h
-    f[F.OMEGA_L_DOT] = (_follow(omega_l, lower, h, f[F.MOTOR_LAG_L]) - omega_l) / h
+def _mean_acceleration(start, asked, h, lag):
+    """A rotor's over `h` seconds: angular momentum is kept exactly."""
+    return (_follow(start, asked, h, lag) - start) / h
+
+
+@compiled()
+def _earliness(h, lag):
+    """How early in `h` seconds a rotor that lags speeds up: 0 evenly, 1 all at their start.
+
+    Of what r gains by its reaction, times `h`, half is in the heading if the rotor speeds up evenly, all
+    of it if at once: 1 / (1 - exp(-h / lag)) - lag / h.
+    """
+    slow = lag > SHORTEST_LAG
+    if any_lane(slow):
+        times = h / select(slow, lag, h)
+        share = 1.0 / (1.0 - math.exp(-times)) - 1.0 / times
+        return select(slow, select(times > 1e-3, 2.0 * share - 1.0, times / 6.0), 1.0)
+    return 1.0 + 0.0 * lag
+
+
+@compiled()
+def _of_stage(k, mean, early):
+    """A rotor's acceleration in stage `k` of RK4: what comes early is in the first stages.
+
+    Weighed as RK4 does, all stages together are the mean, and those that a heading sees of a rate, the
+    first three, its integral. At 60 Hz a rotor that jumps, its mean in every stage, had its reaction on
+    the heading 8 ms too late: a yaw inertia was 18 % too large, 7 std (**synthetic**).
+    """
+    return (1.0 + (2.0 - k if k < 3 else -4.0) * early) * mean
 
 
 @compiled()
@@ -458,7 +481,10 @@ def _step(x, u, dt, p, work, out):
     gusty = _gusty(out)  # without one, nothing fades
     for _ in range(parts):
         if WITH_EFFECTS:
-            _mean_rotor_accelerations(out, u, h, f)
+            upper, lower = _speeds_asked_for(u, f)
+            lag_u, lag_l = f[F.MOTOR_LAG_U], f[F.MOTOR_LAG_L]
+            mean_u, early_u = _mean_acceleration(out[S.OMEGA_U], upper, h, lag_u), _earliness(h, lag_u)
+            mean_l, early_l = _mean_acceleration(out[S.OMEGA_L], lower, h, lag_l), _earliness(h, lag_l)
         half_fade = _fade(0.5 * h, p) if gusty else _STAYS
         for i in range(S.GUST_X, N_FULL):
             stage[i] = out[i]
@@ -468,6 +494,9 @@ def _step(x, u, dt, p, work, out):
                 stage[i] = out[i] if k == 0 else out[i] + time * slope[i]
             if gusty and (k == 1 or k == 3):
                 _fade_gusts(half_fade, stage)
+            if WITH_EFFECTS:
+                f[F.OMEGA_U_DOT] = _of_stage(k, mean_u, early_u)
+                f[F.OMEGA_L_DOT] = _of_stage(k, mean_l, early_l)
             _actuate(out, u, time + READING_DELAY, f, stage)
             _rates(stage, p, f, slope)
             weight = 1.0 if k == 0 or k == 3 else 2.0
