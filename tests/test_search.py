@@ -62,6 +62,7 @@ def moves(monkeypatch):
     monkeypatch.setattr(module, "drop", drop)
     monkeypatch.setattr(module, "with_latent_noise", latent)
     monkeypatch.setattr(module, "noise_fitted", noise_fitted)
+    monkeypatch.setattr(module, "_in_brief_gusts", lambda *given: None)
     monkeypatch.setattr(module, "_nearest", lambda problem, *given: problem)
     monkeypatch.setattr(module, "threshold", lambda problem, q, active: SETTINGS.evidence)
     monkeypatch.setattr(module, "swaps", lambda *given: iter(()))
@@ -187,3 +188,23 @@ def test_after_three_additions_that_did_not_hold_no_more_are_made(moves):
     assert memory.banned == {"a"}, "what was dropped twice stays banned"
     memory.failures = 3
     assert _forward(PROBLEM, two, [], None, strong, memory) is None  # type: ignore[arg-type]
+
+
+def test_in_brief_gusts_all_weak_effects_leave_but_what_was_worth_most_when_it_came(monkeypatch):
+    """Once for each set of effects; what is worth ten thresholds is not asked to leave."""
+    worth = {"yaw_damping": 99.0, "spin_up_reaction": 70.0, "servo_play": 268.0, "motor_lag": 5.0}
+    history = (("+ yaw_damping", 63.0), ("+ spin_up_reaction", 410.0), ("- yaw_damping", 900.0),
+               ("+ servo_play", 51.0), ("+ motor_lag", 15.0))  # fmt: skip
+    fit = Fit(tuple(worth), {}, Noise({}), history=history)
+    asked: list[list[str]] = []
+    monkeypatch.setattr(module, "loss", lambda problem, q, active, e, inflation: worth[e])
+    monkeypatch.setattr(module, "threshold", lambda problem, q, active: SETTINGS.evidence)
+    monkeypatch.setattr(module, "dropped_in_brief_gusts", lambda p, f, q, gone, enough:
+                        asked.append(list(gone)))  # fmt: skip
+    memory = _Memory()
+    quadratic: Any = None
+    for _ in range(2):
+        module._in_brief_gusts(PROBLEM, fit, quadratic, memory)
+    assert asked == [["yaw_damping", "motor_lag"]]
+    module._in_brief_gusts(PROBLEM, replace(fit, active=("motor_lag",)), quadratic, memory)
+    assert len(asked) == 1

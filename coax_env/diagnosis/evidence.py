@@ -24,8 +24,16 @@ before poses show it makes an answer weak or slow, and none late by a constant t
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_at, without
+from coax_env.diagnosis.fits import (
+    converged,
+    fitted,
+    noise_fitted,
+    quadratic_at,
+    with_latent_noise,
+    without,
+)
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
+from coax_env.diagnosis.moves import dropped_in_brief_gusts
 from coax_env.diagnosis.problem import PURE_DELAYS, WEAK_OR_LATE, Fit, Problem
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, loss, threshold
@@ -109,7 +117,7 @@ def prune(
         fit, quadratic = quadratic_at(alone, fit)
         better = _without_hopeless(problem, fit, quadratic)
         if better is not None:
-            fit = better
+            fit = with_latent_noise(problem, better) or better
             continue
         if fit.active and not _asked(problem, fit, quadratic, clear):
             return fit, quadratic, {}
@@ -121,10 +129,39 @@ def prune(
             removals |= weigh(problem, fit, quadratic, which)
             better = _better(problem, fit, enough, removals)
             if better is not None:
-                fit = better
                 break
         else:
-            return fit, quadratic, {e: removals[e].evidence for e in fit.active if e in removals}
+            better = _in_brief_gusts(problem, fit, quadratic, enough, removals)
+            if better is None:
+                left = (e for e in fit.active if e in removals)
+                return fit, quadratic, {e: removals[e].evidence for e in left}
+        fit = with_latent_noise(problem, better) or better
+
+
+def _in_brief_gusts(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    enough: float,
+    removals: Mapping[str, Removal],
+) -> Fit | None:
+    """The fit without weak causes, where these are worth too little from brief gusts.
+
+    Args:
+        problem, fit: with the causes. quadratic: linearised at the fit.
+        enough: nats that causes must be worth.
+        removals: of causes that stand, each from the fit's own gusts.
+    """
+    clear = problem.settings.clear_evidence * problem.settings.evidence
+    worth = {e: removal.evidence.nats for e, removal in removals.items()}
+    weak = [e for e in worth if worth[e] < clear]
+    if len(weak) > 1 and len(weak) == len(fit.active):
+        weak.remove(max(weak, key=lambda e: worth[e]))
+    for gone in [weak, *([e] for e in weak if len(weak) > 1)]:
+        rest = dropped_in_brief_gusts(problem, fit, quadratic, gone, enough)
+        if rest is not None:
+            return rest
+    return None
 
 
 def _asked(

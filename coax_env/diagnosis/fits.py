@@ -23,6 +23,9 @@ from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.model.effect_registry import GUST_MEMORY
 
+BRIEF = 0.1
+"""s, of gusts that are tried as brief ones: shorter ones are nearly white at 100 Hz; ours."""
+
 
 def start(problem: Problem, noise: Noise, held: Collection[str] = ()) -> Fit:
     """The bare model with its own noise levels.
@@ -235,19 +238,28 @@ def with_latent_noise(problem: Problem, fit: Fit) -> Fit | None:
     return replace(fit, noise=noise, levels=levels)
 
 
+def brief_memories(noise: Noise) -> Noise:
+    """Gusts with memories of no more than BRIEF, shaken as much per second."""
+    return _with_memories(noise, BRIEF)
+
+
 def short_memories(noise: Noise) -> Noise:
     """Gusts with no longer memories than usual, shaken as much per second.
 
     Gusts that were fitted without a change have taken up a part of it, as a push that lasts: a mass
     that is 6 % less was worth 3 nats then.
     """
+    return _with_memories(noise, GUST_MEMORY)
+
+
+def _with_memories(noise: Noise, most: float) -> Noise:
     levels = {}
     for name, memory in noise.process.items():
         plain_name, at, part = name.partition(AT)
-        if plain_name in MEMORIES and memory > GUST_MEMORY:
+        if plain_name in MEMORIES and memory > most:
             gusts = plain_name.removeprefix("memory_") + at + part
-            levels[name] = GUST_MEMORY
-            levels[gusts] = noise.process[gusts] * math.sqrt(GUST_MEMORY / memory)
+            levels[name] = most
+            levels[gusts] = noise.process[gusts] * math.sqrt(most / memory)
     return noise.with_levels(levels)
 
 

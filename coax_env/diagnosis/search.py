@@ -22,9 +22,17 @@ from coax_env.diagnosis.fits import (
     stepped,
     with_latent_noise,
 )
-from coax_env.diagnosis.moves import Proposal, accepted, add, drop, swaps, trials
+from coax_env.diagnosis.moves import (
+    Proposal,
+    accepted,
+    add,
+    drop,
+    dropped_in_brief_gusts,
+    swaps,
+    trials,
+)
 from coax_env.diagnosis.problem import SERVO_FORMS, Fit, Problem
-from coax_env.diagnosis.scores import Score, most_gains, scores, threshold
+from coax_env.diagnosis.scores import Score, loss, most_gains, scores, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 
@@ -67,6 +75,7 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
             continue
         if not complete:
             moved = moved or _steadier(problem, fit, memory)
+            moved = moved or _in_brief_gusts(problem, fit, quadratic, memory)
             moved = moved or _swap(problem, fit, quadratic, memory)
             moved = moved or _trial(problem, fit, quadratic, candidates, memory)
             moved = moved or with_latent_noise(problem, fit)
@@ -114,7 +123,7 @@ class _Memory:
     """What one search must not do again.
 
     banned: effects dropped since an addition last held. tried: sets of effects that were fitted.
-    steadied: sets of effects beside which steadier noise was asked for.
+    steadied: sets of effects beside which steadier noise was asked for. briefed: and brief gusts.
     drops: how often each effect was dropped. failures: additions in a row that did not hold.
     most: effects that were active together and held.
     """
@@ -122,6 +131,7 @@ class _Memory:
     banned: set[str] = field(default_factory=set)
     tried: set[tuple[str, ...]] = field(default_factory=set)
     steadied: set[tuple[str, ...]] = field(default_factory=set)
+    briefed: set[tuple[str, ...]] = field(default_factory=set)
     drops: Counter[str] = field(default_factory=Counter)
     failures: int = 0
     most: int = 0
@@ -164,6 +174,22 @@ def _steadier(problem: Problem, fit: Fit, memory: _Memory) -> Fit | None:
         return None
     problem.report("searching on from steadier noise")
     return steady
+
+
+def _in_brief_gusts(
+    problem: Problem, fit: Fit, quadratic: Quadratic, memory: _Memory
+) -> Fit | None:
+    """Without its weak effects, all but what was worth most when it came, from brief gusts."""
+    if len(fit.active) < 2 or fit.active in memory.briefed:
+        return None
+    memory.briefed.add(fit.active)
+    came = {move.removeprefix("+ "): nats for move, nats in fit.history}
+    first = max(fit.active, key=lambda e: came.get(e, 0.0))
+    clear = problem.settings.clear_evidence * problem.settings.evidence
+    others = [e for e in fit.active if e != first]
+    weak = [e for e in others if loss(problem, quadratic, fit.active, e, 1.0) < clear]
+    enough = threshold(problem, quadratic, fit.active)
+    return dropped_in_brief_gusts(problem, fit, quadratic, weak, enough)
 
 
 def _swap(problem: Problem, fit: Fit, quadratic: Quadratic, memory: _Memory) -> Fit | None:

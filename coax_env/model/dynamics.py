@@ -238,9 +238,9 @@ def _mean_acceleration(start, asked, h, lag):
 
 @compiled()
 def _earliness(h, lag):
-    """How early in `h` seconds a rotor that lags speeds up: 0 evenly, 1 all at their start.
+    """How early in `h` seconds a rotor with a lag speeds up: 0 evenly, 1 all at first.
 
-    Of what r gains by its reaction, times `h`, half is in the heading if the rotor speeds up evenly, all
+    Of what r gains by its reaction, times `h`, half is in the heading if it speeds up evenly, all
     of it if at once: 1 / (1 - exp(-h / lag)) - lag / h.
     """
     slow = lag > SHORTEST_LAG
