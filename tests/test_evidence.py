@@ -168,9 +168,9 @@ def test_without_a_cause_latent_noise_is_asked_for(monkeypatch):
 @pytest.mark.slow
 def test_a_strong_cause_beside_brief_gusts_and_a_drift_is_alone_and_at_its_size(tmp_path):
     """Until its reaction is found, the moment's gusts seem long. Then these stayed so beside a yaw
-    damping of 109 nats, sure, and a yaw inertia that nobody hid, and the gain was 0.40. **Synthetic**."""
-    trims = {"trim_thrust": 8e-4, "trim_torque": 9e-4}
-    air = Air("markov", 0.19, 0.0058, 0.0029, memory=(2.0, 0.053), **trims)
+    damping of 109 nats, sure, and a yaw inertia that nobody hid; the gain was 0.40. **Synthetic**."""
+    trims = {"trim_thrust": 8.45e-4, "trim_torque": 9.06e-4}
+    air = Air("markov", 0.194, 0.00581, 0.00291, memory=(1.99, 0.0526), **trims)
     hidden = {"spin_up_reaction": {"gain": 0.858}}
     injector.fly(tmp_path, hidden, gusts=air, seed=139619247, craft=COAX, card_noise=None,
                  longest=14.0)  # fmt: skip

@@ -98,7 +98,7 @@ def believes_its_sensors(monkeypatch) -> None:
     monkeypatch.setattr(searched, "with_clock_errors", lambda problem, fit: None)
     monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: None)
     monkeypatch.setattr(searched, "_may_hide_jitter", lambda found: False)
-    monkeypatch.setattr(searched, "_is_much_coloured", lambda problem, fit: False)
+    monkeypatch.setattr(searched, "is_much_coloured", lambda problem, fit: False)
     monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
 
 
@@ -348,7 +348,7 @@ def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
 def test_jitter_is_asked_by_poses_alone_where_something_is_named(
     monkeypatch, alone, aboard, active, coloured, may
 ):
-    monkeypatch.setattr(searched, "_is_much_coloured", lambda problem, fit: coloured)
+    monkeypatch.setattr(searched, "is_much_coloured", lambda problem, fit: coloured)
     problem = SimpleNamespace(sees_poses_alone=alone, aboard=frozenset(aboard))
     found = SimpleNamespace(problem=problem, fit=Fit(active, {}, FINE))
     assert searched._may_hide_jitter(found) == may  # type: ignore[arg-type]
@@ -396,7 +396,7 @@ def test_air_of_each_runs_own_stands_where_little_is_coloured_in_it(monkeypatch,
     monkeypatch.setattr(searched, "with_own_air", with_own_air)
     monkeypatch.setattr(
         searched,
-        "_is_much_coloured",
+        "is_much_coloured",
         lambda problem, fit: coloured or (problem, fit) != (own, there),
     )
     monkeypatch.setattr(searched, "_searched", lambda problem, noise: (problem.name, noise))

@@ -21,10 +21,15 @@ from coax_env.estimation.parted_engine import AT, PartedEngine, joint_noise, of_
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
+from coax_env.estimation.whiteness import colour, whiteness
 from coax_env.model.effect_registry import GUST_MEMORY
 
 BRIEF = 0.1
 """s, of gusts that are tried as brief ones: shorter ones are nearly white at 100 Hz; ours."""
+
+MUCH = 0.1
+"""Share of the innovations, in the mean of the channels, from which a model lacks something else than
+its noise; ours. It is 0.02 to 0.05 on **synthetic** flights in joint gusts, 0.12 to 0.9 on the CoaX."""
 
 
 def start(problem: Problem, noise: Noise, held: Collection[str] = ()) -> Fit:
@@ -295,3 +300,9 @@ def _score(problem: Problem, fit: Fit, score: NoiseScore, name: str) -> float:
     """Slope in a level over its scatter from block to block [std]."""
     parts, _ = level_slopes(problem.engine, fit.values, fit.noise, name, score)
     return float(parts.sum() / (np.sqrt(parts.size) * parts.std() + 1e-300))
+
+
+def is_much_coloured(problem: Problem, fit: Fit) -> bool:
+    """Whether more than MUCH of the innovations is foretold by their own past."""
+    passes = problem.engine.filter(fit.values, fit.noise)
+    return colour(whiteness(passes, problem.model.channels).values()) > MUCH

@@ -9,6 +9,7 @@ from coax_env.diagnosis.fits import (
     brief_memories,
     converged,
     fitted,
+    is_much_coloured,
     noise_fitted,
     stepped,
     with_latent_noise,
@@ -265,14 +266,16 @@ def dropped_in_brief_gusts(
     without either 1.2 s, and from 0.1 s 86 nats likelier than with them (**synthetic**).
 
     Drifts and white noise that such an effect had stood for are asked for, too: a torque that drifts is
-    next to a yaw inertia, which came out 40 % too large without.
+    next to a yaw inertia, which came out 40 % too large without. What a model lacks looks like drifts:
+    on a real helicopter they stood for a yaw damping of 52 nats, with which 72 % of the error was
+    removed, and 45 with them; so they are asked only where little of what is read is coloured.
 
     Args:
         problem, fit: what may be free, and where.
         quadratic: linearised at the fit.
         gone: the effects. enough: nats that they must be worth.
     """
-    if not gone:
+    if not gone or is_much_coloured(problem, fit):
         return None
     rest = without(problem, fit, quadratic, *gone)
     rest = replace(rest, noise=brief_memories(rest.noise))

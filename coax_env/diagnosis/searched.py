@@ -44,7 +44,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.clock_errors import with_clock_errors
-from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
+from coax_env.diagnosis.fits import fitted, is_much_coloured, noise_fitted, start, steadied
 from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
@@ -69,7 +69,7 @@ from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import with_jitter
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.whiteness import colour, is_white, whiteness
+from coax_env.estimation.whiteness import is_white, whiteness
 from coax_env.model.layout import INERTIAL
 
 COARSENESS = (1.0, 3.0)
@@ -86,9 +86,6 @@ instead of them. On three flights with such errors the best change was worth 0.0
 asking took 64 s of 110; growth scores less than it is worth; ours."""
 NEARLY = 0.1
 """Share of its time by which a low-pass must be another one for a further search; ours."""
-MUCH = 0.1
-"""Share of the innovations, in the mean of the channels, from which a model lacks something else than
-its noise; ours. It is 0.02 to 0.05 on **synthetic** flights in joint gusts, 0.12 to 0.9 on the CoaX."""
 FINER = 2.0
 """Times finer than LEAST_READING_STD that a channel must be for a second search; ours."""
 
@@ -291,7 +288,7 @@ def _with_own_air(found: Searched, noise: Noise) -> Searched:
         found: in the same air on all runs. noise: levels that it started from.
     """
     own = None if found.air_asked else with_own_air(found.problem, found.fit)
-    if own is None or _is_much_coloured(*own):
+    if own is None or is_much_coloured(*own):
         return replace(found, air_asked=True)
     problem, _ = own
     problem.report("searching again in air of each run's own")
@@ -439,13 +436,7 @@ def _may_hide_jitter(found: Searched) -> bool:
     """
     problem = found.problem
     unseen = problem.sees_poses_alone and problem.aboard.isdisjoint(ROTOR_SPEEDS)
-    return unseen and bool(found.fit.active) and not _is_much_coloured(problem, found.fit)
-
-
-def _is_much_coloured(problem: Problem, fit: Fit) -> bool:
-    """Whether more than MUCH of the innovations is foretold by their own past."""
-    passes = problem.engine.filter(fit.values, fit.noise)
-    return colour(whiteness(passes, problem.model.channels).values()) > MUCH
+    return unseen and bool(found.fit.active) and not is_much_coloured(problem, found.fit)
 
 
 def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
@@ -473,7 +464,7 @@ def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:
     Args:
         found: with such gusts already, or without. noise: levels that it started from.
     """
-    if _is_much_coloured(found.problem, found.fit):
+    if is_much_coloured(found.problem, found.fit):
         return found
     joint = in_joint_gusts(found.problem, found.fit)
     if joint is None:
@@ -481,7 +472,7 @@ def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:
     problem, fit = joint
     problem.report("searching again with gusts that push and turn at once")
     other = _likelier(_searched(problem, noise, found.coarse), fit)
-    if not other.cost < found.cost or _is_much_coloured(other.problem, other.fit):
+    if not other.cost < found.cost or is_much_coloured(other.problem, other.fit):
         return found
     return replace(other, low_passes=found.low_passes)
 
