@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coax_env import load_vehicle
-from coax_env.diagnosis import searched
+from coax_env.diagnosis import fits, searched
 from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.searched import Searched
 from coax_env.diagnosis.sensor_low_pass import hidden_behind
@@ -329,7 +329,7 @@ def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
     monkeypatch.setattr(
         searched, "cost", lambda problem, fit, quadratic: costs[problem.name == "joint"]
     )
-    monkeypatch.setattr(searched, "whiteness", shown)
+    monkeypatch.setattr(fits, "whiteness", shown)
     found = searched._with_joint_gusts(first, FINE)
     assert (found.problem is joint) == used and found.low_passes == first.low_passes
     assert found is first or used
