@@ -305,6 +305,7 @@ def refits(monkeypatch):
         return replace(fit, objective=1000.0 + above[fit.active[-1]])
 
     monkeypatch.setattr(confounding, "fitted", ended)
+    monkeypatch.setattr(confounding, "converged", lambda problem, fit: fit)
     return above
 
 
@@ -337,6 +338,28 @@ def test_a_lags_delay_stands_for_it_within_a_tie_of_the_refit(refits, inflation,
     slope[names.index("servo_delay.time")] = -50.0 / std[names.index("servo_delay.time")]
     found = confounding._of_one(SERVO, fit, replace(q, g=slope), "servo_lag", inflation, lost)
     assert set(found) == {"servo_delay"}
+
+
+@pytest.mark.parametrize(
+    ("alone", "off", "there"),
+    [(True, 15.0, True), (True, 18.0, False), (False, 15.0, False), (False, 5.0, True)],
+)
+def test_by_poses_alone_a_turned_frame_stands_for_a_swash_phase_within_a_tenth(
+    monkeypatch, refits, alone, off, there
+):
+    """Of 166 nats of a phase 8 to 14 were between them where a frame was turned by that angle."""
+    pair = ("swash_phase", "frame_yaw")
+    problem = replace(PROBLEM, own={e: tuple(MODEL.effect_parameters(e)) for e in pair})
+    vars(problem)["sees_poses_alone"] = alone
+    monkeypatch.setattr(confounding, "_near", lambda *given: [])
+    monkeypatch.setattr(confounding, "swap", lambda *given: (0.0, np.zeros(0)))
+    monkeypatch.setattr(confounding, "score", lambda *given: SimpleNamespace(evidence=0.0))
+    q: Any = SimpleNamespace(moved=lambda move: {})
+    refits["frame_yaw"] = off
+    fit = Fit(pair[:1], {}, NOISE, objective=1000.0)
+    assert set(confounding._of_one(problem, fit, q, "swash_phase", 1.0, 166.0)) == (
+        {"frame_yaw"} if there else set()
+    )
 
 
 @pytest.mark.parametrize(

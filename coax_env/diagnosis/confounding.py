@@ -8,7 +8,7 @@ import numpy as np
 from coax_env.design.discrimination import Alternative, logged_rates
 from coax_env.design.next_maneuver import Design, design
 from coax_env.diagnosis.evidence import Evidence
-from coax_env.diagnosis.fits import fitted
+from coax_env.diagnosis.fits import converged, fitted
 from coax_env.diagnosis.problem import SERVO_FORMS, Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import score, swap
 from coax_env.estimation.quadratic import Quadratic
@@ -22,6 +22,8 @@ NEAR_TIES = 3.0
 """Ties by the quadratic within which an alternative is refitted; ours."""
 TWIN_STEPS = 6
 """Gauss-Newton steps from a lag to a delay of nothing, which is far; ours."""
+UNCONVERGED = 2.0
+"""Times what may be between them within which a twin's noise is fitted, too; ours."""
 
 LATE = frozenset({"command_delay", "pose_delay"})
 """By poses alone one lateness: what was commanded is seen so much later. The likelihood prefers one
@@ -113,8 +115,11 @@ def _of_one(
         _, move = swap(problem, quadratic, fit.active, effect, twin)
         trial = refit(twin, move, steps=TWIN_STEPS)
         mixed = score(problem, quadratic, fit.active, twin).evidence > chosen.evidence
-        form = chosen.form_share * lost if effect in SERVO_FORMS else 0.0
-        if mixed or trial.objective - fit.objective < max(tie, form):
+        alike = effect in SERVO_FORMS or problem.sees_poses_alone
+        most = max(tie, chosen.form_share * lost if alike else 0.0)
+        if most < trial.objective - fit.objective < UNCONVERGED * most:
+            trial = converged(problem, trial)
+        if mixed or trial.objective - fit.objective < most:
             found[twin] = trial
     return found
 
