@@ -131,11 +131,12 @@ def test_gusts_are_unlike_the_filters_where_no_accelerometer_is_white(monkeypatc
 @pytest.mark.parametrize(
     ("worth", "asked"),
     [
-        ({"motor_lag": CLEAR, "gyro_bias": 1.5, "yaw_damping": 2.0},
-         [["gyro_bias", "yaw_damping"], ["gyro_bias"], ["yaw_damping"]]),
-        ({"motor_lag": 3.0, "gyro_bias": 1.5, "yaw_damping": 2.0},  # but the strongest
-         [["gyro_bias", "yaw_damping"], ["gyro_bias"], ["yaw_damping"]]),
+        ({"gyro_bias": CLEAR, "motor_lag": 1.5, "yaw_damping": 2.0},
+         [["motor_lag", "yaw_damping"], ["motor_lag"], ["yaw_damping"]]),
+        ({"servo_lag": 3.0, "motor_lag": 1.5, "yaw_damping": 2.0},  # but the strongest
+         [["motor_lag", "yaw_damping"], ["motor_lag"], ["yaw_damping"]]),
         ({"yaw_damping": 2.0}, [["yaw_damping"]]),
+        ({"yaw_damping": 2.0, "swash_offset": 2.0}, [["yaw_damping"]]),  # no gust looks like that
         ({"motor_lag": CLEAR}, []),
     ],
 )  # fmt: skip

@@ -192,7 +192,8 @@ def test_after_three_additions_that_did_not_hold_no_more_are_made(moves):
 
 def test_in_brief_gusts_all_weak_effects_leave_but_what_was_worth_most_when_it_came(monkeypatch):
     """Once for each set of effects; what is worth ten thresholds is not asked to leave."""
-    worth = {"yaw_damping": 99.0, "spin_up_reaction": 70.0, "servo_play": 268.0, "motor_lag": 5.0}
+    worth = {"yaw_damping": 99.0, "spin_up_reaction": 70.0, "servo_play": 268.0, "motor_lag": 5.0,
+             "gyro_bias": 20.0}  # fmt: skip
     history = (("+ yaw_damping", 63.0), ("+ spin_up_reaction", 410.0), ("- yaw_damping", 900.0),
                ("+ servo_play", 51.0), ("+ motor_lag", 15.0))  # fmt: skip
     fit = Fit(tuple(worth), {}, Noise({}), history=history)

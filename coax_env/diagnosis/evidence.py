@@ -96,7 +96,7 @@ def weigh(
 
 
 def prune(
-    problem: Problem, fit: Fit, clear: Collection[str] = ()
+    problem: Problem, fit: Fit, clear: Collection[str] = (), again: bool = False
 ) -> tuple[Fit, Quadratic, dict[str, Evidence]]:
     """Remove, one at a time, causes whose evidence is gone once the noise levels are fitted too.
 
@@ -106,6 +106,7 @@ def prune(
     Args:
         problem, fit: what may be free, and where.
         clear: known to be, and not weighed unless the quadratic doubts them.
+        again: whether these causes were asked from brief gusts already.
 
     Returns:
         the fit, refined where something was weighed, the quadratic at it, with the candidates then, and
@@ -131,7 +132,7 @@ def prune(
             if better is not None:
                 break
         else:
-            better = _in_brief_gusts(problem, fit, quadratic, enough, removals)
+            better = None if again else _in_brief_gusts(problem, fit, quadratic, enough, removals)
             if better is None:
                 left = (e for e in fit.active if e in removals)
                 return fit, quadratic, {e: removals[e].evidence for e in left}
@@ -145,7 +146,8 @@ def _in_brief_gusts(
     enough: float,
     removals: Mapping[str, Removal],
 ) -> Fit | None:
-    """The fit without weak causes, where these are worth too little from brief gusts.
+    """The fit without weak causes that gusts may hide or stand for, where these are worth too little
+    from brief ones.
 
     Args:
         problem, fit: with the causes. quadratic: linearised at the fit.
@@ -154,7 +156,7 @@ def _in_brief_gusts(
     """
     clear = problem.settings.clear_evidence * problem.settings.evidence
     worth = {e: removal.evidence.nats for e, removal in removals.items()}
-    weak = [e for e in worth if worth[e] < clear]
+    weak = [e for e in worth if worth[e] < clear and e in WEAK_OR_LATE]
     if len(weak) > 1 and len(weak) == len(fit.active):
         weak.remove(max(weak, key=lambda e: worth[e]))
     for gone in [weak, *([e] for e in weak if len(weak) > 1)]:
@@ -205,7 +207,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
             return first, pruned, quadratic, evidence
         enough = problem.settings.clear_evidence * problem.settings.evidence
         clear = [e for e in pruned.active if evidence[e].nats >= enough]
-        asked, _, other = prune(second, _only(second, again, pruned.active), clear)
+        asked, _, other = prune(second, _only(second, again, pruned.active), clear, True)
         if asked.active == pruned.active:
             lesser = {
                 e: min(x, other.get(e, x), key=lambda worth: worth.nats)

@@ -31,7 +31,7 @@ from coax_env.diagnosis.moves import (
     swaps,
     trials,
 )
-from coax_env.diagnosis.problem import SERVO_FORMS, Fit, Problem
+from coax_env.diagnosis.problem import SERVO_FORMS, WEAK_OR_LATE, Fit, Problem
 from coax_env.diagnosis.scores import Score, loss, most_gains, scores, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
@@ -179,14 +179,14 @@ def _steadier(problem: Problem, fit: Fit, memory: _Memory) -> Fit | None:
 def _in_brief_gusts(
     problem: Problem, fit: Fit, quadratic: Quadratic, memory: _Memory
 ) -> Fit | None:
-    """Without its weak effects, all but what was worth most when it came, from brief gusts."""
+    """Without weak effects that gusts may hide, all but what was worth most when it came."""
     if len(fit.active) < 2 or fit.active in memory.briefed:
         return None
     memory.briefed.add(fit.active)
     came = {move.removeprefix("+ "): nats for move, nats in fit.history}
     first = max(fit.active, key=lambda e: came.get(e, 0.0))
     clear = problem.settings.clear_evidence * problem.settings.evidence
-    others = [e for e in fit.active if e != first]
+    others = [e for e in fit.active if e != first and e in WEAK_OR_LATE]
     weak = [e for e in others if loss(problem, quadratic, fit.active, e, 1.0) < clear]
     enough = threshold(problem, quadratic, fit.active)
     return dropped_in_brief_gusts(problem, fit, quadratic, weak, enough)
