@@ -285,7 +285,7 @@ def dropped_in_brief_gusts(
     lost = rest.objective - fit.objective
     if lost >= enough:
         return None
-    problem.report(f"dropped {and_list(gone)}: worth {lost:.1f} nats from brief gusts")
+    problem.report(f"dropped {and_list(list(gone))}: worth {lost:.1f} nats from brief gusts")
     for effect in gone:
         rest = rest.noted(f"- {effect}", max(lost, 0.0))
     return rest
