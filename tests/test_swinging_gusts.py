@@ -178,9 +178,11 @@ def passes(gust: np.ndarray) -> list[SimpleNamespace]:
     return [SimpleNamespace(states=part) for part in np.array_split(states, 3)]
 
 
-def test_a_spectrum_shows_at_what_frequency_a_gust_comes():
+@pytest.mark.parametrize("offset", [0.0, 3.0])
+def test_a_spectrum_shows_at_what_frequency_a_gust_comes(offset):
+    """Also about what is no gust: a moment that a centre of gravity has made all the time."""
     t, rng = 0.01 * np.arange(4500), np.random.default_rng(1)
-    wave = np.sin(2.0 * np.pi * 0.8 * t) + 0.3 * rng.standard_normal(t.size)
+    wave = np.sin(2.0 * np.pi * 0.8 * t) + 0.3 * rng.standard_normal(t.size) + offset
     assert swings(passes(wave), 0.01) == pytest.approx([0.0, 0.8, 0.0, 0.0, 0.0, 0.0])
     assert clearest(passes(wave), 0.01) == "force_xy"
 
