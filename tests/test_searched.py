@@ -181,9 +181,37 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
     monkeypatch.setattr(searched, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
+    monkeypatch.setattr(searched, "with_other_swings", lambda problem, fit: None)
     found = searched.searched(fading, Noise({"force_xy": 0.2}), {})  # type: ignore[arg-type]
     assert asked == [(fading, 0.2), (swinging, 0.7)]
     assert found.problem is (swinging if white else fading) and found.low_passes == {}
+
+
+@pytest.mark.parametrize(("costs", "used"), [((5.0, 3.0), True), ((3.0, 5.0), False)])
+def test_a_swing_that_what_was_found_had_hidden_is_searched_beside_where_that_is_likelier(
+    monkeypatch, costs, used
+):
+    engine = SimpleNamespace(filter=lambda values, noise: [])
+    model = SimpleNamespace(channels=())
+    fading, swinging, other = (
+        SimpleNamespace(name=name, report=lambda text: None, engine=engine, model=model)
+        for name in ("fading", "swinging", "other")
+    )
+    worth = dict(zip(("swinging", "other"), costs, strict=True))
+
+    def of(problem: Any, noise: Noise) -> Searched:
+        fit = Fit((), {}, noise)
+        return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(searched, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
+    monkeypatch.setattr(searched, "with_other_swings", lambda p, fit: (other, {"force_xy": 0.9}))
+    monkeypatch.setattr(searched, "_searched", of)
+    monkeypatch.setattr(searched, "cost", lambda problem, fit, quadratic: worth[problem.name])
+    monkeypatch.setattr(searched, "is_white", lambda passes, channels: True)
+    noise = Noise({"force_xy": 0.2})
+    found = searched._in_swings(of(fading, noise), noise)
+    assert found is not None and found.problem is (other if used else swinging)
+    assert found.fit.noise.level("force_xy") == (0.9 if used else 0.7)
 
 
 @pytest.mark.parametrize(("left", "asked"), [(False, ["swings"]), (True, ["swings", "shocks"])])
@@ -258,6 +286,7 @@ def test_jitter_is_asked_first_where_rotor_speeds_show_it_and_gusts_beside_it(
 
     monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
     monkeypatch.setattr(searched, "with_swings", with_swings)
+    monkeypatch.setattr(searched, "with_other_swings", lambda problem, fit: None)
     monkeypatch.setattr(searched, "_jittery", with_jitter)
     monkeypatch.setattr(searched, "_searched", of)
     monkeypatch.setattr(

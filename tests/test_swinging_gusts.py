@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import injector
 import numpy as np
@@ -229,6 +230,20 @@ def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, peak, alone, 
     if found is not None:
         levels = {**LEVELS, **{f"memory_{axes}": 1.25 for axes in AXES}}  # one swing at 0.8 Hz
         assert found[0] is problem and found[1] == pytest.approx(levels)
+
+
+@pytest.mark.parametrize(("peak", "asked"), [(0.8, False), (0.71, True), (2.3, True), (0.0, False)])
+def test_a_swing_far_from_its_spectrums_peak_is_fitted_from_there(monkeypatch, peak, asked):
+    """It swings at 0.29 times, or 2 to 2.9 times the peak's frequency, but not at 1.6 times."""
+    at = {0.8: 1.28, 0.71: 0.29, 2.3: 0.8, 0.0: 0.8}[peak]
+    model = ErringModel(SwingingModel(PLAIN, (0.9, 0.0, 0.0, at, 0.0, 0.0)))
+    problem: Any = SimpleNamespace(
+        model=model, row=0.01, engine=SimpleNamespace(filter=lambda values, noise: [])
+    )
+    monkeypatch.setattr(asking, "swings", lambda passes, row: [0.8, 0.5, 0.0, peak, 0.0, 0.0])
+    monkeypatch.setattr(asking, "_fitted_from", lambda problem, fit, found: found)
+    found = asking.with_other_swings(problem, Fit((), {}, NOISE))
+    assert found == ([0.8, 0.5, 0.0, peak, 0.0, 0.0] if asked else None)
 
 
 @pytest.mark.parametrize(("axes", "alone"), [("force_xy", [0.8, 0.9]), ("moment_z", [0.5])])

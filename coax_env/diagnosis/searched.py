@@ -56,7 +56,7 @@ from coax_env.diagnosis.search import search
 from coax_env.diagnosis.sensor_errors import with_lasting_errors
 from coax_env.diagnosis.sensor_low_pass import GROUPS, hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
-from coax_env.diagnosis.swings import with_swings
+from coax_env.diagnosis.swings import with_other_swings, with_swings
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.helicopter_noise import (
     JITTER_LEVEL,
@@ -307,6 +307,13 @@ def _in_swings(found: Searched, noise: Noise) -> Searched | None:
     problem, levels = swinging
     problem.report("gusts have a frequency: searching again with that")
     other = _searched(problem, noise.with_levels(levels))
+    again = with_other_swings(problem, other.fit)
+    if again is not None:
+        problem, levels = again
+        problem.report("a gust has another frequency: searching again with that")
+        likelier = _searched(problem, noise.with_levels(levels))
+        other = likelier if likelier.cost < other.cost else other
+    problem = other.problem
     passes = problem.engine.filter(other.fit.values, other.fit.noise)
     return other if is_white(passes, problem.model.channels) else None
 

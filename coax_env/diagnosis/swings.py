@@ -23,7 +23,13 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import AXES, GUST_AXES, GUST_LEVELS, MEMORIES
 from coax_env.estimation.noise_levels import evenly_picked
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.swinging_gusts import FASTEST, clearest, swinging_at, swings
+from coax_env.estimation.swinging_gusts import (
+    FASTEST,
+    clearest,
+    frequencies_of,
+    swinging_at,
+    swings,
+)
 from coax_env.plain_words import and_list
 
 TURNS = 3
@@ -32,6 +38,9 @@ EVALUATIONS = 60
 """Likelihoods of a group's frequencies, memory and level, at most; ours."""
 SWUNG = 1.0
 """Swings that a memory lasts, where its fit begins: a sixth of critical damping; ours."""
+FAR = 1.7
+"""Times the frequency of a swing, or part of it, at which its spectrum peaks, from which on it is
+fitted once more: a peak is up to 0.1 Hz off; ours."""
 SLOWEST = 0.05
 """Hz: slower, no run shows a swing of; ours."""
 
@@ -49,6 +58,26 @@ def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] 
     alone = _gained_by(problem, fit, frequencies, clearest(passes, problem.row))
     if alone < problem.settings.tie:
         return None
+    return _fitted_from(problem, fit, frequencies)
+
+
+def with_other_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] | None:
+    """As `with_swings`, of gusts that swing already: where a spectrum shows another frequency.
+
+    What was found beside them had hidden it: a centre of gravity that is off, the moments'.
+    """
+    swinging = frequencies_of(problem.model)
+    found = swings(problem.engine.filter(fit.values, fit.noise), problem.row)
+    apart = [abs(math.log(f / was)) for f, was in zip(found, swinging, strict=True) if f * was]
+    if max(apart, default=0.0) < math.log(FAR):
+        return None
+    return _fitted_from(problem, fit, found)
+
+
+def _fitted_from(
+    problem: Problem, fit: Fit, frequencies: Sequence[float]
+) -> tuple[Problem, dict[str, float]] | None:
+    """Frequencies, noise levels and numbers fitted in turns, where that is worth the threshold."""
     best = _swinging(problem, frequencies)
     trial = replace(fit, noise=_lasting(fit.noise, frequencies))
     last = math.inf
