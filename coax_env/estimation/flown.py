@@ -17,7 +17,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from coax_env.estimation.lost_rows import longest_believed
 from coax_env.logs.flight import Flight, Run
 from coax_env.logs.held import MISSING
 from coax_env.logs.held_signal import integral_of_held
@@ -26,6 +25,13 @@ from coax_env.logs.repairs import GAP, hold_last
 from coax_env.model.layout import RPM_PER_RAD_S
 from coax_env.model.vehicle import Vehicle
 
+LONGEST_BELIEVED = 0.25
+"""Time [s] for which the last command is believed, and not less than BELIEVED_STEPS usual steps.
+
+A swash command that is 0.05 rad off turns a machine of this size by half a radian in that time. Gaps of
+radio links that are shorter cost less by a held command than by a filter that starts anew; ours.
+"""
+BELIEVED_STEPS = 5.0
 JUMP = 3.0
 """Times the rms of what a command does in the time of a gap, over all runs, from which on it jumped.
 
@@ -151,6 +157,11 @@ def _part(run: Run, rows: np.ndarray, name: str) -> Run:
         began=run.beginning,
         battery=None if run.battery is None else run.battery[rows],
     )
+
+
+def longest_believed(t: np.ndarray) -> float:
+    """Time [s] for which a run's last command is believed; t: (n,) its rows."""
+    return max(LONGEST_BELIEVED, BELIEVED_STEPS * float(np.median(np.diff(t))))
 
 
 def jumps_in_gaps(times: Sequence[np.ndarray], commands: Sequence[np.ndarray]) -> list[np.ndarray]:

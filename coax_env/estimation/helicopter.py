@@ -23,7 +23,6 @@ from numba import float64, types
 
 from coax_env.estimation import helicopter_noise
 from coax_env.estimation.compiled_model import LANES_MEASURE, LANES_STEP
-from coax_env.estimation.lost_rows import longest_believed, lost_rows
 from coax_env.estimation.state_space import FreeParameter, Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled, pointer
 from coax_env.kernel.simd import any_lane, simd_view
@@ -455,18 +454,10 @@ def _to_the_middle(t: np.ndarray, delay: float) -> np.ndarray:
 
 
 def record_of(run: Run) -> Record:
-    """A run as the engine sees it: with the rows that its log lost, which have no readings."""
-    t = np.sort(np.concatenate([run.t, lost_rows(run.t, longest_believed(run.t))]))
-    logged = np.searchsorted(t, run.t)
-    z = np.full((t.size, len(CHANNELS)), np.nan)
+    """A run as the engine sees it."""
+    z = np.full((run.t.size, len(CHANNELS)), np.nan)
     for channel, values in run.measured.items():
-        z[logged, CHANNELS.index(channel)] = values
-
-    def over(values: np.ndarray) -> np.ndarray:
-        return np.interp(t, run.t, values)
-
-    command = np.column_stack([over(one) for one in run.command.T])
-    battery = None if run.battery is None else over(run.battery)
+        z[:, CHANNELS.index(channel)] = values
     return Record(
-        run.name, t, command, z, origin=run.beginning, run=run.whole, battery=battery
+        run.name, run.t, run.command, z, origin=run.beginning, run=run.whole, battery=run.battery
     )
