@@ -248,7 +248,7 @@ def weighed(
             the quadratic doubts it.
     """
     chosen = state.problem.settings
-    enough = chosen.clear_evidence * chosen.evidence
+    enough = chosen.clear
 
     def one(effect: str, score: Score) -> Weighed:
         rest = state.without(effect).fitted().with_noise()

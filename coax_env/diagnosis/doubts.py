@@ -230,7 +230,7 @@ def weak(nats: float, shaken: bool, chosen: Settings) -> Iterator[str]:
     Args:
         nats: its evidence. shaken: whether gusts come in single shocks. chosen: what is enough.
     """
-    if shaken and nats < chosen.clear_evidence * chosen.evidence:
+    if shaken and nats < chosen.clear:
         yield f"gusts come in single shocks here, and {nats:.0f} nats may be one of them"
     elif nats < chosen.sure_evidence:
         yield f"it is worth {nats:.0f} nats only: an effect that is in no list may look like it"

@@ -87,7 +87,7 @@ def weigh(
         rest = fitted(problem, rest, steps=1, held=held)
         lost = rest.objective - fit.objective
         foretold = loss(problem, quadratic, fit.active, effect, 1.0)
-        clear = chosen.clear_evidence * chosen.evidence * factor
+        clear = chosen.clear * factor
         if lost < clear or lost > AMISS * foretold:
             rest = converged(problem, rest, held)
         return Removal(Evidence(float(rest.objective - fit.objective), factor), rest)
@@ -154,7 +154,7 @@ def _in_brief_gusts(
         enough: nats that causes must be worth.
         removals: of causes that stand, each from the fit's own gusts.
     """
-    clear = problem.settings.clear_evidence * problem.settings.evidence
+    clear = problem.settings.clear
     worth = {e: removal.evidence.nats for e, removal in removals.items()}
     weak = [e for e in worth if worth[e] < clear and e in WEAK_OR_LATE]
     if len(weak) > 1 and len(weak) == len(fit.active):
@@ -205,9 +205,9 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         pruned, quadratic, evidence = prune(first, start)
         if not has_command_gains(wider) or not pruned.active:
             return first, pruned, quadratic, evidence
-        enough = problem.settings.clear_evidence * problem.settings.evidence
+        enough = problem.settings.clear
         clear = [e for e in pruned.active if evidence[e].nats >= enough]
-        asked, _, other = prune(second, _only(second, again, pruned.active), clear, True)
+        asked, _, other = prune(second, _only(second, again, pruned.active), clear, again=True)
         if asked.active == pruned.active:
             lesser = {
                 e: min(x, other.get(e, x), key=lambda worth: worth.nats)
@@ -258,7 +258,7 @@ def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) ->
 
 def _is_doubtful(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:
     """Whether a cause is not worth several thresholds by the quadratic."""
-    enough = problem.settings.clear_evidence * problem.settings.evidence
+    enough = problem.settings.clear
     return _worth(problem, fit, quadratic, effect) < enough
 
 

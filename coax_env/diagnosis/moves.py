@@ -234,7 +234,7 @@ def drop(problem: Problem, fit: Fit, quadratic: Quadratic, coloured: bool) -> Fi
 def _settled(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> Fit | None:
     """The fit once noise and values have settled, where that makes large what is worth much."""
     chosen = problem.settings
-    if loss(problem, quadratic, fit.active, effect, 1.0) < chosen.clear_evidence * chosen.evidence:
+    if loss(problem, quadratic, fit.active, effect, 1.0) < chosen.clear:
         return None
     fit = converged(problem, fit)
     if not is_large(problem, effect, fit.values):

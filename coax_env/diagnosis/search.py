@@ -185,7 +185,7 @@ def _in_brief_gusts(
     memory.briefed.add(fit.active)
     came = {move.removeprefix("+ "): nats for move, nats in fit.history}
     first = max(fit.active, key=lambda e: came.get(e, 0.0))
-    clear = problem.settings.clear_evidence * problem.settings.evidence
+    clear = problem.settings.clear
     others = [e for e in fit.active if e != first and e in WEAK_OR_LATE]
     weak = [e for e in others if loss(problem, quadratic, fit.active, e, 1.0) < clear]
     enough = threshold(problem, quadratic, fit.active)

@@ -69,7 +69,7 @@ from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import with_jitter
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.whiteness import is_white, whiteness
+from coax_env.estimation.whiteness import are_white, is_white, whiteness
 from coax_env.model.layout import INERTIAL
 
 COARSENESS = (1.0, 3.0)
@@ -432,7 +432,7 @@ def _is_coloured(found: Searched, channels: Sequence[str]) -> bool:
     """Whether one of some channels is."""
     passes = found.problem.engine.filter(found.fit.values, found.fit.noise)
     shown = whiteness(passes, found.problem.model.channels)
-    return not all(shown[channel].white for channel in channels if channel in shown)
+    return not are_white(shown, channels)
 
 
 def _may_hide_jitter(found: Searched) -> bool:

@@ -17,7 +17,6 @@ smoothed: asked of them too, errors that were worth 1,700 nats were not used bes
 a clean **synthetic** flight had a false name (`--arms mixed`, seed 100).
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted
@@ -25,7 +24,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import ERROR_LEVELS, ERROR_MEMORIES
 from coax_env.estimation.lasting_errors import ErringModel, with_errors
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.whiteness import Whiteness, whiteness
+from coax_env.estimation.whiteness import are_white, whiteness
 from coax_env.model.layout import ACCELEROMETERS, GYROS, MOTION, SENSOR_GROUPS
 from coax_env.plain_words import and_list
 
@@ -56,7 +55,7 @@ def with_lasting_errors(
         for group, felt_by in FELT_BY.items()
         if problem.aboard.issuperset(felt_by)
         and not problem.aboard.isdisjoint(SENSOR_GROUPS[group])
-        and (problem.of_onboard_filter or _is_coloured(group, seen))
+        and (problem.of_onboard_filter or not are_white(seen, SENSOR_GROUPS[group]))
     ]
     if problem.sees_poses_alone and BIAS in fit.active:
         asked.append("attitude")
@@ -68,15 +67,10 @@ def with_lasting_errors(
     if gained < problem.settings.evidence:
         return None
     left = whiteness(wider.engine.filter(trial.values, trial.noise), channels)
-    if not all(left[c].white for c in MOTION if c in left):
+    if not are_white(left, MOTION):
         return None
     levels = {name: trial.noise.level(name) for name in trial.levels if name in LEVELS_OF_ERRORS}
     return wider, trial, with_errors(noise).with_levels(levels)
-
-
-def _is_coloured(group: str, seen: Mapping[str, Whiteness]) -> bool:
-    """Whether one of a group's channels is."""
-    return any(c in seen and not seen[c].white for c in SENSOR_GROUPS[group])
 
 
 def _erring(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:

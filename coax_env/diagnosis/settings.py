@@ -151,6 +151,11 @@ class Settings:
     most_warnings: int = 3
     """Such remarks; ours."""
 
+    @property
+    def clear(self) -> float:
+        """Evidence [nats] of a cause that is clear."""
+        return self.clear_evidence * self.evidence
+
 
 SETTINGS = Settings()
 """What the diagnosis uses, and what its calibration and studies were measured with."""

@@ -23,13 +23,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import AXES, GUST_AXES, GUST_LEVELS, MEMORIES
 from coax_env.estimation.noise_levels import evenly_picked
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.swinging_gusts import (
-    FASTEST,
-    clearest,
-    frequencies_of,
-    swinging_at,
-    swings,
-)
+from coax_env.estimation.swinging_gusts import FASTEST, clearest, swinging_at, swings
 from coax_env.plain_words import and_list
 
 TURNS = 3
@@ -66,9 +60,9 @@ def with_other_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, fl
 
     What was found beside them had hidden it: a centre of gravity that is off, the moments'.
     """
-    swinging = frequencies_of(problem.model)
     found = swings(problem.engine.filter(fit.values, fit.noise), problem.row)
-    apart = [abs(math.log(f / was)) for f, was in zip(found, swinging, strict=True) if f * was]
+    pairs = zip(found, problem.model.frequencies, strict=True)
+    apart = [abs(math.log(f / was)) for f, was in pairs if f * was]
     if max(apart, default=0.0) < math.log(FAR):
         return None
     return _fitted_from(problem, fit, found)

@@ -180,13 +180,6 @@ def swinging_at(model: HeliModel, frequencies: Sequence[float]) -> HeliModel:
     return SwingingModel(model, frequencies)
 
 
-def frequencies_of(model: HeliModel) -> tuple[float, ...]:
-    """Frequencies [Hz] of the six gusts of a model, 0 of one that only fades."""
-    if isinstance(model, SwingingModel):
-        return tuple(model.frequencies)
-    return frequencies_of(model.inner) if isinstance(model, WrappingModel) else (0.0,) * 6
-
-
 def swings(passes: Sequence[RunPass], row: float) -> list[float]:
     """Frequencies [Hz] of the six gusts, 0 of one that only fades, as their spectra show them.
 

@@ -7,7 +7,7 @@ noise that was assumed.
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,6 +89,11 @@ def correlation(one: np.ndarray, other: np.ndarray) -> float:
 def colour(judged: Collection[Whiteness]) -> float:
     """Share of the innovations that their own past predicts, in the mean of some channels."""
     return float(np.mean([of.coloured_share for of in judged]))
+
+
+def are_white(judged: Mapping[str, Whiteness], channels: Iterable[str]) -> bool:
+    """Whether those of some channels that were judged are."""
+    return all(judged[channel].white for channel in channels if channel in judged)
 
 
 def is_white(passes: Sequence[RunPass], channels: Sequence[str]) -> bool:

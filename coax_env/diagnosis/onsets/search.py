@@ -99,7 +99,7 @@ def _next(
     steady, found = scored(replace(state, fit=without_drifts(state.fit)))
     near = [s for s in _standing(state.problem, found) if about is None or _is_about(s.moment, about)]
     near = _beyond_drifts(state, steady, near)
-    if near and near[0].nats < chosen.clear_evidence * chosen.evidence:
+    if near and near[0].nats < chosen.clear:
         near = _beside_commands(steady, near)
     for candidate in near[: chosen.most_trials]:
         trial = fitted_change(state, steady, candidate, clock, best)

@@ -17,7 +17,7 @@ from coax_env.estimation.helicopter import Moment
 from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
-from coax_env.estimation.whiteness import whiteness
+from coax_env.estimation.whiteness import are_white, whiteness
 
 CLEAR = 3.0
 """Thresholds by which a change is likelier than a model without it, to need no closer fit of that: a
@@ -231,8 +231,7 @@ def _worth(
 def _is_coloured(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:
     """Whether a channel that shows the effect is."""
     white = whiteness(problem.engine.filter(fit.values, fit.noise), problem.model.channels)
-    shows = channels_of(problem, fit, quadratic, effect)
-    return any(c in white and not white[c].white for c in shows)
+    return not are_white(white, channels_of(problem, fit, quadratic, effect))
 
 
 def _matters(problem: Problem, fit: Fit, effect: str) -> bool:
