@@ -76,31 +76,61 @@ def taken_up(upper: float, lower: float) -> float:
     return (momentum - own["rotor_inertia_lower"] * lower) / own["inertia_zz"]
 
 
+def turned_by_torque(upper: float, lower: float) -> float:
+    """What faster rotors turn the body by [rad/s2]: c (2 w + d) d each, equations (15)-(20)."""
+    own = LAMA.values()
+    factor = own["air_density"] * math.pi * own["rotor_radius"] ** 5 / own["inertia_zz"]
+    c_u, c_l = own["torque_coefficient_upper"], own["torque_coefficient_lower"]
+    w_u, w_l = COMMAND[:2]
+    return factor * (c_u * (2.0 * w_u + upper) * upper - c_l * (2.0 * w_l + lower) * lower)
+
+
 @pytest.mark.parametrize("reaction", [0.0, 0.7])
-def test_jitter_is_speed_on_top_of_the_command_and_turns_the_body(reaction):
-    """As commands and a yaw rate that are shifted by it do; and it fades by its memory."""
-    x, p = state(1.5, -0.8), vector(reaction)
+@pytest.mark.parametrize("lag", [0.0, 0.06])
+def test_jitter_is_speed_on_top_of_the_rotors_and_turns_the_body(reaction, lag):
+    """As rotor speeds and a yaw rate that are shifted by it do, with a motor's lag or without.
+
+    The rotors' own speeds follow their commands as ever; and it fades by its memory.
+    """
+    lags = {"motor_lag.upper": lag, "motor_lag.lower": lag}
+    lagging = PLAIN.vector(lags)
+    x = state(1.5, -0.8)
+    x[S.OMEGA_U] -= 4.0  # on its way
+    p = MODEL.vector(lags, LEVELS.with_levels({JITTER_REACTION: reaction}))
     faster = COMMAND + [1.5, -0.8, 0.0, 0.0]
     turned = x[:N_FULL].copy()
     turned[S.R] += reaction * taken_up(1.5, -0.8)
+    turned[[S.OMEGA_U, S.OMEGA_L]] += 1.5, -0.8
     shown = read(MODEL, x, COMMAND, p)
-    np.testing.assert_allclose(shown, read(PLAIN, turned, faster, LAMA.vector), rtol=1e-12)
-    at_rest = read(MODEL, state(0.0, 0.0), COMMAND, p)
+    np.testing.assert_allclose(shown, read(PLAIN, turned, faster, lagging), rtol=1e-12)
+    still = x.copy()
+    still[JITTER] = 0.0
+    at_rest = read(MODEL, still, COMMAND, p)
     assert shown[0] - at_rest[0] == pytest.approx(1.5 * RPM_PER_RAD_S)
     rate = CHANNELS.index("r")
     assert shown[rate] - at_rest[rate] == pytest.approx(reaction * taken_up(1.5, -0.8))
     later = stepped(MODEL, x, COMMAND, p)
-    expected = stepped(PLAIN, turned, faster, LAMA.vector)
+    expected = stepped(PLAIN, turned, faster, lagging)
     expected[S.R] -= reaction * taken_up(1.5, -0.8)
+    alone = stepped(PLAIN, x[:N_FULL], COMMAND, lagging)
+    rotors = [S.OMEGA_U, S.OMEGA_L]
+    expected[rotors] = alone[rotors]
     np.testing.assert_allclose(later[:N_FULL], expected, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(later[JITTER], math.exp(-DT / 0.08) * x[JITTER])
+    arrived = COMMAND[0] - (4.0 * math.exp(-DT / lag) if lag else 0.0)
+    assert later[S.OMEGA_U] == pytest.approx(arrived, rel=1e-12)
 
 
-def test_a_reaction_that_the_vehicle_has_is_not_counted_twice():
-    """The effect `spin_up_reaction` gives the body all that a change of speed does: no more is left."""
-    p = MODEL.vector({"spin_up_reaction.gain": 1.0}, LEVELS)
+def test_a_spin_up_reaction_is_of_what_is_commanded():
+    """That of jitter is the jitter's own, and neither is counted twice."""
+    values = {"spin_up_reaction.gain": 1.0}
+    p = MODEL.vector(values, LEVELS)
     rate = CHANNELS.index("r")
-    assert read(MODEL, state(1.5, -0.8), COMMAND, p)[rate] == pytest.approx(0.2)
+    assert read(MODEL, state(1.5, -0.8), COMMAND, p)[rate] == pytest.approx(0.2 + taken_up(1.5, -0.8))
+    x = state(1.5, -0.8)
+    alone = stepped(PLAIN, x[:N_FULL], COMMAND, PLAIN.vector(values))
+    gained = stepped(MODEL, x, COMMAND, p)[S.R] - alone[S.R]
+    assert gained == pytest.approx(DT * turned_by_torque(1.5, -0.8), rel=0.02)
 
 
 def test_without_jitter_it_is_the_helicopters_own_model_to_the_last_digit():

@@ -6,7 +6,8 @@ momentum that a rotor gains. A rate that is shaken so and comes back looks like 
 the air's noise alone, such jitter was called yaw damping (and a gyro's scale) on clean flights.
 
 Two states more than the helicopter's own, in the filter alone, each with an exponential memory. The
-rotors' commands are the logged ones plus these; the yaw rate is the helicopter's plus what is taken up.
+rotors' speeds are the helicopter's plus these, and so no lag of a motor smooths them; the yaw rate is
+the helicopter's plus what is taken up.
 """
 
 import math
@@ -30,7 +31,7 @@ from coax_env.estimation.helicopter import (
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, JITTER_REACTION
 from coax_env.estimation.state_space import Noise, ProcessNoise, Record
 from coax_env.kernel.compilation import compiled
-from coax_env.model import dynamics, effects
+from coax_env.model import dynamics
 from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
@@ -55,7 +56,6 @@ MEMORY_BOUNDS = (0.015, 2.0)
 
 # behind the kernel's parameters
 _MEMORY, _REACTION = -2, -1
-_SPIN_UP = effects.parameter_index("spin_up_reaction.gain")
 
 # of the scratch, behind the kernel's: the state without jitter, the input with it, drift and readings
 _STATE = dynamics.WORK_SIZE
@@ -66,11 +66,8 @@ _WORK_SIZE = _OUT + N_FULL + N_CHANNELS
 
 @compiled()
 def _taken_up(x, p):
-    """Yaw rate [rad/s] that the body has taken up of the rotors' jitter.
-
-    What the effect `spin_up_reaction` gives to every change of a speed is not counted twice.
-    """
-    share = (p[p.size + _REACTION] - p[_SPIN_UP]) / p[P.GUST_INERTIA_ZZ]
+    """Yaw rate [rad/s] that the body has taken up of the rotors' jitter."""
+    share = p[p.size + _REACTION] / p[P.GUST_INERTIA_ZZ]
     upper = p[P.ROTOR_INERTIA_U] + p[P.FLYBAR_INERTIA]
     return share * (upper * x[N_FULL] - p[P.ROTOR_INERTIA_L] * x[N_FULL + 1])
 
@@ -79,6 +76,10 @@ def _taken_up(x, p):
 def _shaken(x, u, p, work):
     """State and input as the helicopter's own model takes them, into the scratch; what is taken up.
 
+    Speeds and commands alike are shifted: as if the commands were those that the rotors settle at with
+    their jitter. So a lag brings the helicopter's own speeds where it would without, and a change of
+    jitter is none of the commands: what `spin_up_reaction` gives to these is not counted twice.
+
     Args:
         x: (31,) state. u: (6,) the step's or the readings' part of the input. p, work: as everywhere.
     """
@@ -86,6 +87,8 @@ def _shaken(x, u, p, work):
     for i in range(N_FULL):
         work[_STATE + i] = x[i]
     work[_STATE + S.R] += taken
+    work[_STATE + S.OMEGA_U] += x[N_FULL]
+    work[_STATE + S.OMEGA_L] += x[N_FULL + 1]
     for i in range(N_INPUTS):
         work[_INPUT + i] = u[i]
     work[_INPUT + U.OMEGA_U] += x[N_FULL]
@@ -104,6 +107,8 @@ def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     for i in range(N_FULL):
         out[i] = state[i]
     out[S.R] -= taken
+    out[S.OMEGA_U] -= out[N_FULL]
+    out[S.OMEGA_L] -= out[N_FULL + 1]
     left = math.exp(-dt / p[p.size + _MEMORY])
     for i in range(N_FULL, N_JITTERY):
         out[i] *= left
