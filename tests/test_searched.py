@@ -383,9 +383,21 @@ def test_jitter_is_asked_by_poses_alone_where_something_is_named(
     assert searched._may_hide_jitter(found) == may  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("cost", "used"), [(90.0, True), (110.0, False)])
-def test_jitter_stands_where_the_search_in_it_ends_likelier(monkeypatch, cost, used):
-    """With the level and memory from which that search began."""
+@pytest.mark.parametrize(
+    ("cost", "aboard", "coloured", "used"),
+    [
+        (90.0, {"rpm_upper"}, False, True),
+        (110.0, {"rpm_upper"}, False, False),
+        (90.0, {"rpm_upper"}, True, True),  # rotor speeds show it
+        (90.0, {"r"}, True, False),  # the model lacks something else
+        (90.0, {"r"}, False, True),
+    ],
+)
+def test_jitter_stands_where_the_search_in_it_ends_likelier(
+    monkeypatch, cost, aboard, coloured, used
+):
+    """With the level and memory from which that search began; and where it is what is seen."""
+    monkeypatch.setattr(searched, "is_much_coloured", lambda problem, fit: coloured)
     noise = with_jitter(FINE, HeliModel(load_vehicle("lama400d")))
     there = Fit((), {}, noise.with_levels({JITTER_LEVEL: 0.4, JITTER_MEMORY: 0.07}))
     wider = SimpleNamespace(report=lambda text: None, model=HeliModel(load_vehicle("lama400d")))
@@ -402,7 +414,7 @@ def test_jitter_stands_where_the_search_in_it_ends_likelier(monkeypatch, cost, u
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
     monkeypatch.setattr(searched, "_searched", of)
-    found = of(SimpleNamespace(), FINE)
+    found = of(SimpleNamespace(aboard=frozenset(aboard)), FINE)
     again, begun = searched._jittery(found, FINE)
     assert (again.problem is wider) == used and (again is found) != used
     if used:
