@@ -204,13 +204,18 @@ ABOARD = frozenset({"p", "q", "r", "ax", "ay", "az", "phi", "vn", "h"})
         ("", ABOARD, ("attitude_bias",), 100.0, "", False),  # gyros would have shown them
         ("onboard filter", ABOARD, (), 100.0, "", True),  # read too seldom to look coloured
         ("onboard filter", ABOARD - {"p", "az"}, (), 100.0, "", False),
+        ("", ABOARD, ("sonar_scale",), 100.0, "", False),
+        ("white force", ABOARD, ("sonar_scale",), 100.0, "", True),  # named beside one
+        ("white force", ABOARD, (), 100.0, "", False),
+        ("white force", ABOARD - {"az"}, ("sonar_scale",), 100.0, "", False),  # nothing feels it
     ],
 )
 def test_errors_last_where_that_is_worth_it_and_no_motion_stays_coloured(
     monkeypatch, coloured, aboard, active, gain, left, used
 ):
     """The fits are stand-ins, which gain at once what they may."""
-    first = Noise({"force_xy": 1.0}, {"phi": 0.01, "vn": 0.5})
+    process = {"force_xy": 1.0, "white_force_xy": 1.0 if coloured == "white force" else 2e-3}
+    first = Noise(process, {"phi": 0.01, "vn": 0.5}, {"white_force_xy": 1e-3})
     fit = Fit(active, {}, first, objective=500.0)
     gained = lambda problem, fit: replace(fit, objective=500.0 - gain)  # noqa: E731
     answers = [
@@ -232,7 +237,7 @@ def test_errors_last_where_that_is_worth_it_and_no_motion_stays_coloured(
     if found is not None:
         assert isinstance(found[0].model, ErringModel)
         names = {name(g) for g in ("attitude", "velocity") for name in (error_level, error_memory)}
-        assert found[1].objective == 400.0 and set(found[2].process) == {"force_xy"} | names
+        assert found[1].objective == 400.0 and set(found[2].process) == {*process, *names}
         assert found[2].process[error_level("velocity")] == pytest.approx(0.5)
 
 

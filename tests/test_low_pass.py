@@ -14,6 +14,7 @@ from scipy.stats import multivariate_normal
 from coax_env.diagnosis import sensor_low_pass
 from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.low_pass import NONE, LowPass, before_low_pass
 from coax_env.estimation.state_space import Noise, Record
 
@@ -132,3 +133,32 @@ def test_a_low_pass_is_asked_for_where_it_shows_or_what_looks_like_it_is_named(
     )
     fit = Fit(active, {}, Noise({}))
     assert sensor_low_pass.low_passes(problem, fit, Noise({})) == {} and tried == asked
+
+
+@pytest.mark.parametrize(("from_search", "found"), [(-40.0, True), (-60.0, False)])
+def test_a_low_pass_is_worth_what_it_is_at_the_likeliest_levels(monkeypatch, from_search, found):
+    """Noise levels are fitted from two starts, which end 50 nats apart without a low-pass: what it is
+    worth is the difference of the better ones. The fits are stand-ins."""
+    searched, first = Noise({"force_xy": 1.0}, {"p": 0.1}), Noise({"force_xy": 2.0}, {"p": 0.1})
+    ends = {("none", 1.0): -50.0, ("none", 2.0): -100.0, ("some", 1.0): from_search + 20.0}
+
+    class Stand(SimpleNamespace):
+        def log_likelihood(self, values: Any, noise: Noise) -> float:
+            return ends.get((self.kind, noise.level("force_xy")), -70.0)
+
+    def before(record: Any, channels: Any, passes: Any) -> tuple[str, float]:
+        return ("none" if set(passes.values()) <= {NONE} else "some"), 0.0
+
+    monkeypatch.setattr(sensor_low_pass, "before_low_pass", before)
+    monkeypatch.setattr(
+        sensor_low_pass, "Engine", lambda model, records, threads: Stand(kind=records[0])
+    )
+    monkeypatch.setattr(sensor_low_pass, "fit_noise", lambda engine, values, noise, *rest: noise)
+    problem: Any = SimpleNamespace(
+        row=0.01, settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
+        engine=SimpleNamespace(records=["logged"], threads=1),
+        model=SimpleNamespace(channels=("p",)),
+    )  # fmt: skip
+    low_pass, noise = sensor_low_pass._likeliest(problem, Fit((), {}, searched), first, ["p"], {})
+    assert (low_pass != NONE) == found
+    assert noise.level("force_xy") == (1.0 if found else 2.0)

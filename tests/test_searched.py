@@ -18,7 +18,7 @@ from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LE
 from coax_env.estimation.low_pass import LowPass
 from coax_env.estimation.rotor_jitter import with_jitter
 from coax_env.estimation.state_space import Noise, Record
-from coax_env.model.layout import GYROS
+from coax_env.model.layout import ACCELEROMETERS, GYROS
 
 
 @pytest.fixture(autouse=True)
@@ -621,30 +621,42 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     monkeypatch.setattr(searched, "_in_unrest", in_unrest)
     found = searched.searched("as given", levels, {})  # type: ignore[arg-type]
     assert found.problem == taken
-    assert asked == (["again"] if taken == "behind" else []) + [(True, True)]
+    assert asked == ["again", (True, True)]
     assert found.low_passes == ({"p": LowPass(0.01)} if taken == "behind" else {})
 
 
+HAD = {"p": LowPass(0.01)}
+
+
 @pytest.mark.parametrize(
-    ("passes", "lost", "taken"),
+    ("had", "active", "passes", "lost", "groups", "taken"),
     [
-        ({"p": LowPass(0.0105)}, 10.0, "found"),  # as it was: no further search
-        ({"p": LowPass(0.006)}, 10.0, "again"),
-        ({"p": LowPass(0.010, 2)}, 10.0, "again"),
-        ({}, 10.0, "again"),
-        ({"p": LowPass(0.006)}, 90.0, "found"),
+        (HAD, "wind", {"p": LowPass(0.0105)}, 10.0, [GYROS], "found"),  # as it was
+        (HAD, "wind", {"p": LowPass(0.006)}, 10.0, [GYROS], "again"),
+        (HAD, "wind", {"p": LowPass(0.010, 2)}, 10.0, [GYROS], "again"),
+        (HAD, "wind", {}, 10.0, [GYROS], "again"),
+        (HAD, "wind", {"p": LowPass(0.006)}, 90.0, [GYROS], "found"),
+        ({}, "wind", {}, 10.0, None, "found"),  # nothing looks like one: not asked
+        ({}, "thrust_exponent", {"ax": LowPass(0.005)}, 10.0, [ACCELEROMETERS], "again"),
+        ({}, "thrust_exponent", {}, 10.0, [ACCELEROMETERS], "found"),
     ],
 )
-def test_low_passes_are_fitted_once_more_beside_errors_that_last(monkeypatch, passes, lost, taken):
-    """Of groups that have one, to readings as logged, from the levels that the search began with."""
+def test_low_passes_are_fitted_once_more_beside_errors_that_last(
+    monkeypatch, had, active, passes, lost, groups, taken
+):
+    """Of groups that have one or whose like is named, to readings as logged, from the levels that the
+    search began with; what cannot be told from them is no candidate then."""
     levels = Noise({"error_gyros": 0.1})
 
     class Problem(SimpleNamespace):
         def with_records(self, records: Any, smoothed: bool = False) -> "Problem":
             return Problem(**{**vars(self), "records": records, "smoothed": smoothed})
 
+        def of_candidates(self, names: Any) -> "Problem":
+            return Problem(**{**vars(self), "candidates": sorted(names)})
+
     def of(problem: Any, noise: Noise) -> Searched:
-        fit = Fit(("wind",), {}, noise)
+        fit = Fit((active,), {}, noise)
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
     asked: list[Any] = []
@@ -654,17 +666,19 @@ def test_low_passes_are_fitted_once_more_beside_errors_that_last(monkeypatch, pa
         return passes
 
     given = Problem(
-        engine=SimpleNamespace(records="logged"), model=SimpleNamespace(channels=("p",)),
-        report=lambda text: None,
+        engine=SimpleNamespace(records="logged"), report=lambda text: None,
+        model=SimpleNamespace(channels=("p",), vehicle=SimpleNamespace(effects={})),
+        candidates=["thrust_exponent", "wind"],
     )  # fmt: skip
-    found = replace(of(given.with_records("before", True), levels), low_passes={"p": LowPass(0.01)})
+    found = replace(of(given.with_records("before", True), levels), low_passes=had)
     monkeypatch.setattr(searched, "low_passes", low_passes)
     monkeypatch.setattr(searched, "records_before", lambda logged, channels, those: ("then", those))
     monkeypatch.setattr(searched, "_searched", of)
     monkeypatch.setattr(searched, "_lost", lambda problem, it: 50.0 if it is found else lost)
     best = searched._behind_other_low_passes(given, found, levels)  # type: ignore[arg-type]
-    assert asked == [("logged", levels, [GYROS])]
+    assert asked == ([("logged", levels, groups)] if groups else [])
     assert (best is found) == (taken == "found")
     if best is not found:
         assert best.low_passes == passes
         assert best.problem.records == ("then", passes) and best.problem.smoothed
+        assert ("thrust_exponent" in best.problem.candidates) == ("ax" not in passes)

@@ -55,7 +55,7 @@ from coax_env.diagnosis.run_air import with_own_air
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.sensor_errors import with_lasting_errors
-from coax_env.diagnosis.sensor_low_pass import GROUPS, hidden_behind, low_passes
+from coax_env.diagnosis.sensor_low_pass import GROUPS, LIKE, hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_other_swings, with_swings
 from coax_env.estimation.changing_model import Lap
@@ -137,7 +137,7 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         no_more = set(other.fit.active) <= set(best.fit.active)
         if other is not first and no_more and _lost(problem, other) < _lost(problem, best):
             best, begun = other, begun_so
-    if best.low_passes and begun is not noise and best.changing is None:
+    if begun is not noise and best.changing is None:
         best = _behind_other_low_passes(problem, best, begun)
     if best.changing is not None:
         return best
@@ -197,19 +197,27 @@ def _with_errors(found: Searched, noise: Noise, clock: Mapping[str, Lap]) -> tup
 def _behind_other_low_passes(problem: Problem, found: Searched, noise: Noise) -> Searched:
     """The search behind low-passes as they are beside errors that last, where that is likelier.
 
-    Without such errors a low-pass takes a part of them up.
+    Without such errors a low-pass takes a part of them up, or is not seen: then it is asked for where
+    something is named that looks like it.
 
     Args:
         problem: as given. found: with errors that last. noise: levels that it started from.
     """
+    behind = [
+        group
+        for group in GROUPS
+        if found.low_passes.keys() & set(group) or LIKE[group] in found.fit.active
+    ]
+    if not behind:
+        return found
     logged = problem.engine.records
-    behind = [group for group in GROUPS if found.low_passes.keys() & set(group)]
     passes = low_passes(found.problem.with_records(logged), found.fit, noise, behind)
     if _are_nearly(passes, found.low_passes):
         return found
     problem.report("searching again with readings as they were before these low-passes")
     before = records_before(logged, problem.model.channels, passes)
-    again = _searched(found.problem.with_records(before, True), noise)
+    asked = set(found.problem.candidates) - hidden_behind(passes, found.fit, problem)
+    again = _searched(found.problem.with_records(before, True).of_candidates(asked), noise)
     again = replace(again, low_passes=passes)
     return again if _lost(problem, again) < _lost(problem, found) else found
 

@@ -5,6 +5,10 @@ gyros and accelerometers are aboard that feel the motion itself: by poses alone 
 what moves the body are one. But for an attitude, whose tilt the position feels, and whose mean has been
 named: a bias of 59 nats, sure, was errors that lasted 20 s on a clean **synthetic** flight.
 
+And where something is named while a white force stands beside the gusts: to a model whose sensors do
+not err an accelerometer that drifts feels one, and its innovations are white then. A sonar's scale of
+20 nats was that (`--arms mixed`, seed 631, one 4), where such errors are worth 180.
+
 And always where attitudes are an onboard filter's, which are read once a second (onboard_filter.py) and
 cannot look coloured then: gyros that drift by 0.01 rad/s were taken for a stabiliser bar with half its
 following time, of 17 and 28 nats on clean **synthetic** flights (`--arms mixed`, seed 611, clean 6 and
@@ -34,6 +38,10 @@ FELT_BY = {"attitude": GYROS, "heading": GYROS} | dict.fromkeys(
 """Sensors that tell a group's motion from errors of its readings."""
 BIAS = "attitude_bias"
 """The mean of errors of attitudes that last; by poses alone they are asked where it is named."""
+FORCES = ("white_force_xy", "white_force_z")
+WHITE = 100.0
+"""Times the floor of its level from which a white force stands for something: 0.05 N s^1/2 of a machine
+of 1 kg; ours."""
 LEVELS_OF_ERRORS = (*ERROR_LEVELS, *ERROR_MEMORIES)
 
 
@@ -59,6 +67,8 @@ def with_lasting_errors(
     ]
     if problem.sees_poses_alone and BIAS in fit.active:
         asked.append("attitude")
+    if not asked and fit.active and _feels_white_forces(problem, fit):
+        asked.append("accelerometers")
     if not asked:
         return None
     wider, trial = _erring(problem, fit)
@@ -71,6 +81,16 @@ def with_lasting_errors(
         return None
     levels = {name: trial.noise.level(name) for name in trial.levels if name in LEVELS_OF_ERRORS}
     return wider, trial, with_errors(noise).with_levels(levels)
+
+
+def _feels_white_forces(problem: Problem, fit: Fit) -> bool:
+    """Whether white forces that are no part of the gusts stand for what accelerometers feel."""
+    white = (
+        fit.noise.level(name) > WHITE * fit.noise.floor[name]
+        for name in FORCES
+        if name in fit.noise.process
+    )
+    return problem.aboard.issuperset(ACCELEROMETERS) and any(white)
 
 
 def _erring(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
