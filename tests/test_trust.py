@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from coax_env.diagnosis import moves, replication
+from coax_env.diagnosis import moves, replication, unlisted
 from coax_env.diagnosis.doubts import (
     Against,
     doubts,
@@ -37,6 +37,7 @@ from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
+from coax_env.model.generic_terms import TERMS
 from coax_env.model.vehicle_file import load_vehicle
 
 NAMES = ("axial_damping.coefficient", "rotor_drag.coefficient", "flap_blowback.gain")
@@ -299,7 +300,7 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
         channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
         alternatives=(), nats=100.0, shaken=False, poses_alone=False,
-        clock_error=0.0, smoothed=False,
+        clock_error=0.0, smoothed=False, beside_terms=(),
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -316,6 +317,18 @@ def test_what_shows_where_another_stands_at_its_limit_is_doubted(size, channels,
     found = list(doubts("servo_delay", against, SETTINGS))
     assert bool(found) == doubted and all("gyro bias" in text for text in found)
     assert not any("beside it" in text for text in doubts("gyro_bias", against, SETTINGS))
+
+
+def test_what_shows_where_something_unexplained_acts_is_doubted():
+    """A yaw inertia of 92 nats was sure beside a term of the yaw moment (**synthetic**)."""
+    (doubt,) = doubts("yaw_inertia", {"yaw_inertia": known_of(["r"], beside_terms=("r",))}, SETTINGS)
+    assert "no effect explains acts in yaw rate" in doubt
+    model = HeliModel(load_vehicle("lama400d"))
+    plain = replace(problem_of(1), model=model)
+    terms = unlisted.parameters(model, "unlisted_N", [t for t in TERMS if t.form == "r"])
+    assert len(terms) == 1
+    assert unlisted.acted_on(plain) == set()
+    assert unlisted.acted_on(plain.with_free(terms)) == {"r", "psi"}
 
 
 def test_two_that_stand_for_each_other_are_not_exchanged_without_end(monkeypatch):

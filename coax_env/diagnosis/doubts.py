@@ -47,6 +47,7 @@ class Against:
         poses_alone: whether neither gyros nor accelerometers were read.
         clock_error: std by which the times of the log's rows are wrong [s].
         smoothed: whether a low-pass of a sensor too fast to be seen would do the same.
+        beside_terms: channels among its own in which what no effect explains acts, too.
     """
 
     channels: tuple[str, ...]
@@ -64,6 +65,7 @@ class Against:
     poses_alone: bool
     clock_error: float
     smoothed: bool
+    beside_terms: tuple[str, ...]
 
     @property
     def at_limit(self) -> bool:
@@ -141,6 +143,9 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
     if of.loud:
         loud = and_list([channel_name(c) for c in of.loud])
         yield f"a run is over {LOUD:g} times as loud in {loud} as the noise that was fitted"
+    if of.beside_terms:
+        acts = and_list([channel_name(c) for c in of.beside_terms])
+        yield f"something that no effect explains acts in {acts}, too: it may be a part of that"
     yield from under_noise(of.falls_at)
     yield from on_parts(of.parts, of.runs, chosen)
     yield from of_sizes(of.sizes)

@@ -1,11 +1,12 @@
 """When may a name be believed? Each cause is sure, or doubtful with the reasons in plain words.
 
 Sure is what holds: under half and twice every noise level (noise_variation.py), without any one run and
-on halves of the flights (replication.py), with white innovations where it shows, a usual size and no
-cause at its limit beside it, a number that the flights determine, no other effect that would do as
-well, and more evidence than something that no list has, or a single gust (shocks.py), gives a wrong
-name. A doubtful cause still improves the model, and stays in it. Where more speaks against it
-(doubts.py) it has no name: the model keeps it, findings tell it among what is unexplained.
+on halves of the flights (replication.py), with white innovations where it shows and no generic term
+(unlisted.py), a usual size and no cause at its limit beside it, a number that the flights determine, no
+other effect that would do as well, and more evidence than something that no list has, or a single gust
+(shocks.py), gives a wrong name. A doubtful cause still improves the model, and stays in it. Where more
+speaks against it (doubts.py) it has no name: the model keeps it, findings tell it among what is
+unexplained.
 """
 
 import math
@@ -22,6 +23,7 @@ from coax_env.diagnosis.replication import Asked, Replication, halves_of, of_run
 from coax_env.diagnosis.sensor_low_pass import may_hide_behind
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.shocks import in_shocks
+from coax_env.diagnosis.unlisted import acted_on
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import UNUSUAL_FROM
 from coax_env.estimation.quadratic import Quadratic
@@ -90,6 +92,7 @@ def trusts(
     runs = len(of_runs(problem.engine.records))
     loud = tuple(channel for channel, of in white.items() if of.spread > LOUD)
     elsewhere = sum(not of.white for of in white.values()) / max(len(white), 1)
+    acting = acted_on(problem)
     known, against = {}, {}
     for effect in fit.active:
         channels = channels_of(problem, fit, quadratic, effect)
@@ -110,6 +113,7 @@ def trusts(
             poses_alone=problem.sees_poses_alone,
             clock_error=problem.clock_error,
             smoothed=may_hide_behind(problem, fit, effect),
+            beside_terms=tuple(c for c in channels if c in acting),
         )
     nameless = without_name(against, problem.settings)
     return {

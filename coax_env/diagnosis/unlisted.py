@@ -217,6 +217,12 @@ def described_channels(found: Sequence[dict[str, Any]]) -> set[str]:
     return {c for entry in found for c in families[entry["channel"]]}
 
 
+def acted_on(problem: Problem) -> set[str]:
+    """Channels in which the generic terms that a problem has show."""
+    axes = {f.name.partition(".")[0] for f in problem.added} & CHANNELS_OF.keys()
+    return {c for axis in axes for c in CHANNELS_OF[axis][1]}
+
+
 def standard_deviation(problem: Problem, fit: Fit, quadratic: Quadratic, one: str) -> float:
     """Posterior std of a term's coefficient, with the variance inflation of its own direction.
 
