@@ -279,13 +279,32 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "converged", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "refined", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "quadratic_at", lambda problem, fit: (fit, nothing))
+    apart: list[bool] = []
+    monkeypatch.setattr(
+        evidence, "_as_far_apart", lambda problem, fit, *rest: apart.append(problem.gains) or fit
+    )
     monkeypatch.setattr(evidence, "_worth", lambda problem, fit, quadratic, effect: THRESHOLD)
     monkeypatch.setattr(evidence, "threshold", lambda problem, quadratic, active: THRESHOLD)
     monkeypatch.setattr(evidence, "weigh", removals)
     problem, fit, _, found = weighed(tables, Fit(active, {}, Noise({})))
     assert problem.gains == (tables.worth_it and tables.white and tables.feels)
     assert set(found) == set(fit.active)
+    assert apart == ([False] if tables.worth_it and not tables.feels and fit.active else [])
     return fit.active
+
+
+def test_a_number_is_as_unsure_as_the_commands_would_have_it_elsewhere():
+    """Both in quadrature: 3 apart and a std of 4, of a variance that colour makes 4 times as large."""
+    problem: Any = SimpleNamespace(free_names=lambda active: ["mass", "wind.north", "wind.east"])
+    quadratic: Any = SimpleNamespace(std=lambda names: dict(zip(names, (4.0, 2.0, 2.0), strict=True)))
+    values = {"mass": 1.0, "wind.north": 5.0, "wind.east": 5.0}
+    fit = Fit(("wind",), values, Noise({}), std_ratio={"wind.east": 0.75})
+    other = fit.at({"mass": 4.0, "wind.north": 8.0, "wind.east": 1.0})
+    found = evidence._as_far_apart(problem, fit, quadratic, {"wind": Evidence(50.0, 4.0)}, other)
+    assert found.std_ratio == pytest.approx(
+        {"mass": 1.25, "wind.north": 1.25, "wind.east": 1.25}
+    )
+    assert found.values == values
 
 
 def of(**nats: float) -> dict[frozenset[str], dict[str, float]]:

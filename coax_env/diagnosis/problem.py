@@ -278,8 +278,9 @@ class Fit:
         noise: levels of process and reading noise.
         objective: minus the log-posterior at its last evaluation [nats].
         levels: the noise levels that are fitted.
-        std_ratio: std of an effect's parameter by the likelihood's own curvature over that by the
-            signatures; 1 where it is not known (refinement.py).
+        std_ratio: std of a parameter by the likelihood's own curvature (refinement.py), and with how
+            far what commands show has it elsewhere (evidence.py), over that by the signatures; 1 where
+            neither is known.
         history: (move, nats) of the search, in order.
         strongest: evidence [nats] and name of the candidate that came nearest to being added, or was;
             the threshold is calibrated on it (scripts/study_diagnosis.py --calibrate).
