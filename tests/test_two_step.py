@@ -213,6 +213,7 @@ def doublets():
     return found
 
 
+@pytest.mark.slow
 def test_the_bias_converges_to_what_was_planted(doublets):
     """-0.05 m/s2 as in the paper, within its std (both tails of a chi square over twelve flights)."""
     z = np.array([(s.states[-1, BIAS] + 0.05) / s.std[-1, BIAS] for s, _ in doublets])
@@ -220,6 +221,7 @@ def test_the_bias_converges_to_what_was_planted(doublets):
     assert all(s.std[-1, BIAS] < 0.006 for s, _ in doublets)
 
 
+@pytest.mark.slow
 def test_height_is_within_a_tenth_of_a_metre(doublets):
     for states, truth in doublets:
         assert np.abs(states.states[100:, H] + truth[100:, 15]).max() < 0.1
@@ -229,6 +231,7 @@ def test_height_is_within_a_tenth_of_a_metre(doublets):
         assert np.nanstd(states.residual) == pytest.approx(0.05, rel=0.12)
 
 
+@pytest.mark.slow
 def test_the_states_scatter_as_their_std_says(doublets):
     for column, own in ((THETA, 11), (1, 0), (W, 2)):
         z = np.concatenate(
@@ -241,6 +244,7 @@ def test_the_states_scatter_as_their_std_says(doublets):
         assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4, column
 
 
+@pytest.mark.slow
 def test_the_smoother_knows_more_and_the_speed_is_dead_reckoned(doublets):
     for states, _ in doublets:
         assert np.all(states.smoothed_std <= states.std + 1e-12)
