@@ -208,6 +208,7 @@ def diagnose(
 
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     replays, gain = _gain(problem, (bare, refitted, fit), held, sensors, ceiling)
+    causes = findings.doubted_by_held_out(causes, gain)
     report("asking whether the fitted model makes such flights")
     check = model_check(problem, fit, passes_after)
     report("refitting the corrected model on everything")
