@@ -70,7 +70,7 @@ class Against:
     @property
     def at_limit(self) -> bool:
         """Whether one of its numbers is as large as is believed at most."""
-        return any(is_limit(size) for size in self.sizes.values())
+        return has_limit(self.sizes)
 
     def is_gone_on_parts(self, chosen: Settings) -> bool:
         """Whether it does not return without enough of the runs, or in enough of the halves."""
@@ -96,6 +96,11 @@ def sizes(problem: Problem, fit: Fit, effect: str) -> dict[str, float]:
 def is_limit(size: float) -> bool:
     """Whether a number of so many usual sizes stands at the limit of what is believed."""
     return size > AT_BOUND * MOST_USUAL_SIZES
+
+
+def has_limit(numbers: Mapping[str, float]) -> bool:
+    """Whether one of an effect's numbers, in usual sizes, stands at that limit."""
+    return any(is_limit(size) for size in numbers.values())
 
 
 def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:

@@ -115,9 +115,12 @@ def doubted_by_held_out(
     most = None if gain is None else gain["ci95"][1]
     if most is None or most >= 0.0 or any(c.get("since") for c in known):
         return known
-    doubted = (c | {"trust": "doubtful", "doubts": [*c["doubts"], FLIES_WORSE]} for c in known)
-    pairs = zip(known, doubted, strict=True)
-    return _in_order(c if c["effect"] == "vibration" else worse for c, worse in pairs)
+    return _in_order(c if c["effect"] == "vibration" else _doubted(c, FLIES_WORSE) for c in known)
+
+
+def _doubted(cause: dict[str, Any], why: str) -> dict[str, Any]:
+    """The cause in doubt, with one more reason."""
+    return cause | {"trust": "doubtful", "doubts": [*cause["doubts"], why]}
 
 
 def confusable_with(problem: Problem, effect: str, alternatives: Iterable[str]) -> list[str]:
@@ -144,12 +147,10 @@ def mixtures_as_one(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
             kept.append(dict(weaker))
             continue
         alike = dict.fromkeys([*stronger["confusable_with"], weaker["effect"]])
-        stronger |= {
+        stronger |= _doubted(stronger, f"it is a mixture with {plain(weaker['effect'])}") | {
             "confusable_with": [e for e in alike if e != stronger["effect"]],
             "channels": list(dict.fromkeys([*stronger["channels"], *weaker["channels"]])),
             "mixture": {**stronger.get("mixture", {}), **weaker["parameters"]},
-            "trust": "doubtful",
-            "doubts": [*stronger["doubts"], f"it is a mixture with {plain(weaker['effect'])}"],
         }
     return kept
 

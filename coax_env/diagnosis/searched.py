@@ -44,7 +44,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.clock_errors import with_clock_errors
-from coax_env.diagnosis.doubts import is_limit, sizes
+from coax_env.diagnosis.doubts import has_limit, sizes
 from coax_env.diagnosis.fits import fitted, is_much_coloured, noise_fitted, start, steadied
 from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.changing import Changing
@@ -69,7 +69,7 @@ from coax_env.estimation.low_pass import LowPass, before_low_pass, records_befor
 from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import with_jitter
-from coax_env.estimation.state_space import Noise
+from coax_env.estimation.state_space import Noise, Record
 from coax_env.estimation.whiteness import are_white, is_white, whiteness
 from coax_env.model.layout import INERTIAL
 
@@ -169,10 +169,23 @@ def _before_low_passes(first: Searched, noise: Noise) -> Searched | None:
     if not smoothed:
         return None
     problem.report("searching again with readings as they were before a low-pass")
-    before = records_before(problem.engine.records, problem.model.channels, smoothed)
-    asked = set(problem.candidates) - hidden_behind(smoothed, first.fit, problem)
-    found = _searched(problem.with_records(before, True).of_candidates(asked), noise)
-    return replace(found, low_passes=smoothed)
+    return _searched_before(first, problem.engine.records, smoothed, noise)
+
+
+def _searched_before(
+    found: Searched, logged: Sequence[Record], passes: Mapping[str, LowPass], noise: Noise
+) -> Searched:
+    """The search with readings as they were before low-passes, for what can be told from these.
+
+    Args:
+        found: a search of the same problem. logged: readings as logged.
+        passes: by channel. noise: levels to start from.
+    """
+    problem = found.problem
+    before = records_before(logged, problem.model.channels, passes)
+    asked = set(problem.candidates) - hidden_behind(passes, found.fit, problem)
+    again = _searched(problem.with_records(before, True).of_candidates(asked), noise)
+    return replace(again, low_passes=passes)
 
 
 def _with_errors(found: Searched, noise: Noise, clock: Mapping[str, Lap]) -> tuple[Searched, Noise]:
@@ -215,10 +228,7 @@ def _behind_other_low_passes(problem: Problem, found: Searched, noise: Noise) ->
     if _are_nearly(passes, found.low_passes):
         return found
     problem.report("searching again with readings as they were before these low-passes")
-    before = records_before(logged, problem.model.channels, passes)
-    asked = set(found.problem.candidates) - hidden_behind(passes, found.fit, problem)
-    again = _searched(found.problem.with_records(before, True).of_candidates(asked), noise)
-    again = replace(again, low_passes=passes)
+    again = _searched_before(found, logged, passes, noise)
     return again if _lost(problem, again) < _lost(problem, found) else found
 
 
@@ -505,9 +515,7 @@ def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:
 
 def _at_limits(found: Searched) -> set[str]:
     """Effects that have a number at the limit of what is believed."""
-    problem, fit = found.problem, found.fit
-    of = {effect: sizes(problem, fit, effect).values() for effect in fit.active}
-    return {effect for effect, numbers in of.items() if any(is_limit(size) for size in numbers)}
+    return {e for e in found.fit.active if has_limit(sizes(found.problem, found.fit, e))}
 
 
 def _coarser(noise: Noise) -> dict[str, float]:
