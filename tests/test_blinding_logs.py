@@ -130,7 +130,14 @@ def test_40_ms_of_nonsense_are_found_at_any_rate(rate, channel, nonsense):
 
 
 @pytest.mark.needs_shared_flights
-@pytest.mark.parametrize("name", ["open_none", "open_near_ground", "open_rigging", "open_outside"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "open_none",
+        *(pytest.param(f"open_{w}", marks=pytest.mark.slow) for w in ("near_ground", "rigging")),
+        "open_outside",
+    ],
+)
 def test_no_sound_flight_is_repaired(name):
     flight = read(name)
     assert flight.counts == {}

@@ -125,6 +125,7 @@ def test_weights_and_limits_make_the_cost():
     assert again.cost == wide.cost
 
 
+@pytest.mark.slow
 def test_the_worst_vehicle_is_worse_than_any_drawn_and_no_farther_than_asked(onboard):
     worst = margins.worst_over_spread(onboard, LAMA, distance=2.0, rounds=2, draws=6)
     z = np.array(list(worst.moves.values()))
@@ -893,6 +894,7 @@ def test_machines_are_flown_once(tmp_path):
         list(machines.fly_machines([2], LAMA, tmp_path, wind=2.0, **short))
 
 
+@pytest.mark.slow
 def test_a_machine_whose_flight_is_refused_flies_the_bare_model_on_both_sides(
     tmp_path, monkeypatch
 ):

@@ -432,6 +432,7 @@ def only(flight: Flight, *names: str) -> Flight:
 FEW = all_but("gyro_bias", "swash_offset", "rotor_drag")
 
 
+@pytest.mark.slow
 def test_a_short_still_flight(still):
     """Two runs: the last third of each is held out; nothing is found in them."""
     result = diagnose(only(still, "lon_3211", "lat_3211"), exclude=FEW)
@@ -443,6 +444,7 @@ def test_a_short_still_flight(still):
     assert 7.0 < last < 9.0, "the fit must not see the last third"
 
 
+@pytest.mark.slow
 def test_hold_out_none_fits_everything(still):
     result = diagnose(only(still, "lon_3211", "lat_3211"), hold_out=[], exclude=FEW)
     check_form(result)
@@ -500,6 +502,7 @@ def test_the_choice_of_the_hold_out_does_not_look_at_residuals(still, monkeypatc
     assert chosen() == before
 
 
+@pytest.mark.slow
 def test_an_excluded_effect_is_not_named(tmp_path):
     folder = injector.fly(tmp_path / "flight", {"gyro_bias": {}}, runs=["lon_3211"], seed=22)
     flight = read_flight(folder)
@@ -512,6 +515,7 @@ def test_an_excluded_effect_is_not_named(tmp_path):
         assert "gyro_bias" not in cause["confusable_with"]
 
 
+@pytest.mark.slow
 def test_an_effect_that_the_vehicle_has_is_no_finding(tmp_path):
     """The extended vehicle on the same flight: consistent, and a warning of double counting."""
     folder = injector.fly(tmp_path / "flight", {"gyro_bias": {}}, runs=["lon_3211"], seed=22)

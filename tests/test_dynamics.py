@@ -1150,7 +1150,8 @@ def test_an_edited_callee_is_compiled_anew(tmp_path):
     assert second[1] == pytest.approx(-3.0)
 
 
-@pytest.mark.parametrize("lag", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("lag", [0.0, 0.1])
 def test_no_index_leaves_its_array(lag, tmp_path):
     """Compiled code does not look; with numba's bounds checks it does.
 

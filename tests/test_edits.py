@@ -175,6 +175,7 @@ def test_rotors_turn_faster_from_the_moment_on():
         np.testing.assert_allclose(now.command, was.command * expected)
 
 
+@pytest.mark.slow
 def test_two_edits_are_two_changes():
     found = difference({"phase": 0.15, "theta": 0.03})
     assert set(found) == {"swash_phase", "attitude_bias"}

@@ -269,6 +269,7 @@ def test_a_wild_reading_hardly_counts_but_a_lasting_one_is_believed():
     np.testing.assert_allclose(slipped.states[300:, 0], clean.states[300:, 0] + 1.0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_the_gate_is_no_step():
     """Likelihood and its slope are continuous in a reading that crosses the gate."""
     record = swing(4)

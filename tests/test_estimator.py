@@ -165,6 +165,7 @@ def test_gains_act_on_what_is_new_in_their_row(onboard):
             assert gain[:, k].any() == has_sample, (row, name)  # a rotor without lag is its command
 
 
+@pytest.mark.slow
 def test_the_errors_of_the_linear_system_have_the_spread_that_is_stated(onboard, spreads):
     """Three hundred errors under the filter's own gains, with the noise that was assumed."""
     rng = np.random.default_rng(0)

@@ -161,7 +161,9 @@ def test_weak_causes_are_asked_from_brief_gusts_together_and_alone(monkeypatch, 
 def test_without_a_cause_latent_noise_is_asked_for(monkeypatch):
     flights = Flights({"gyro_bias": CLEAR, "yaw_damping": 0.1 * THRESHOLD})
     beside: list[tuple[str, ...]] = []
-    monkeypatch.setattr(evidence, "with_latent_noise", lambda problem, fit: beside.append(fit.active))
+    monkeypatch.setattr(
+        evidence, "with_latent_noise", lambda problem, fit: beside.append(fit.active)
+    )
     flights.pruned(monkeypatch, GOOD)
     assert beside == [("gyro_bias",)]
 
@@ -296,14 +298,14 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
 def test_a_number_is_as_unsure_as_the_commands_would_have_it_elsewhere():
     """Both in quadrature: 3 apart and a std of 4, of a variance that colour makes 4 times as large."""
     problem: Any = SimpleNamespace(free_names=lambda active: ["mass", "wind.north", "wind.east"])
-    quadratic: Any = SimpleNamespace(std=lambda names: dict(zip(names, (4.0, 2.0, 2.0), strict=True)))
+    quadratic: Any = SimpleNamespace(
+        std=lambda names: dict(zip(names, (4.0, 2.0, 2.0), strict=True))
+    )
     values = {"mass": 1.0, "wind.north": 5.0, "wind.east": 5.0}
     fit = Fit(("wind",), values, Noise({}), std_ratio={"wind.east": 0.75})
     other = fit.at({"mass": 4.0, "wind.north": 8.0, "wind.east": 1.0})
     found = evidence._as_far_apart(problem, fit, quadratic, {"wind": Evidence(50.0, 4.0)}, other)
-    assert found.std_ratio == pytest.approx(
-        {"mass": 1.25, "wind.north": 1.25, "wind.east": 1.25}
-    )
+    assert found.std_ratio == pytest.approx({"mass": 1.25, "wind.north": 1.25, "wind.east": 1.25})
     assert found.values == values
 
 

@@ -61,7 +61,10 @@ def readings(sensors: str, count: int, rows: int, seed: int) -> np.ndarray:
 
 
 @needs_compiler
-@pytest.mark.parametrize(("kind", "sensors"), KINDS)
+@pytest.mark.parametrize(
+    ("kind", "sensors"),
+    [pytest.param(*k, marks=pytest.mark.slow) if k == ("scheduled", "mocap") else k for k in KINDS],
+)
 def test_any_readings_give_the_same_commands(kind, sensors, exported):
     controller, c, _ = exported(kind, sensors)
     seen = readings(controller.sensors, 4, 300, seed=3)
@@ -82,8 +85,10 @@ def test_any_readings_give_the_same_commands(kind, sensors, exported):
         ("pid", "onboard", {}),
         ("ppo", None, {"wind": 2.0, "turbulence": "light"}),
         ("lqg", "mocap", {"task": "waypoints"}),
-        ("scheduled", "mocap", {"task": "waypoints", "target": FAR}),
-        ("pid", "mocap", {"task": "waypoints"}),
+        pytest.param(
+            "scheduled", "mocap", {"task": "waypoints", "target": FAR}, marks=pytest.mark.slow
+        ),
+        pytest.param("pid", "mocap", {"task": "waypoints"}, marks=pytest.mark.slow),
         ("ppo_outdoor", "mocap", {"task": "waypoints", "wind": 4.0, "turbulence": "moderate"}),
     ],
 )

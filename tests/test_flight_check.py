@@ -98,7 +98,12 @@ PLANTED: dict[str, tuple[dict[str, float], tuple[str, ...]]] = {
 }
 
 
-@pytest.mark.parametrize("what", PLANTED)
+QUICK = ("rotors in rad/s", "z up", "gyros in degrees", "climb as velocity down")
+
+
+@pytest.mark.parametrize(
+    "what", [w if w in QUICK else pytest.param(w, marks=pytest.mark.slow) for w in PLANTED]
+)
 def test_a_wrong_unit_or_sign_is_suspected(what):
     factors, words = PLANTED[what]
     found = suspicions(changed(sound(), **factors))
@@ -159,6 +164,7 @@ def test_more_flight_tells_more(monkeypatch):
     assert ratio == pytest.approx(math.sqrt(2.0), rel=0.02)
 
 
+@pytest.mark.slow
 def test_look_alikes_of_a_hover():
     """A scale error of az is a bias where nothing but gravity is felt."""
     found = {e.effect: e for e in checked("hover").effects}

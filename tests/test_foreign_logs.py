@@ -428,7 +428,7 @@ def matrices(q: np.ndarray) -> np.ndarray:
     return np.stack(axes, axis=2)
 
 
-@pytest.mark.parametrize("kind", ["ros1", "ros2", "mcap"])
+@pytest.mark.parametrize("kind", ["ros1", pytest.param("ros2", marks=pytest.mark.slow), "mcap"])
 def test_ros(tmp_path, kind):
     """FLU and ENU, as REP 103 has them: ours come out."""
     pytest.importorskip("rosbags")

@@ -116,6 +116,7 @@ def test_every_effect_can_be_flown_with(tmp_path: Path, effect: str) -> None:
     assert json.loads((tmp_path / "truth.json").read_text())["hidden"] == [effect]
 
 
+@pytest.mark.slow
 def test_gusts_sensors_and_dropouts(tmp_path: Path) -> None:
     folder = injector.fly(
         tmp_path, {"rotor_drag": 5e-4, "wind": {"north": 1.0}}, gusts=True, sensors="onboard",
@@ -190,7 +191,10 @@ def test_a_vehicle_within_its_files_spread_keeps_the_file(tmp_path: Path) -> Non
     assert read_flight(tmp_path).vehicle == "lama400d" and not (tmp_path / "vehicle.toml").exists()
 
 
-@pytest.mark.parametrize("memory", [0.03, 0.5, 2.0])
+@pytest.mark.parametrize(
+    "memory",
+    [0.03, pytest.param(0.5, marks=pytest.mark.slow), pytest.param(2.0, marks=pytest.mark.slow)],
+)
 @pytest.mark.parametrize("gusts", ["markov", "heavy_tails"])
 def test_gusts_have_the_std_and_memory_asked(gusts: str, memory: float) -> None:
     air = Air(gusts, memory=(memory, 0.5 * memory))
@@ -209,6 +213,7 @@ def test_gusts_have_the_std_and_memory_asked(gusts: str, memory: float) -> None:
     assert (tails > 4.0) == (gusts == "heavy_tails")
 
 
+@pytest.mark.slow
 def test_dryden_has_the_standards_proportions() -> None:
     """MIL-F-8785C at 1.6 m: sigma_u / sigma_w = (0.177 + 0.0043)^-0.4 = 1.98, down in 1.6 m."""
     air = Air("dryden", wind=3.0)
@@ -241,6 +246,7 @@ def history_of(gusts: str, rows: int = 100_000, seed: int = 1) -> np.ndarray:
     return history / [0.2, 0.2, 0.2, 0.006, 0.006, 0.003]
 
 
+@pytest.mark.slow
 def test_one_sided_gusts_are_log_normal() -> None:
     """Of a log-normal the skewness is (exp(s^2) + 2) sqrt(exp(s^2) - 1), here 3.7; its mean is 0."""
     gusts = history_of("one_sided", 400_000)
@@ -457,7 +463,7 @@ def test_mixed_poses_are_of_every_rate_and_fault() -> None:
         assert all(1.0 <= std / POSE[c] <= 10.0 for c, std in of_one.noise.items())
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
 def test_a_wrong_card_changes_the_card_alone(tmp_path: Path, factor: float) -> None:
     for name, said in (("right", 1.0), ("wrong", factor)):
         injector.fly(tmp_path / name, {}, runs=["lat_3211"], seed=1, card_noise=said)

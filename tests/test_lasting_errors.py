@@ -146,6 +146,7 @@ def wandering(tmp_path_factory):
     )
 
 
+@pytest.mark.slow
 def test_without_errors_its_likelihood_is_the_helicopters_and_planted_ones_return(wandering):
     flight = read_flight(wandering)
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)

@@ -79,6 +79,7 @@ def test_every_mutation_of_the_code_is_another_program_with_a_name_of_its_own():
         assert ast.dump(ast.parse(changed)) != ast.dump(ast.parse(text)), mutation
 
 
+@pytest.mark.slow
 def test_a_draw_takes_every_part_in_turn_and_does_not_depend_on_other_code():
     found = all_sites()
     drawn = draw.draw(found, 60, seed=3)

@@ -153,6 +153,7 @@ def test_projected_information_is_that_beside_the_rest_under_its_priors():
     assert none.shape == (0, 2)
 
 
+@pytest.mark.slow
 def test_occams_factor_is_the_integral_over_the_prior():
     """log of the ratio of the evidences is what the fit gains less the factor: all is Gaussian."""
     for seed in range(3):

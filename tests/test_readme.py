@@ -1,6 +1,5 @@
 """READMEs: what they print is printed, what they name is there, and the first one stays short."""
 
-import ast
 import re
 import subprocess
 import sys
@@ -53,13 +52,9 @@ def test_every_test_named_as_a_proof_is_there():
     text = (ROOT / "tests" / "README.md").read_text(encoding="utf-8")
     named = re.findall(r"`(test_\w+\.py)::(\w+)`", text)
     assert len(named) > 50
-    trees = {
-        file: ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
-        for file in {file for file, _ in named}
-    }
+    texts = {file: (ROOT / "tests" / file).read_text(encoding="utf-8") for file, _ in named}
     for file, name in named:
-        tests = {node.name for node in trees[file].body if isinstance(node, ast.FunctionDef)}
-        assert name in tests, f"{file}::{name}"
+        assert f"\ndef {name}(" in texts[file], f"{file}::{name}"
 
 
 @pytest.mark.slow

@@ -133,6 +133,7 @@ def test_the_vector_env_draws_every_row():
 
 
 @pytest.mark.skipif(importlib.util.find_spec("moviepy") is None, reason="moviepy is not installed")
+@pytest.mark.slow
 def test_record_video_writes_a_film(tmp_path):
     env = gymnasium.wrappers.RecordVideo(
         gymnasium.make("CoaxHeli-v0", render_mode="rgb_array"),

@@ -126,7 +126,9 @@ def test_a_spin_up_reaction_is_of_what_is_commanded():
     values = {"spin_up_reaction.gain": 1.0}
     p = MODEL.vector(values, LEVELS)
     rate = CHANNELS.index("r")
-    assert read(MODEL, state(1.5, -0.8), COMMAND, p)[rate] == pytest.approx(0.2 + taken_up(1.5, -0.8))
+    assert read(MODEL, state(1.5, -0.8), COMMAND, p)[rate] == pytest.approx(
+        0.2 + taken_up(1.5, -0.8)
+    )
     x = state(1.5, -0.8)
     alone = stepped(PLAIN, x[:N_FULL], COMMAND, PLAIN.vector(values))
     gained = stepped(MODEL, x, COMMAND, p)[S.R] - alone[S.R]

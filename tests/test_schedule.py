@@ -31,6 +31,7 @@ def test_shares_are_those_of_the_neighbours():
     assert found.sum(axis=1) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_a_far_target_is_reached_sooner_and_without_going_past(grid):
     same = lqr.design(DRAGGED, LAMA, "mocap", lqr.BRISK)
     target = [(12.0, 0.0, 1.5, 0.0)]

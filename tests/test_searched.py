@@ -378,14 +378,19 @@ def test_joint_gusts_stand_where_they_need_no_name_at_its_limit(monkeypatch, had
     plain, joint = (SimpleNamespace(report=lambda text: None) for _ in range(2))
     first, other = (
         Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
-        for problem, fit in ((plain, Fit(tuple(had), had, FINE)), (joint, Fit(tuple(then), then, FINE)))
+        for problem, fit in (
+            (plain, Fit(tuple(had), had, FINE)),
+            (joint, Fit(tuple(then), then, FINE)),
+        )
     )
     monkeypatch.setattr(searched, "is_much_coloured", lambda problem, fit: False)
     monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: (joint, other.fit))
     monkeypatch.setattr(searched, "_searched", lambda problem, noise, coarse: other)
     monkeypatch.setattr(searched, "_likelier", lambda best, fit: best)
     monkeypatch.setattr(searched, "cost", lambda problem, fit, _: 9.0 if problem is joint else 10.0)
-    monkeypatch.setattr(searched, "sizes", lambda problem, fit, effect: {effect: fit.values[effect]})
+    monkeypatch.setattr(
+        searched, "sizes", lambda problem, fit, effect: {effect: fit.values[effect]}
+    )
     assert (searched._with_joint_gusts(first, FINE).problem is joint) == used
 
 

@@ -710,6 +710,7 @@ def test_the_usual_way_finds_yaw_damping_in_still_air(damped: tuple) -> None:
     assert "yaw_damping" in [c["effect"] for c in named["F > 20"]["causes"]]
 
 
+@pytest.mark.slow
 def test_expected_evidence_grows_with_the_square_of_the_size(damped: tuple) -> None:
     """Four times as much at twice the size, but for the Occam factor. Of small sizes: the flight itself
     has another one, and is less and less that of the size asked."""
@@ -727,6 +728,7 @@ def test_expected_evidence_grows_with_the_square_of_the_size(damped: tuple) -> N
     assert (two - none) / (one - none) == pytest.approx(4.0, rel=0.15)
 
 
+@pytest.mark.slow
 def test_far_from_the_truth_an_effect_is_worth_what_its_slopes_say_at_most(
     damped: tuple, monkeypatch
 ) -> None:
@@ -740,6 +742,7 @@ def test_far_from_the_truth_an_effect_is_worth_what_its_slopes_say_at_most(
     assert by_slopes == pytest.approx(near, rel=0.3) and by_slopes <= near
 
 
+@pytest.mark.slow
 def test_a_deadband_is_expected_to_be_worth_what_the_play_that_names_it_is(damped: tuple) -> None:
     """By its own jumps it was expected to be worth 8,500 nats on a flight, and was called missed."""
     planned, folder, _ = damped

@@ -151,6 +151,7 @@ def test_the_policy_kept_is_the_best_and_no_worse_than_the_one_there_was(tmp_pat
     assert {"trained", "seed_3"} <= set(made)
 
 
+@pytest.mark.slow
 def test_no_candidate_is_refused(tmp_path):
     pytest.importorskip("stable_baselines3")
     from controllers import ppo, trainings

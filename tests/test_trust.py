@@ -321,7 +321,9 @@ def test_what_shows_where_another_stands_at_its_limit_is_doubted(size, channels,
 
 def test_what_shows_where_something_unexplained_acts_is_doubted():
     """A yaw inertia of 92 nats was sure beside a term of the yaw moment (**synthetic**)."""
-    (doubt,) = doubts("yaw_inertia", {"yaw_inertia": known_of(["r"], beside_terms=("r",))}, SETTINGS)
+    (doubt,) = doubts(
+        "yaw_inertia", {"yaw_inertia": known_of(["r"], beside_terms=("r",))}, SETTINGS
+    )
     assert "no effect explains acts in yaw rate" in doubt
     model = HeliModel(load_vehicle("lama400d"))
     plain = replace(problem_of(1), model=model)

@@ -434,6 +434,7 @@ def test_without_excitation_it_is_not_trusted():
     assert total(*noisy_rows(0, 1000, False)).trusted
 
 
+@pytest.mark.slow
 def test_with_draws_the_std_is_the_scatter_in_gusts_too():
     """A gust in y remembers twenty rows: what the errors alone make is then far too small a std."""
     errors = np.diag([0.1, 0.1]) ** 2
@@ -846,6 +847,7 @@ def fits_of(flight, vehicle=LAMA):
     return {fit.mode.name: fit for fit in fits if fit is not None}
 
 
+@pytest.mark.slow
 def test_coefficients_of_the_doublet_are_those_of_the_physics():
     """Paper's tables, Table V noise: forces within 3 std; the moment only with the missing p term."""
     beyond = misses = 0
@@ -1070,6 +1072,7 @@ def planted_flight(seed: int):
     return simulate(truth, runs, seed=seed), truth
 
 
+@pytest.mark.slow
 def test_a_planted_vehicle_comes_back_and_flies(tmp_path):
     flight, truth = planted_flight(1)
     result = identify(flight, LAMA, method="paper")
@@ -1126,6 +1129,7 @@ def test_a_hover_moves_nothing_and_says_so():
     assert result.after.values() == LAMA.values()
 
 
+@pytest.mark.slow
 def test_a_clock_that_starts_late_changes_nothing():
     """Times are counted from a run's own start, the noise record's first seconds too."""
     flight = simulate(LAMA, ("hover", "lon_3211"), seed=4)

@@ -318,6 +318,7 @@ print(json.dumps(found))
 effects once it is compiled."""
 
 
+@pytest.mark.slow
 def test_a_bad_effect_file_is_refused_in_one_line(tmp_path):
     for number, text in enumerate(BAD_EFFECTS.values()):
         if text is not None:
@@ -380,7 +381,7 @@ def test_louder_noise_is_no_vibration(tmp_path, loud):
     assert vibration.find(replace(flight, runs=tuple(runs))) == ()
 
 
-@pytest.mark.parametrize("sensors", ["onboard", "paper"])
+@pytest.mark.parametrize("sensors", ["onboard", pytest.param("paper", marks=pytest.mark.slow)])
 def test_our_own_vibration_is_found_and_taken_out(sensors):
     """The simulation's line at 33.2 Hz, read at 100 Hz and, aliased to 8.2 Hz, at 25 Hz."""
     shaking = LAMA.with_effect("vibration", amplitude=0.3)
