@@ -197,8 +197,7 @@ def test_the_bundled_flight_is_sound():
     "name",
     [
         "open_none",
-        "open_near_ground",
-        "open_rigging",
+        *(pytest.param(f"open_{w}", marks=pytest.mark.slow) for w in ("near_ground", "rigging")),
         "open_outside",
         "skybotix_coax",
         "skybotix_second",

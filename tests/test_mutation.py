@@ -109,6 +109,7 @@ def test_every_file_with_numbers_of_its_own_can_be_broken():
     assert all((ROOT / file).exists() for file in draw.LEFT_OUT)
 
 
+@pytest.mark.slow
 def test_every_pattern_fits_a_file():
     broken = [file for some in draw.files_of(ROOT).values() for file in some]
     for pattern in (*trial.WHOLE_FLIGHTS, *(p for some in draw.PARTS.values() for p in some)):
@@ -121,6 +122,7 @@ def test_every_pattern_fits_a_file():
     assert not left, f"without tests of their own: {sorted(left)}"
 
 
+@pytest.mark.slow
 def test_equivalent_mutations_are_mutations_and_have_a_reason():
     found = {(m.file, m.before, m.after) for m in all_sites()}
     for change, reason in draw.equivalents().items():

@@ -197,7 +197,10 @@ def test_no_line_without_accelerometers():
     assert vibration.find(Flight("lama400d", (run,))) == ()
 
 
-@pytest.mark.parametrize("slip", [0.992, 1.0, 1.01])
+@pytest.mark.parametrize(
+    "slip",
+    [pytest.param(0.992, marks=pytest.mark.slow), 1.0, pytest.param(1.01, marks=pytest.mark.slow)],
+)
 def test_a_tracked_pose_that_shakes_is_calmed(slip):
     """Roll, pitch and height of a motion capture, the speed commanded alone and a little off."""
     rng = np.random.default_rng(5)
