@@ -106,16 +106,17 @@ def test_the_remark_says_where_it_cuts_off_and_what_is_not_asked():
 
 
 @pytest.mark.parametrize(
-    ("alike", "active", "asked"),
+    ("alike", "of_one", "active", "asked"),
     [
-        (4.1, (), ["p", "ax"]),
-        (3.9, (), []),
-        (3.9, ("thrust_exponent", "wind"), ["ax"]),  # which looks like it
-        (3.9, ("attitude_delay",), ["p"]),
+        (4.1, 0.0, (), ["p", "ax"]),
+        (-1.0, 4.1, (), ["p", "ax"]),  # signs differ
+        (3.9, 3.9, (), []),
+        (3.9, 3.9, ("thrust_exponent", "wind"), ["ax"]),  # which looks like it
+        (3.9, 3.9, ("attitude_delay",), ["p"]),
     ],
 )
 def test_a_low_pass_is_asked_for_where_it_shows_or_what_looks_like_it_is_named(
-    monkeypatch, alike, active, asked
+    monkeypatch, alike, of_one, active, asked
 ):
     tried = []
 
@@ -123,7 +124,10 @@ def test_a_low_pass_is_asked_for_where_it_shows_or_what_looks_like_it_is_named(
         tried.append(group[0])
         return NONE, noise
 
-    monkeypatch.setattr(sensor_low_pass, "_alike", lambda passes, channels, group: alike)
+    def correlation(passes: Any, channels: Any, group: Any) -> float:
+        return of_one if group == ["q"] else -9.0 if len(group) == 1 else alike
+
+    monkeypatch.setattr(sensor_low_pass, "_alike", correlation)
     monkeypatch.setattr(sensor_low_pass, "_likeliest", likeliest)
     monkeypatch.setattr(sensor_low_pass, "_refitted", lambda problem, fit, found: fit)
     problem: Any = SimpleNamespace(

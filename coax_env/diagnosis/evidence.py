@@ -36,7 +36,7 @@ from coax_env.diagnosis.fits import (
     without,
 )
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
-from coax_env.diagnosis.moves import dropped_in_brief_gusts
+from coax_env.diagnosis.moves import dropped_in_brief_gusts, far_swap
 from coax_env.diagnosis.problem import PURE_DELAYS, WEAK_OR_LATE, Fit, Problem
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, loss, threshold
@@ -199,6 +199,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         it, and the lesser evidence of the two.
     """
     problem = replace(problem, unlike_gusts=_unlike_gusts(problem, fit))
+    exchanged = False  # at most once
     while True:
         wider, trial = with_command_gains(problem, fit, coloured=True)
         # colour, and gusts that no reading feels in time, spoil them for a model, not to ask with
@@ -206,6 +207,10 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         joint, alone = (wider, trial), (problem, fit)
         (first, start), (second, again) = (joint, alone) if stated else (alone, joint)
         pruned, quadratic, evidence = prune(first, start)
+        swapped = None if exchanged else far_swap(first, pruned, quadratic)
+        if swapped is not None:
+            fit, exchanged = _as_named(problem, fit, swapped), True
+            continue
         if not has_command_gains(wider) or not pruned.active:
             return first, pruned, quadratic, evidence
         enough = problem.settings.clear
@@ -265,6 +270,13 @@ def _only(problem: Problem, fit: Fit, causes: Collection[str]) -> Fit:
         off = problem.off_values(effect) | problem.file_values(effect)
         fit = replace(fit.at(off), active=fit.rest(effect))
     return fit
+
+
+def _as_named(problem: Problem, fit: Fit, other: Fit) -> Fit:
+    """The fit with the causes of another one, those that it does not have at their numbers there."""
+    rest = _only(problem, fit, other.active)
+    new = [f.name for e in other.active if e not in fit.active for f in problem.own[e]]
+    return replace(rest.at({name: other.values[name] for name in new}), active=other.active)
 
 
 def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:

@@ -31,6 +31,12 @@ SERVO_FORMS = ("servo_lag", "servo_delay")
 """Two forms of one servo, the usual one first. A real servo is neither: what a critically damped one of
 40 ms does to a flight, a delay explains better than a lag by 6 of 110 nats, and by 24 of 320."""
 
+LATE_SERVO = (*SERVO_FORMS, "servo_rate")
+"""Effects by which the swash plate is late. A limited rate is far from the others: from 4 rad/s to no
+limit no flight shows anything, and beside a lag the little that a limit adds says nothing of what it
+would explain in its place. So each is fitted in the other's place. (Of 200 and 325 nats hidden, a limit
+of 1.33 rad/s and a deadband, play was named and a lag of 91, 17 nats less likely: **synthetic**.)"""
+
 EXCLUSIVE = (
     frozenset(SERVO_FORMS),
     frozenset({"battery_sag", "battery_voltage"}),
