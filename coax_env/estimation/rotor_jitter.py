@@ -45,7 +45,9 @@ N_JITTERY = JITTER.stop
 REACTION, REACTION_STD = 1.0, 0.5
 """Share of a rotor's angular momentum that the body takes up: all, where a motor shakes the rotor, less
 where the air does; and its std. It is no parameter: gains that are held do not know what noise does
-(fitted so it ran to 2 where 1 was true, 700 nats downhill on a **synthetic** flight); ours."""
+(fitted so it ran to 2 where 1 was true, 700 nats downhill on a **synthetic** flight). Nor are rotors'
+inertias in it: these ran to 1.4 times their own, 81 nats downhill, where a spin-up reaction of 0.82 was
+0.62; ours."""
 REACTION_BOUNDS = (0.05, 2.0)
 JITTER_START = 1e-3
 """Share of the hover speeds with which a fit begins; ours."""
@@ -55,7 +57,7 @@ MEMORY_BOUNDS = (0.015, 2.0)
 """[s]: below, it is white at 100 Hz; above, a trim."""
 
 # behind the kernel's parameters
-_MEMORY, _REACTION = -2, -1
+_MEMORY, _UPPER, _LOWER = -3, -2, -1
 
 # of the scratch, behind the kernel's: the state without jitter, the input with it, drift and readings
 _STATE = dynamics.WORK_SIZE
@@ -67,9 +69,7 @@ _WORK_SIZE = _OUT + N_FULL + N_CHANNELS
 @compiled()
 def _taken_up(x, p):
     """Yaw rate [rad/s] that the body has taken up of the rotors' jitter."""
-    share = p[p.size + _REACTION] / p[P.GUST_INERTIA_ZZ]
-    upper = p[P.ROTOR_INERTIA_U] + p[P.FLYBAR_INERTIA]
-    return share * (upper * x[N_FULL] - p[P.ROTOR_INERTIA_L] * x[N_FULL + 1])
+    return p[p.size + _UPPER] * x[N_FULL] - p[p.size + _LOWER] * x[N_FULL + 1]
 
 
 @compiled()
@@ -148,10 +148,16 @@ class JitteryModel(HeliModel):
     noise_places = np.insert(HeliModel.noise_places, N_FULL, [[N_FULL] * 2, [N_FULL + 1] * 2], 0)
 
     def vector(self, values: Mapping[str, float], noise: Noise | None = None) -> np.ndarray:
-        """The helicopter's parameter vector, and behind it the jitter's memory and reaction."""
+        """The helicopter's parameter vector; behind it the jitter's memory and each rotor's reaction.
+
+        With the vehicle file's inertias: a free one would be the reaction's parameter.
+        """
         levels = {} if noise is None else noise.process
         memory = levels.get(JITTER_MEMORY, MEMORY_START)
-        tail = [memory, levels.get(JITTER_REACTION, REACTION)]
+        file = self.vehicle.vector
+        per_speed = levels.get(JITTER_REACTION, REACTION) / file[P.GUST_INERTIA_ZZ]
+        upper = per_speed * (file[P.ROTOR_INERTIA_U] + file[P.FLYBAR_INERTIA])
+        tail = [memory, upper, per_speed * file[P.ROTOR_INERTIA_L]]
         return np.append(super().vector(values, noise), tail)
 
     def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
