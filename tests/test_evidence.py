@@ -37,6 +37,7 @@ def noise_as_it_is(request, monkeypatch):
     if not request.node.get_closest_marker("slow"):
         monkeypatch.setattr(evidence, "with_latent_noise", lambda problem, fit: None)
         monkeypatch.setattr(evidence, "dropped_in_brief_gusts", lambda *given: None)
+        monkeypatch.setattr(evidence, "is_large", lambda problem, effect, values: True)
 
 
 class Flights:
@@ -205,6 +206,17 @@ def test_what_has_no_evidence_leaves_before_the_fit_is_refined(monkeypatch):
     assert flights.refined == [("gyro_bias", "swash_offset"), ("gyro_bias",)]
 
 
+def test_what_has_become_too_small_leaves_whatever_a_refit_without_it_says(monkeypatch):
+    """A hub stiffness of nothing was worth 83 nats: the refit without it had ended elsewhere."""
+    flights = Flights({"gyro_bias": CLEAR, "hub_stiffness": PLAIN})
+    small = {"hub_stiffness"}
+    monkeypatch.setattr(evidence, "is_large", lambda problem, effect, values: effect not in small)
+    monkeypatch.setattr(evidence, "_only", lambda problem, fit, kept: replace(fit, active=kept))
+    fit, found = flights.pruned(monkeypatch, GOOD)
+    assert fit.active == ("gyro_bias",) and set(found) == {"gyro_bias"}
+    assert fit.history == (("- hub_stiffness", 0.0),)
+
+
 def test_what_is_clear_is_weighed_once(monkeypatch):
     """Its refit costs as much as any other, and it changes nothing of what leaves."""
     flights = Flights({"gyro_bias": CLEAR, "swash_offset": 0.0, "yaw_damping": 0.5 * THRESHOLD})
@@ -319,6 +331,41 @@ def test_a_cause_stands_by_both_likelihoods_or_is_not_named(monkeypatch):
     ):  # fmt: skip
         found = named(monkeypatch, Tables(of(damping=alone), of(damping=joint)), "damping")
         assert found == (("damping",) if stands else ()), (alone, joint)
+
+
+def test_what_takes_a_causes_place_in_the_end_is_weighed_anew_and_once(monkeypatch):
+    """With its own number, of the causes that are left."""
+    had, then = of(servo_lag=PLAIN, play=PLAIN), of(servo_rate=PLAIN, play=PLAIN)
+    tables = Tables(had | then, had | then)
+    asked: list[tuple[str, ...]] = []
+
+    def far_swap(problem: Any, fit: Fit, quadratic: object) -> Fit:
+        asked.append(fit.active)
+        new = {"servo_lag": "servo_rate", "servo_rate": "servo_lag"}
+        return replace(fit, active=tuple(new.get(e, e) for e in fit.active))
+
+    monkeypatch.setattr(evidence, "far_swap", far_swap)
+    monkeypatch.setattr(
+        evidence, "_as_named", lambda problem, fit, other: replace(fit, active=other.active)
+    )
+    assert named(monkeypatch, tables, "servo_lag", "play") == ("servo_rate", "play")
+    assert asked == [("servo_lag", "play")]
+
+
+def test_what_is_named_in_the_end_has_its_own_number():
+    off: Any = {"servo_lag": {"servo_lag.time": 0.0}, "wind": {"wind.north": 0.0}}
+    own: Any = {"servo_rate": [SimpleNamespace(name="servo_rate.limit")]}
+    problem: Any = SimpleNamespace(
+        off_values=off.__getitem__, file_values=lambda effect: {}, own=own
+    )
+    values = {"servo_lag.time": 0.05, "servo_rate.limit": 10.0, "wind.north": 2.0, "play": 0.02}
+    fit = Fit(("servo_lag", "play", "wind"), values, Noise({}))
+    there = {"servo_rate.limit": 1.3, "play": 0.03}
+    found = evidence._as_named(problem, fit, Fit(("servo_rate", "play"), there, Noise({})))
+    assert found.active == ("servo_rate", "play")
+    assert found.values == {
+        "servo_lag.time": 0.0, "servo_rate.limit": 1.3, "wind.north": 0.0, "play": 0.02
+    }  # fmt: skip
 
 
 def test_names_are_asked_so_where_colour_keeps_the_gains_out_of_the_model(monkeypatch):
