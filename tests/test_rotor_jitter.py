@@ -135,6 +135,16 @@ def test_a_spin_up_reaction_is_of_what_is_commanded():
     assert gained == pytest.approx(DT * turned_by_torque(1.5, -0.8), rel=0.02)
 
 
+def test_what_the_body_takes_up_is_of_the_vehicle_files_inertias():
+    """Gains that are held do not know what it does to them: free inertias would be its parameter."""
+    x = state(upper=3.0, lower=-2.0)
+    moves = {"rotor_inertia_upper": 2e-3, "rotor_inertia_lower": 2e-3, "inertia_zz": 9e-3}
+    read_r = CHANNELS.index("r")
+    base, moved = (read(MODEL, x, COMMAND, MODEL.vector(m, LEVELS)) for m in ({}, moves))
+    assert moved[read_r] == base[read_r]
+    assert base[read_r] - x[S.R] == pytest.approx(taken_up(3.0, -2.0))
+
+
 def test_without_jitter_it_is_the_helicopters_own_model_to_the_last_digit():
     x, p = state(0.0, 0.0), vector()
     assert np.array_equal(read(MODEL, x, COMMAND, p), read(PLAIN, x[:N_FULL], COMMAND, LAMA.vector))
