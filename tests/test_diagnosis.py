@@ -27,7 +27,7 @@ from coax_env.diagnosis.fits import at_optimum, converged, fitted, linearise, no
 from coax_env.diagnosis.hold_out import split
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.refinement import refined
-from coax_env.diagnosis.scores import damping_gain, score
+from coax_env.diagnosis.scores import gain_by_likelihood, score
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.errors import InputError
@@ -188,7 +188,7 @@ def test_the_predicted_gain_of_a_damping_is_what_the_likelihood_says(tmp_path, h
     bare = fitted(problem, noise_fitted(problem, fitted(problem, bare)), 4, 0.1)
     bare, _, quadratic = linearise(problem, bare)
     held = score(problem, quadratic, (), "axial_damping").nats
-    predicted, at = damping_gain(problem, bare, quadratic, "axial_damping")
+    predicted, at = gain_by_likelihood(problem, bare, quadratic, "axial_damping")
     full = at_optimum(problem, bare, quadratic, ("axial_damping",), at)
     full = fitted(problem, full, 10, 0.02)
     occam = quadratic.occam(["axial_damping.coefficient"], problem.free_names([]))

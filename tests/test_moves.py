@@ -158,7 +158,7 @@ def test_trials_are_those_nearly_strong_and_dampings_with_half_the_evidence(monk
     )
     gains = {"yaw_damping": (7.1, {"yaw_damping.coefficient": 0.1})}
     monkeypatch.setattr(
-        moves, "damping_gain", lambda problem, fit, q, e: gains.get(e, (-math.inf, {}))
+        moves, "gain_by_likelihood", lambda problem, fit, q, e: gains.get(e, (-math.inf, {}))
     )
     made = problem("gyro_bias", "wind", "yaw_damping", "servo_lag", "added_mass", "swash_offset")
     fit = replace(FIT, active=("gyro_bias",))

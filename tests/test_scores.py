@@ -20,8 +20,8 @@ from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.findings import FLIES_WORSE, doubted_by_held_out, mixtures_as_one
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import (
-    damping_gain,
     exchanges,
+    gain_by_likelihood,
     inflation,
     is_large,
     loss,
@@ -271,7 +271,7 @@ def test_a_damping_is_weighed_by_the_likelihoods_slope(pull):
     g[k] = pull / STD[k]
     made = problem(Parabola(q, g))
     fit = Fit((), OFF, NOISE, objective=0.0)
-    nats, at = damping_gain(made, fit, q, "yaw_damping")
+    nats, at = gain_by_likelihood(made, fit, q, "yaw_damping")
     true = replace(q, g=g)
     (value,) = at.values()
     best = true.moved(true.best([*BASE, *own("yaw_damping")])[1])["yaw_damping.coefficient"]
@@ -289,7 +289,7 @@ def test_a_damping_that_the_flight_does_not_show_is_worth_nothing():
     q = quadratic(7)
     G, k = q.G.copy(), NAMES.index("yaw_damping.coefficient")
     G[k] = G[:, k] = 0.0
-    nats, at = damping_gain(PROBLEM, Fit((), OFF, NOISE), replace(q, G=G), "yaw_damping")
+    nats, at = gain_by_likelihood(PROBLEM, Fit((), OFF, NOISE), replace(q, G=G), "yaw_damping")
     assert nats == -math.inf and at == {}
 
 

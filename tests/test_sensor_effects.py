@@ -32,7 +32,7 @@ def flight_with(channels: str, turn: float = 0.0) -> Flight:
     ("channels", "absent"),
     [
         ("p q r phi theta psi h", POSITION),
-        ("phi theta psi pn pe h", SONAR | {"attitude_delay", "magnetic_field"}),
+        ("phi theta psi pn pe h", SONAR | {"magnetic_field"}),
         ("p q r phi theta psi pn pe h", SONAR),
     ],
 )

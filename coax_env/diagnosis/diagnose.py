@@ -334,13 +334,13 @@ def _followed(flight: Flight) -> tuple[np.ndarray, np.ndarray]:
 def _without_sensor(flight: Flight) -> frozenset[str]:
     """Effects of readings that the flight does not have, or that another effect stands for.
 
-    Where a position is aboard, the height comes with it; where no gyro is either, so does the attitude.
+    Where a position is aboard, the height comes with it; where no gyro is either, so does the heading.
     Without a position a late attitude and a late pose are one effect.
     """
     tracked, gyros = {"pn", "pe"} <= set(flight.channels), {"p", "q", "r"} & set(flight.channels)
     absent = SONAR if tracked else OF_POSITION
     if tracked and not gyros:
-        absent |= {"attitude_delay", "magnetic_field"}
+        absent |= {"magnetic_field"}
     return absent if _turns(flight) else absent | {"magnetic_field"}
 
 

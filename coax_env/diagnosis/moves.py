@@ -17,11 +17,18 @@ from coax_env.diagnosis.fits import (
     with_latent_noise,
     without,
 )
-from coax_env.diagnosis.problem import LATE_SERVO, SERVO_FORMS, Fit, Problem
+from coax_env.diagnosis.problem import (
+    LATE_SERVO,
+    SERVO_FORMS,
+    SERVO_RATE,
+    Fit,
+    Problem,
+    exclusive_with,
+)
 from coax_env.diagnosis.scores import (
     Score,
-    damping_gain,
     exchanges,
+    gain_by_likelihood,
     inflation,
     is_large,
     loss,
@@ -29,7 +36,6 @@ from coax_env.diagnosis.scores import (
 )
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
-from coax_env.model import effects
 from coax_env.plain_words import and_list
 
 BRIEF_TURNS = 2
@@ -108,6 +114,8 @@ def add(
     fixed = problem.file_values(effect)
     if fixed:  # takes the base parameter's place: the same model, not a better one
         moved = at_optimum(problem, fit, quadratic, active, fixed)
+    elif effect == SERVO_RATE:
+        moved = _likeliest(problem, replace(fit, active=active), effect)
     else:
         moved = stepped(problem, replace(fit, active=active), passes, quadratic)
     return moved.noted(f"+ {effect}", nats)
@@ -121,7 +129,7 @@ def trials(
     banned: Collection[str],
     tried: Collection[tuple[str, ...]],
 ) -> tuple[list[Proposal], list[str]]:
-    """Effects that the quadratic nearly carries, and dampings by the likelihood's own slope.
+    """Effects that the quadratic nearly carries, and by the likelihood's own slope those gains hide.
 
     The quadratic at nothing is not that at the effect's size: a damping changes what the filter makes
     of gusts, and may be worth ten times what its slope predicted.
@@ -134,7 +142,7 @@ def trials(
         tried: sets of effects that need no second trial.
 
     Returns:
-        what is worth a fit, and the dampings that were evaluated.
+        what is worth a fit, and what was asked by the likelihood's slope.
     """
     chosen = problem.settings
     enough = threshold(problem, quadratic, fit.active)
@@ -149,13 +157,14 @@ def trials(
         if least < c.evidence <= enough and not problem.file_values(c.effect)
     )[: chosen.most_trials]
     begin: dict[str, Mapping[str, float]] = {effect: {} for effect in weak}
-    dampings = untried(
+    hidden = untried(
         e
         for e in problem.candidates
-        if effects.CATALOGUE[e].damps
+        if problem.is_hidden_by_gains(e)
         and e not in {*fit.active, *banned, *weak, *problem.model.moments}
+        and not exclusive_with(e) & set(fit.active)
     )
-    gains = problem.for_each(lambda e: damping_gain(problem, fit, quadratic, e), dampings)
+    gains = problem.for_each(lambda e: gain_by_likelihood(problem, fit, quadratic, e), hidden)
     begin |= {e: at for e, (nats, at) in gains.items() if nats > least}
     proposals = [
         Proposal(
@@ -168,7 +177,7 @@ def trials(
         )
         for effect, at in begin.items()
     ]
-    return proposals, dampings
+    return proposals, hidden
 
 
 # --- swap -------------------------------------------------------------------------------------------

@@ -31,11 +31,15 @@ SERVO_FORMS = ("servo_lag", "servo_delay")
 """Two forms of one servo, the usual one first. A real servo is neither: what a critically damped one of
 40 ms does to a flight, a delay explains better than a lag by 6 of 110 nats, and by 24 of 320."""
 
-LATE_SERVO = (*SERVO_FORMS, "servo_rate")
-"""Effects by which the swash plate is late. A limited rate is far from the others: from 4 rad/s to no
-limit no flight shows anything, and beside a lag the little that a limit adds says nothing of what it
-would explain in its place. So each is fitted in the other's place. (Of 200 and 325 nats hidden, a limit
-of 1.33 rad/s and a deadband, play was named and a lag of 91, 17 nats less likely: **synthetic**.)"""
+SERVO_RATE = "servo_rate"
+"""A limited rate is far from none: from 4 rad/s on no flight shows anything, so that its size is looked
+for (moves.py) and not read off a slope. By that one of 0.68 rad/s, worth 1,022 nats, was put at more
+than 7 and dropped as too small (**synthetic**)."""
+
+LATE_SERVO = (*SERVO_FORMS, SERVO_RATE)
+"""Effects by which the swash plate is late. Beside a lag the little that a limited rate adds says
+nothing of what it would explain in its place: each is fitted there. (Of a limit of 1.33 rad/s and a
+deadband, play was named and a lag of 91 nats, 17 less likely than the limit: **synthetic**.)"""
 
 EXCLUSIVE = (
     frozenset(SERVO_FORMS),
@@ -226,6 +230,16 @@ class Problem:
     def reads_seldom(self) -> bool:
         """Whether commands may answer what no reading but a rotor's speed has shown by then."""
         return self.between_readings > self.settings.slow_rows
+
+    def is_hidden_by_gains(self, effect: str) -> bool:
+        """Whether an effect's slope with the filter's gains held says little of what it is worth.
+
+        A damping changes what a filter makes of gusts; by poses alone a delay of the attitudes does, to
+        which the state is drawn: one of 51 ms, 200 nats likelier than a late command and a late servo,
+        seemed to gain nothing (**synthetic**).
+        """
+        late = effect == "attitude_delay" and self.sees_poses_alone
+        return late or effects.CATALOGUE[effect].damps
 
     @cached_property
     def sees_poses_alone(self) -> bool:

@@ -281,23 +281,23 @@ def most_gains(
     return value, gains
 
 
-def damping_gain(
-    problem: Problem, fit: Fit, quadratic: Quadratic, damping: str
+def gain_by_likelihood(
+    problem: Problem, fit: Fit, quadratic: Quadratic, effect: str
 ) -> tuple[float, dict[str, float]]:
-    """Predicted gain of a damping, by the slope of the likelihood itself, Occam factor deducted.
+    """Predicted gain of an effect, by the slope of the likelihood itself, Occam factor deducted.
 
-    From one filter pass with a small damping. Signatures hold the gains fixed, so that their slope
-    lacks what the damping does to the gains.
+    From one filter pass with a little of it. Signatures hold the gains fixed, so that their slope lacks
+    what the effect does to the gains.
 
     Args:
         problem, fit: what may be free, and where.
         quadratic: linearised at the fit.
-        damping: an effect of the catalogue with `damps`.
+        effect: of one parameter that acts, such as a damping.
 
     Returns:
-        nats, and the damping's parameter at its optimum.
+        nats, and the effect's parameter at its optimum.
     """
-    (f,) = (f for f in problem.own[damping] if f.name in problem.acting_names(damping))
+    (f,) = (f for f in problem.own[effect] if f.name in problem.acting_names(effect))
     rest = problem.free_names(fit.active)
     information = float(quadratic.projected([f.name], rest)[0][0, 0])
     if information <= 0.0:
