@@ -380,6 +380,14 @@ def test_a_steplike_sensors_std_is_at_least_that_of_its_steps():
     assert sensor_std(a_flight(h=ramp), "h") == pytest.approx(0.5 / math.sqrt(12.0))
 
 
+def test_a_whole_turn_is_no_step_of_a_heading():
+    """A heading in steps of 0.02 rad that crosses south and comes back: 2 pi is no multiple of them."""
+    turning = 2.6 + np.sin(0.001 * np.arange(4000))
+    heading = np.round(np.round((np.mod(turning + np.pi, 2.0 * np.pi) - np.pi) / 0.02) * 0.02, 2)
+    assert np.ptp(heading) > 6.0
+    assert sensor_std(a_flight(psi=heading), "psi") == pytest.approx(0.02 / math.sqrt(12.0))
+
+
 def test_record_of_puts_every_channel_in_its_column():
     flight = a_flight(h=np.arange(10.0), q=-np.arange(10.0))
     found = record_of(flight.runs[0])

@@ -296,11 +296,9 @@ def sensor_std(flight: Flight, channel: str) -> float:
     for run in flight.runs:
         if channel in run.measured:
             values = run.measured[channel][np.isfinite(run.measured[channel])]
-            if channel in ANGLES:
-                values = np.unwrap(values)
             if values.size > 8:
-                parts.append(np.diff(values, 3))
-                steps.append(np.diff(np.unique(values)))
+                steps.append(np.diff(np.unique(values)))  # a whole turn is none of them
+                parts.append(np.diff(np.unwrap(values) if channel in ANGLES else values, 3))
     if not parts:
         return LEAST_READING_STD[channel]
     scatter = float(np.median(np.abs(np.concatenate(parts)))) / 0.6745 / float(np.sqrt(20.0))
