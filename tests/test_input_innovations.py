@@ -130,7 +130,9 @@ def test_a_gain_s_prior_is_what_the_filter_does_not_know_over_what_commands_show
     assert not any(n.endswith(("rate_z", "moment_z")) for n in names) and len(names) == 5
 
 
-@pytest.mark.parametrize(("fallen", "taken"), [(6.1, True), (5.9, False), (-3.0, False)])
+@pytest.mark.parametrize(
+    ("fallen", "taken"), [(6.1, True), (5.9, False), (-3.0, False), (np.nan, False)]
+)
 def test_gains_are_fitted_where_that_is_worth_more_than_a_tie(monkeypatch, fallen, taken):
     """And only beside white innovations: what a model gets wrong follows the commands too."""
     first, *others = P.COMMAND_GAINS

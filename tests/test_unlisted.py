@@ -11,6 +11,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import injector
 import numpy as np
@@ -18,9 +19,9 @@ import pytest
 
 from coax_env import InputError, derivative, diagnose, load_vehicle, read_flight
 from coax_env.diagnosis import unlisted, vibration
-from coax_env.diagnosis.problem import Problem
+from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter import HeliModel
-from coax_env.estimation.state_space import Record
+from coax_env.estimation.state_space import Noise, Record
 from coax_env.model import effects
 from coax_env.model.dynamics import WORK_SIZE, full_state, hover_trim, kernel_input
 from coax_env.model.dynamics import step as dynamics_step
@@ -43,6 +44,25 @@ def all_but(*names: str) -> list[str]:
 
 
 FEW = all_but("gyro_bias", "swash_offset", "rotor_drag")
+
+@pytest.mark.parametrize("ends", [250.0, math.inf])
+def test_generic_terms_with_which_the_filter_diverges_are_refused(monkeypatch, ends):
+    """A search beside two of them ended so: every cause was worth nan nats, and left."""
+    term = ("unlisted_N", TERMS[:1])
+    found = iter([(term, 20.0), None])
+    given: Any = Problem(HeliModel(LAMA), SimpleNamespace(threads=1, records=[]), (), {})  # type: ignore[arg-type]
+    fit, wider, quadratic = Fit((), {}, Noise({}), objective=300.0), replace(given, base=()), Any
+    monkeypatch.setattr(unlisted, "_screened", lambda *asked: None)
+    monkeypatch.setattr(unlisted, "_best", lambda *asked: next(found))
+    monkeypatch.setattr(unlisted, "_with", lambda *asked: (wider, fit))
+    monkeypatch.setattr(
+        unlisted, "search", lambda problem, fit: (replace(fit, objective=ends), quadratic)
+    )
+    monkeypatch.setattr(unlisted, "_pruned", lambda *left: left)
+    problem, after, _, taken = unlisted.explain(given, fit, quadratic)  # type: ignore[arg-type]
+    stands = math.isfinite(ends)
+    assert (problem is wider, after is fit, list(taken)) == (stands, not stands, [term] * stands)
+
 
 # --- the terms themselves ---------------------------------------------------------------------------
 

@@ -77,7 +77,7 @@ def with_command_gains(problem: Problem, fit: Fit, coloured: bool = False) -> tu
     trial = fitted(wider, fit.at({n: fit.values.get(n, 0.0) for n in P.COMMAND_GAINS}),
                    tolerance=0.5 * tie)  # fmt: skip
     gained = fit.objective - trial.objective
-    if gained <= tie:
+    if not gained > tie:  # none of two fits whose filters diverge
         return problem, fit
     problem.report(f"the commands carry information on the gusts: {gained:.1f} nats")
     return wider, trial

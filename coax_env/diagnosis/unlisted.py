@@ -15,6 +15,7 @@ large part of the gusts themselves and be worth twice as much.
 A term is a description with a value in prediction, not a cause.
 """
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -112,6 +113,7 @@ def explain(
         a term that is worth it nothing changes.
     """
     chosen = problem.settings
+    given = problem, fit, quadratic
     taken: list[Candidate] = []
     refused: set[Candidate] = set()
     while len(taken) < chosen.most_terms and len(refused) < chosen.most_failures:
@@ -132,6 +134,9 @@ def explain(
         return problem, fit, quadratic, []
     problem.report("searching again beside the generic terms")
     fit, quadratic = search(problem, fit)
+    if not math.isfinite(fit.objective):
+        problem.report("refused the generic terms: with them the filter diverges")
+        return *given, []
     return _pruned(problem, fit, quadratic, taken)
 
 
