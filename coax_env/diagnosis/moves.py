@@ -44,8 +44,10 @@ REACH = 4.0
 """Times its usual size, and that part of it, between which a number is looked for; ours."""
 WITHIN = 0.02
 """Of its logarithm, to which it is; ours."""
-FAR_TURNS = 3
+FAR_TURNS = 2
 """Of its likeliest size and all other numbers; ours."""
+BEHIND = 5.0
+"""Ties by which it may be less likely then, before noise levels are fitted; ours."""
 TOO_SMALL = "too small to matter in prediction"
 
 
@@ -224,7 +226,10 @@ def far_swap(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
             trial = replace(without(problem, fit, quadratic, old), active=active)
             for _ in range(FAR_TURNS):
                 trial = fitted(problem, _likeliest(problem, trial, new))
-            trial = converged(problem, trial)
+                if not trial.objective < fit.objective + BEHIND * problem.settings.tie:
+                    break
+            else:
+                trial = converged(problem, trial)
             gained = fit.objective - trial.objective
             if gained > problem.settings.tie and is_large(problem, new, trial.values):
                 problem.report(f"{new} explains it better than {old}, by {gained:.1f} nats in the end")
