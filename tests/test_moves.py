@@ -91,6 +91,10 @@ def test_what_makes_a_servo_late_is_fitted_in_the_place_of_what_else_does(
     gained = SETTINGS.tie + 0.1
     found = moves.far_swap(own, fit, quadratic)
     assert (found.active if found else ()) == tuple(tried[:1])
+    begun.clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(Problem, "changes", lambda problem, effect: True)
+        assert moves.far_swap(own, fit, quadratic) is None and not begun, "it has two sizes"
     monkeypatch.setattr(moves, "is_large", lambda *given: False)
     assert moves.far_swap(own, fit, quadratic) is None
 

@@ -116,7 +116,7 @@ def add(
     fixed = problem.file_values(effect)
     if fixed:  # takes the base parameter's place: the same model, not a better one
         moved = at_optimum(problem, fit, quadratic, active, fixed)
-    elif effect == SERVO_RATE:
+    elif effect == SERVO_RATE and not problem.changes(effect):
         moved = _likeliest(problem, replace(fit, active=active), effect)
     else:
         moved = stepped(problem, replace(fit, active=active), passes, quadratic)
@@ -218,10 +218,10 @@ def far_swap(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
         problem, fit: what may be free, and where; converged.
         quadratic: linearised at the fit.
     """
-    for old in (e for e in fit.active if e in LATE_SERVO):
+    for old in (e for e in fit.active if e in LATE_SERVO and not problem.changes(e)):
         near = SERVO_FORMS if old in SERVO_FORMS else (old,)
         far = (e for e in LATE_SERVO if e not in near and e in problem.candidates)
-        for new in (e for e in far if e not in fit.active):
+        for new in (e for e in far if e not in fit.active and not problem.changes(e)):
             active = tuple(new if e == old else e for e in fit.active)
             trial = replace(without(problem, fit, quadratic, old), active=active)
             for _ in range(FAR_TURNS):
