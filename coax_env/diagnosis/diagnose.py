@@ -339,9 +339,8 @@ def _without_sensor(flight: Flight) -> frozenset[str]:
     """
     tracked, gyros = {"pn", "pe"} <= set(flight.channels), {"p", "q", "r"} & set(flight.channels)
     absent = SONAR if tracked else OF_POSITION
-    if tracked and not gyros:
-        absent |= {"magnetic_field"}
-    return absent if _turns(flight) else absent | {"magnetic_field"}
+    blind = (tracked and not gyros) or not _turns(flight)
+    return absent | {"magnetic_field"} if blind else absent
 
 
 def _turns(flight: Flight) -> bool:

@@ -19,7 +19,6 @@ from coax_env.diagnosis.fits import (
 )
 from coax_env.diagnosis.problem import (
     LATE_SERVO,
-    SERVO_FORMS,
     SERVO_RATE,
     Fit,
     Problem,
@@ -218,23 +217,32 @@ def far_swap(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
         problem, fit: what may be free, and where; converged.
         quadratic: linearised at the fit.
     """
-    for old in (e for e in fit.active if e in LATE_SERVO and not problem.changes(e)):
-        near = SERVO_FORMS if old in SERVO_FORMS else (old,)
-        far = (e for e in LATE_SERVO if e not in near and e in problem.candidates)
-        for new in (e for e in far if e not in fit.active and not problem.changes(e)):
-            active = tuple(new if e == old else e for e in fit.active)
-            trial = replace(without(problem, fit, quadratic, old), active=active)
-            for _ in range(FAR_TURNS):
-                trial = fitted(problem, _likeliest(problem, trial, new))
-                if not trial.objective < fit.objective + BEHIND * problem.settings.tie:
-                    break
-            else:
-                trial = converged(problem, trial)
-            gained = fit.objective - trial.objective
-            if gained > problem.settings.tie and is_large(problem, new, trial.values):
-                problem.report(f"{new} explains it better than {old}, by {gained:.1f} nats in the end")
-                return trial.noted(f"{old} -> {new}", gained)
+    for old, new in _far_pairs(problem, fit):
+        active = tuple(new if e == old else e for e in fit.active)
+        trial = replace(without(problem, fit, quadratic, old), active=active)
+        for _ in range(FAR_TURNS):
+            trial = fitted(problem, _likeliest(problem, trial, new))
+            if not trial.objective < fit.objective + BEHIND * problem.settings.tie:
+                break
+        else:
+            trial = converged(problem, trial)
+        gained = fit.objective - trial.objective
+        if gained > problem.settings.tie and is_large(problem, new, trial.values):
+            problem.report(f"{new} explains it better than {old}, by {gained:.1f} nats in the end")
+            return trial.noted(f"{old} -> {new}", gained)
     return None
+
+
+def _far_pairs(problem: Problem, fit: Fit) -> list[tuple[str, str]]:
+    """What makes a servo late, and what may stand in its place; lag and delay are near each other."""
+    return [
+        (old, new)
+        for old in fit.active
+        if old in LATE_SERVO and not problem.changes(old)
+        for new in LATE_SERVO
+        if SERVO_RATE in (old, new) and new in problem.candidates
+        if new not in fit.active and not problem.changes(new)
+    ]
 
 
 def _likeliest(problem: Problem, fit: Fit, effect: str) -> Fit:
