@@ -99,6 +99,15 @@ def test_what_makes_a_servo_late_is_fitted_in_the_place_of_what_else_does(
     assert moves.far_swap(own, fit, quadratic) is None
 
 
+def test_no_delay_stands_in_a_limited_rates_place_beside_a_lag():
+    """One servo has a lag or a delay; either may stand for the rate where it is alone."""
+    own = problem(*LATE_SERVO)
+    fit = replace(FIT, active=("servo_lag", "servo_rate"))
+    assert moves._far_pairs(own, fit) == []
+    alone = replace(FIT, active=("servo_rate",))
+    assert [new for _, new in moves._far_pairs(own, alone)] == ["servo_lag", "servo_delay"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("hidden", "named"),

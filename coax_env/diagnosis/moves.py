@@ -242,6 +242,7 @@ def _far_pairs(problem: Problem, fit: Fit) -> list[tuple[str, str]]:
         for new in LATE_SERVO
         if SERVO_RATE in (old, new) and new in problem.candidates
         if new not in fit.active and not problem.changes(new)
+        if not exclusive_with(new) & set(fit.rest(old))
     ]
 
 
