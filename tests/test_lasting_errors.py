@@ -233,13 +233,13 @@ def test_errors_last_where_that_is_worth_it_and_no_motion_stays_coloured(
         sees_poses_alone=not aboard, of_onboard_filter=coloured == "onboard filter",
     )  # fmt: skip
     problem.with_model = lambda model: SimpleNamespace(**{**vars(problem), "model": model})
-    found = sensor_errors.with_lasting_errors(problem, fit, first)  # type: ignore[arg-type]
-    assert (found is not None) == used
+    found = sensor_errors.lasting_errors(problem, fit, first)  # type: ignore[arg-type]
+    assert (found is not None and found.whiten) == used
     if found is not None:
-        assert isinstance(found[0].model, ErringModel)
+        assert isinstance(found.problem.model, ErringModel) and found.gained == gain
         names = {name(g) for g in ("attitude", "velocity") for name in (error_level, error_memory)}
-        assert found[1].objective == 400.0 and set(found[2].process) == {*process, *names}
-        assert found[2].process[error_level("velocity")] == pytest.approx(0.5)
+        assert found.fit.objective == 400.0 and set(found.begun.process) == {*process, *names}
+        assert found.begun.process[error_level("velocity")] == pytest.approx(0.5)
 
 
 def turning(seed: int, carried: str, every: int = 1, common: float = 0.0) -> Run:

@@ -15,7 +15,7 @@ from coax_env.diagnosis import confounding, corrected_vehicle, moves
 from coax_env.diagnosis.black_box import PRIOR_WIDTHS, black_box
 from coax_env.diagnosis.fits import converged, fitted, quadratic_at, start
 from coax_env.diagnosis.moves import Proposal
-from coax_env.diagnosis.problem import LATE_SERVO, Fit, Problem
+from coax_env.diagnosis.problem import LATE_ROTORS, LATE_SERVO, Fit, Problem
 from coax_env.diagnosis.scores import Score
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter import HeliModel, record_of
@@ -137,6 +137,68 @@ def test_a_limited_rate_and_a_lag_are_told_apart_in_gusts(tmp_path, hidden, name
         assert found.active == (true, "servo_play")
         ((number, size),) = hidden[true].items()
         assert found.values[f"{true}.{number}"] == pytest.approx(size, rel=0.15)
+
+
+# --- rotors that nobody sees --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("had", "candidates", "tried"),
+    [
+        (("yaw_damping",), (), [{"yaw_damping"}]),
+        (("motor_lag",), (), [set()]),
+        (("command_delay",), ("servo_lag",), [{"command_delay"}, {"servo_lag"}]),
+        (("command_delay",), (), [{"command_delay"}]),
+        (("command_delay", "servo_delay"), ("servo_lag",), [{"command_delay", "servo_delay"}]),
+    ],
+)
+def test_late_rotors_and_their_reaction_are_tried_from_their_usual_sizes(had, candidates, tried):
+    """Beside what is late, and with a late servo for a late command; the machine's own numbers anew."""
+    own = problem(*LATE_ROTORS, *had, *candidates)
+    values = {f.name: 1.1 * f.value for f in own.base} | {"command_delay.time": 0.04}
+    fit = replace(FIT, active=had).at(values)
+    begun = list(moves._with_late_rotors(own, fit))
+    assert [set(begin.active) - {*LATE_ROTORS} for begin in begun] == tried
+    usual = {f.name: f.std for e in LATE_ROTORS for f in own.own[e]}
+    for begin in begun:
+        assert set(LATE_ROTORS) <= set(begin.active)
+        assert {name: begin.values[name] for name in usual} == usual
+        assert begin.values["mass"] == own.base[0].value
+    if tried[-1] == {"servo_lag"}:
+        assert begun[-1].values["servo_lag.time"] == 0.04
+        assert begun[-1].values["command_delay.time"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("gains", "large", "taken"),
+    [
+        ((6.5, -100.0), True, 0),
+        ((6.5, 7.0), True, 1),
+        ((5.5, -100.0), True, None),
+        ((100.0, 100.0), False, None),
+        ((math.inf, -math.inf), True, None),
+    ],
+)
+def test_the_likelier_late_rotors_stand_by_more_than_a_tie(monkeypatch, gains, large, taken):
+    own = problem(*LATE_ROTORS, "command_delay", "servo_lag")
+    fit = replace(FIT, active=("command_delay",)).at({f.name: f.value for f in own.parameters})
+
+    def fitted(problem: Problem, begin: Fit, steps: int = 3) -> Fit:
+        late = "servo_lag" in begin.active
+        return replace(begin, objective=500.0 - gains[late] if math.isfinite(gains[late]) else math.nan)
+
+    monkeypatch.setattr(moves, "fitted", fitted)
+    monkeypatch.setattr(moves, "noise_fitted", lambda problem, fit: fit)
+    monkeypatch.setattr(moves, "converged", lambda problem, fit: fit)
+    monkeypatch.setattr(moves, "quadratic_at", lambda problem, fit: (fit, None))
+    monkeypatch.setattr(moves, "cost", lambda problem, fit, quadratic: fit.objective)
+    monkeypatch.setattr(moves, "is_large", lambda *given: large)
+    quadratic: Any = None
+    found = moves.late_rotors(own, fit, quadratic)
+    assert (found is None) == (taken is None)
+    if found is not None:
+        assert ("servo_lag" in found.active) == bool(taken)
+        assert found.history[-1] == ("+ motor_lag and spin_up_reaction", gains[taken])
 
 
 # --- a proposal, fitted -------------------------------------------------------------------------------

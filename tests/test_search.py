@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from coax_env.diagnosis import search as module
-from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.problem import LATE_ROTORS, Fit, Problem
 from coax_env.diagnosis.scores import Score
 from coax_env.diagnosis.search import _forward, _Memory, search
 from coax_env.diagnosis.settings import SETTINGS
@@ -209,3 +209,31 @@ def test_in_brief_gusts_all_weak_effects_leave_but_what_was_worth_most_when_it_c
     assert asked == [["yaw_damping", "motor_lag"]]
     module._in_brief_gusts(PROBLEM, replace(fit, active=("motor_lag",)), quadratic, memory)
     assert len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("active", "candidates", "aboard", "asked"),
+    [
+        (("yaw_damping",), LATE_ROTORS, {"phi"}, True),
+        (("command_delay", "wind"), LATE_ROTORS, {"phi", "r"}, True),
+        (("motor_lag",), LATE_ROTORS, {"phi"}, True),
+        (("wind",), LATE_ROTORS, {"phi"}, False),  # nothing that is late or weak
+        (("yaw_damping",), LATE_ROTORS[:1], {"phi"}, False),
+        (("yaw_damping",), LATE_ROTORS, {"phi", "rpm_lower"}, False),  # they are seen
+        (LATE_ROTORS, LATE_ROTORS, {"phi"}, False),
+        ((), LATE_ROTORS, {"phi"}, False),
+    ],
+)
+def test_late_rotors_are_asked_for_once_where_nobody_sees_them(
+    monkeypatch, active, candidates, aboard, asked
+):
+    beside: list[tuple[str, ...]] = []
+    monkeypatch.setattr(module, "late_rotors", lambda problem, fit, q: beside.append(fit.active))
+    problem: Any = SimpleNamespace(
+        candidates=candidates, model=SimpleNamespace(moments={}), aboard=frozenset(aboard)
+    )
+    memory, quadratic = _Memory(), SimpleNamespace()
+    for _ in range(2):
+        fit = replace(FIT, active=active)
+        assert module._with_late_rotors(problem, fit, quadratic, memory) is None
+    assert beside == [active] * asked

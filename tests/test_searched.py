@@ -11,6 +11,7 @@ from coax_env import load_vehicle
 from coax_env.diagnosis import fits, searched
 from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.searched import Searched
+from coax_env.diagnosis.sensor_errors import LastingErrors
 from coax_env.diagnosis.sensor_low_pass import hidden_behind
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter import HeliModel, Moment
@@ -94,7 +95,7 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
 
 def believes_its_sensors(monkeypatch) -> None:
     """No errors that last, times that are right, white rotor speeds, gusts that push or turn."""
-    monkeypatch.setattr(searched, "with_lasting_errors", lambda problem, fit, noise: None)
+    monkeypatch.setattr(searched, "lasting_errors", lambda problem, fit, noise: None)
     monkeypatch.setattr(searched, "with_clock_errors", lambda problem, fit: None)
     monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: None)
     monkeypatch.setattr(searched, "_may_hide_jitter", lambda found: False)
@@ -122,9 +123,8 @@ def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had,
     monkeypatch.setattr(searched, "_searched", one)
     believes_its_sensors(monkeypatch)
     lasting = Noise({"error_gyros": 0.1}, {"phi": 0.2})
-    monkeypatch.setattr(
-        searched, "with_lasting_errors", lambda problem, fit, noise: (wider, fit, lasting)
-    )
+    errors = lambda problem, fit, noise: LastingErrors(wider, fit, lasting, 90.0, True)  # noqa: E731
+    monkeypatch.setattr(searched, "lasting_errors", errors)
     monkeypatch.setattr(searched, "_white_since", lambda best, clock, gained: None)
     monkeypatch.setattr(searched, "search", lambda problem, fit: (fit, None))
     monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)

@@ -300,7 +300,7 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
         channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
         alternatives=(), nats=100.0, shaken=False, poses_alone=False,
-        clock_error=0.0, smoothed=False, beside_terms=(),
+        clock_error=0.0, smoothed=False, errors_left=0.0, beside_terms=(),
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -456,6 +456,13 @@ def test_nothing_is_sure_where_rows_have_clock_errors():
     (text,) = doubts("marker_offset", against, SETTINGS)
     assert text == "the times of the log's rows are wrong by 0.69 ms"
     assert not without_name(against, SETTINGS)
+
+
+@pytest.mark.parametrize(("worth", "left", "said"), [(65.0, 14725.0, True), (65.0, 60.0, False)])
+def test_a_bias_is_doubted_where_errors_that_last_are_worth_more(worth, left, said):
+    """Of an accelerometer that drifts: 65 nats, sure, since 12 s of a run, on a clean flight."""
+    against = {"accel_bias": known_of(["ax"], nats=worth, errors_left=left)}
+    assert any("last" in text for text in doubts("accel_bias", against, SETTINGS)) == said
 
 
 def test_nothing_is_sure_where_a_run_is_much_louder_than_its_noise():

@@ -47,6 +47,8 @@ class Against:
         poses_alone: whether neither gyros nor accelerometers were read.
         clock_error: std by which the times of the log's rows are wrong [s].
         smoothed: whether a low-pass of a sensor too fast to be seen would do the same.
+        errors_left: what errors of readings that last, which look like it, are worth beside it [nats];
+            0 where they are in the model, or nothing asks for them.
         beside_terms: channels among its own in which what no effect explains acts, too.
     """
 
@@ -65,6 +67,7 @@ class Against:
     poses_alone: bool
     clock_error: float
     smoothed: bool
+    errors_left: float
     beside_terms: tuple[str, ...]
 
     @property
@@ -164,6 +167,8 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
         yield f"the times of the log's rows are wrong by {1e3 * of.clock_error:.2g} ms"
     if of.smoothed:
         yield "a low-pass of the accelerometers too fast to be seen does the same"
+    if of.nats < of.errors_left:
+        yield "readings have errors that last, worth more than it: a sensor that drifts has a bias"
     yield from weak(of.nats, of.shaken, chosen)
 
 

@@ -31,6 +31,8 @@ SERVO_FORMS = ("servo_lag", "servo_delay")
 """Two forms of one servo, the usual one first. A real servo is neither: what a critically damped one of
 40 ms does to a flight, a delay explains better than a lag by 6 of 110 nats, and by 24 of 320."""
 
+COMMAND_DELAY = "command_delay"
+
 SERVO_RATE = "servo_rate"
 """A limited rate is far from none: from 4 rad/s on no flight shows anything, so that its size is looked
 for (moves.py) and not read off a slope. By that one of 0.68 rad/s, worth 1,022 nats, was put at more
@@ -40,6 +42,11 @@ LATE_SERVO = (*SERVO_FORMS, SERVO_RATE)
 """Effects by which the swash plate is late. Beside a lag the little that a limited rate adds says
 nothing of what it would explain in its place: each is fitted there. (Of a limit of 1.33 rad/s and a
 deadband, play was named and a lag of 91 nats, 17 less likely than the limit: **synthetic**.)"""
+
+LATE_ROTORS = ("motor_lag", "spin_up_reaction")
+"""Rotors that follow late, and what the body takes up meanwhile. Where no rotor's speed is read, the
+one is not seen without the other: tried one by one they end at nothing, beside half the yaw inertia and
+a late command (moves.late_rotors)."""
 
 EXCLUSIVE = (
     frozenset(SERVO_FORMS),
@@ -61,6 +68,11 @@ WEAK_OR_LATE = frozenset({
 answers gusts between the rows of a log, which holds each command until the next, or foresees them
 better than the filter does, as by poses alone: of 30 clean **synthetic** flights (`--arms mixed_poses`,
 seed 503) three at 60 Hz had a motor lag, yaw damping or yaw inertia of 34 to 60 nats."""
+
+LIKE_DRIFT = frozenset({
+    "gyro_bias", "accel_bias", "attitude_bias", "accel_scale", "imu_tilt", "magnetic_field",
+})  # fmt: skip
+"""Effects of sensors whose errors, were they to last, would look like them."""
 
 PURE_DELAYS = frozenset({"command_delay", "servo_delay"})
 """Of these those that are a constant time."""
@@ -92,6 +104,8 @@ class Problem:
         unlike_gusts: whether gusts turned out not to be as the filter has them (evidence.py).
         smoothed: whether readings were taken back through a low-pass (sensor_low_pass.py).
         of_onboard_filter: whether attitudes are an onboard filter's (onboard_filter.py).
+        errors_left: what errors of readings that last are worth beside what was found, where they
+            explain too little to be in the model [nats] (sensor_errors.py).
         clock_error: std of the rows' times [s], 0 where they are right (clock_errors.py).
     """
 
@@ -105,6 +119,7 @@ class Problem:
     unlike_gusts: bool = False
     smoothed: bool = False
     of_onboard_filter: bool = False
+    errors_left: float = 0.0
     clock_error: float = 0.0
 
     @classmethod

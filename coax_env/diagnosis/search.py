@@ -28,10 +28,18 @@ from coax_env.diagnosis.moves import (
     add,
     drop,
     dropped_in_brief_gusts,
+    late_rotors,
     swaps,
     trials,
 )
-from coax_env.diagnosis.problem import SERVO_FORMS, WEAK_OR_LATE, Fit, Problem
+from coax_env.diagnosis.problem import (
+    LATE_ROTORS,
+    ROTOR_SPEEDS,
+    SERVO_FORMS,
+    WEAK_OR_LATE,
+    Fit,
+    Problem,
+)
 from coax_env.diagnosis.scores import Score, loss, most_gains, scores, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
@@ -78,6 +86,7 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
             moved = moved or _in_brief_gusts(problem, fit, quadratic, memory)
             moved = moved or _swap(problem, fit, quadratic, memory)
             moved = moved or _trial(problem, fit, quadratic, candidates, memory)
+            moved = moved or _with_late_rotors(problem, fit, quadratic, memory)
             moved = moved or with_latent_noise(problem, fit)
         if moved is None:  # what is active must also stand against coloured innovations
             complete = True
@@ -124,6 +133,7 @@ class _Memory:
 
     banned: effects dropped since an addition last held. tried: sets of effects that were fitted.
     steadied: sets of effects beside which steadier noise was asked for. briefed: and brief gusts.
+    rotored: beside which rotors that follow late were tried.
     drops: how often each effect was dropped. failures: additions in a row that did not hold.
     most: effects that were active together and held.
     """
@@ -132,6 +142,7 @@ class _Memory:
     tried: set[tuple[str, ...]] = field(default_factory=set)
     steadied: set[tuple[str, ...]] = field(default_factory=set)
     briefed: set[tuple[str, ...]] = field(default_factory=set)
+    rotored: set[tuple[str, ...]] = field(default_factory=set)
     drops: Counter[str] = field(default_factory=Counter)
     failures: int = 0
     most: int = 0
@@ -206,6 +217,21 @@ def _trial(
         move, nats = moved.history[-1]
         return _noting_strongest(moved, [(nats, move.removeprefix("+ "))])
     return None
+
+
+def _with_late_rotors(
+    problem: Problem, fit: Fit, quadratic: Quadratic, memory: _Memory
+) -> Fit | None:
+    """Rotors that follow late, where something late or weak is named and no rotor's speed is read."""
+    rotors = set(LATE_ROTORS)
+    done = rotors <= set(fit.active) or fit.active in memory.rotored
+    if done or not set(fit.active) & {*WEAK_OR_LATE, *rotors}:
+        return None
+    may_be = rotors <= set(problem.candidates) and not rotors & set(problem.model.moments)
+    if not may_be or not problem.aboard.isdisjoint(ROTOR_SPEEDS):
+        return None
+    memory.rotored.add(fit.active)
+    return late_rotors(problem, fit, quadratic)
 
 
 def _first_accepted(

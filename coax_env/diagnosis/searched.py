@@ -54,7 +54,7 @@ from coax_env.diagnosis.rotor_jitter import in_jitter
 from coax_env.diagnosis.run_air import with_own_air
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
-from coax_env.diagnosis.sensor_errors import with_lasting_errors
+from coax_env.diagnosis.sensor_errors import lasting_errors
 from coax_env.diagnosis.sensor_low_pass import GROUPS, LIKE, hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_other_swings, with_swings
@@ -195,16 +195,18 @@ def _with_errors(found: Searched, noise: Noise, clock: Mapping[str, Lap]) -> tup
         found: without such errors. noise: levels that it started from.
         clock: of all runs in the order in which they were flown.
     """
-    erring = with_lasting_errors(found.problem, found.fit, noise)
+    erring = lasting_errors(found.problem, found.fit, noise)
     if erring is None:
         return found, noise
-    problem, trial, begun = erring
-    changed = _white_since(found, clock, found.fit.objective - trial.objective)
+    if not erring.whiten:
+        left = replace(found.problem, errors_left=erring.gained)
+        return replace(found, problem=left), noise
+    changed = _white_since(found, clock, erring.gained)
     if changed is not None:
         return changed, noise
-    problem.report("searching again with errors of readings that last")
-    best = _likelier(_searched(problem, begun), trial)
-    return replace(best, low_passes=found.low_passes), begun
+    erring.problem.report("searching again with errors of readings that last")
+    best = _likelier(_searched(erring.problem, erring.begun), erring.fit)
+    return replace(best, low_passes=found.low_passes), erring.begun
 
 
 def _behind_other_low_passes(problem: Problem, found: Searched, noise: Noise) -> Searched:

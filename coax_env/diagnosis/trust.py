@@ -18,7 +18,7 @@ from coax_env.diagnosis.confounding import Alternatives, alike_by_poses_alone, c
 from coax_env.diagnosis.doubts import LOUD, Against, doubts, on_parts, sizes, without_name
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.noise_variation import not_holding
-from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.problem import LIKE_DRIFT, Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, of_runs, replications
 from coax_env.diagnosis.sensor_low_pass import may_hide_behind
 from coax_env.diagnosis.settings import SETTINGS, Settings
@@ -113,6 +113,7 @@ def trusts(
             poses_alone=problem.sees_poses_alone,
             clock_error=problem.clock_error,
             smoothed=may_hide_behind(problem, fit, effect),
+            errors_left=problem.errors_left if effect in LIKE_DRIFT else 0.0,
             beside_terms=tuple(c for c in channels if c in acting),
         )
     nameless = without_name(against, problem.settings)
