@@ -295,7 +295,7 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "quadratic_at", lambda problem, fit: (fit, nothing))
     apart: list[bool] = []
     monkeypatch.setattr(
-        evidence, "_as_far_apart", lambda problem, fit, *rest: apart.append(problem.gains) or fit
+        evidence, "as_far_apart", lambda problem, fit, *rest: apart.append(problem.gains) or fit
     )
     monkeypatch.setattr(evidence, "_worth", lambda problem, fit, quadratic, effect: THRESHOLD)
     monkeypatch.setattr(evidence, "threshold", lambda problem, quadratic, active: THRESHOLD)
@@ -316,9 +316,11 @@ def test_a_number_is_as_unsure_as_the_commands_would_have_it_elsewhere():
     values = {"mass": 1.0, "wind.north": 5.0, "wind.east": 5.0}
     fit = Fit(("wind",), values, Noise({}), std_ratio={"wind.east": 0.75})
     other = fit.at({"mass": 4.0, "wind.north": 8.0, "wind.east": 1.0})
-    found = evidence._as_far_apart(problem, fit, quadratic, {"wind": Evidence(50.0, 4.0)}, other)
+    found = evidence.as_far_apart(problem, fit, quadratic, {"wind": Evidence(50.0, 4.0)}, other)
     assert found.std_ratio == pytest.approx({"mass": 1.25, "wind.north": 1.25, "wind.east": 1.25})
     assert found.values == values
+    kept = evidence.as_far_apart(problem, fit, quadratic, {}, other, but="wind")
+    assert kept.std_ratio == pytest.approx({"mass": 1.25, "wind.east": 0.75})
 
 
 def of(**nats: float) -> dict[frozenset[str], dict[str, float]]:

@@ -235,24 +235,33 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
                 for e, x in evidence.items()
             }
             if not _feels_gusts(problem):
-                pruned = _as_far_apart(problem, pruned, quadratic, evidence, asked)
+                pruned = as_far_apart(problem, pruned, quadratic, evidence, asked)
             return first, pruned, quadratic, lesser
         fit = _only(problem, fit, asked.active)
 
 
-def _as_far_apart(
-    problem: Problem, fit: Fit, quadratic: Quadratic, evidence: Mapping[str, Evidence], other: Fit
+def as_far_apart(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    evidence: Mapping[str, Evidence],
+    other: Fit,
+    but: str = "",
 ) -> Fit:
     """The fit whose std of each number has in it how far that is from the other fit's.
 
     Args:
         problem, fit: with the causes. quadratic: linearised at the fit.
         evidence: of the causes, with the inflation of their variances. other: of the same numbers.
+        but: a cause whose numbers stay as they are.
     """
     names = problem.free_names(fit.active)
     ratios = dict(fit.std_ratio)
     for name, std in quadratic.std(names).items():
-        known = evidence.get(name.partition(".")[0])
+        effect = name.partition(".")[0]
+        if effect == but:
+            continue
+        known = evidence.get(effect)
         stated = std * math.sqrt(known.inflation if known else 1.0)
         apart = (other.values[name] - fit.values[name]) / stated
         ratios[name] = math.hypot(ratios.get(name, 1.0), apart)

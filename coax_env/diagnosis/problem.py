@@ -314,8 +314,8 @@ class Fit:
         objective: minus the log-posterior at its last evaluation [nats].
         levels: the noise levels that are fitted.
         std_ratio: std of a parameter by the likelihood's own curvature (refinement.py), and with how
-            far what commands show has it elsewhere (evidence.py), over that by the signatures; 1 where
-            neither is known.
+            far what commands show (evidence.py), or an alternative in another cause's place
+            (confounding.py), has it elsewhere, over that by the signatures; 1 where neither is known.
         history: (move, nats) of the search, in order.
         strongest: evidence [nats] and name of the candidate that came nearest to being added, or was;
             the threshold is calibrated on it (scripts/study_diagnosis.py --calibrate).
