@@ -185,7 +185,9 @@ def test_the_likelier_late_rotors_stand_by_more_than_a_tie(monkeypatch, gains, l
 
     def fitted(problem: Problem, begin: Fit, steps: int = 3) -> Fit:
         late = "servo_lag" in begin.active
-        return replace(begin, objective=500.0 - gains[late] if math.isfinite(gains[late]) else math.nan)
+        return replace(
+            begin, objective=500.0 - gains[late] if math.isfinite(gains[late]) else math.nan
+        )
 
     monkeypatch.setattr(moves, "fitted", fitted)
     monkeypatch.setattr(moves, "noise_fitted", lambda problem, fit: fit)

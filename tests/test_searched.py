@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from coax_env import load_vehicle
 from coax_env.diagnosis import fits, searched
-from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.problem import ROTOR_SPEEDS, Fit
 from coax_env.diagnosis.searched import Searched
 from coax_env.diagnosis.sensor_errors import LastingErrors
 from coax_env.diagnosis.sensor_low_pass import hidden_behind
@@ -19,13 +20,19 @@ from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LE
 from coax_env.estimation.low_pass import LowPass
 from coax_env.estimation.rotor_jitter import with_jitter
 from coax_env.estimation.state_space import Noise, Record
-from coax_env.model.layout import ACCELEROMETERS, GYROS
+from coax_env.model.layout import ACCELEROMETERS, GYROS, RPM_PER_RAD_S
 
 
 @pytest.fixture(autouse=True)
 def _one_air(monkeypatch):
     """On all runs, but where a test says otherwise."""
     monkeypatch.setattr(searched, "with_own_air", lambda problem, fit: None)
+
+
+@pytest.fixture(autouse=True)
+def _steady_rotors(monkeypatch):
+    """Whose speeds are their commands, but where a test says otherwise."""
+    monkeypatch.setattr(searched, "_rotors_stray", lambda problem: False)
 
 
 def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
@@ -91,6 +98,80 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
     assert asked == pytest.approx(stds) and found.coarse == coarse
     kept = sum(flies)
     assert found.fit.noise.reading["phi"] == pytest.approx(stds[kept])
+
+
+# --- rotors first -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("memory", "read", "strays"),
+    [(0.0, True, False), (0.5, True, True), (0.5, False, False)],
+)
+def test_rotors_stray_where_what_parts_them_from_their_commands_has_a_memory(
+    monkeypatch, memory, read, strays
+):
+    """White readings about the command do not, nor does a scale that is wrong by a constant."""
+    monkeypatch.undo()
+    rng = np.random.default_rng(3)
+    white = 0.2 * rng.standard_normal(1000)
+    apart = lfilter([1.0], [1.0, -memory], white) + 5.0
+    command = np.full((1000, 4), 210.0)
+    z = np.full((1000, 2), np.nan)
+    if read:
+        z[:, 1] = RPM_PER_RAD_S * (command[:, 1] + apart)
+    record = Record("hover", 0.01 * np.arange(1000), command, z)
+    problem: Any = SimpleNamespace(
+        model=SimpleNamespace(channels=ROTOR_SPEEDS), engine=SimpleNamespace(records=[record])
+    )
+    assert searched._rotors_stray(problem) == strays
+
+
+@pytest.mark.parametrize(
+    ("white", "gained", "jitters", "begins"),
+    [
+        (True, 900.0, False, ("motor_lag",)),
+        (False, 900.0, True, ()),  # at once, and everything is searched for in it
+        (False, 139.0, False, ("motor_lag",)),  # asked after the search, as ever
+        (False, None, False, ("motor_lag",)),
+    ],
+)
+def test_what_moves_the_rotors_comes_first_and_plain_jitter_with_it(
+    monkeypatch, white, gained, jitters, begins
+):
+    lag = Fit(("motor_lag",), {}, FINE, objective=1000.0)
+    wider: Any = SimpleNamespace(model="wider", report=lambda text: None)
+    asked: list[tuple[Any, tuple[str, ...]]] = []
+
+    def jitter(problem: Any, fit: Fit, quadratic: object) -> Any:
+        assert fit is lag
+        return None if gained is None else (wider, replace(fit, objective=1000.0 - gained))
+
+    def from_there(problem: Any, bare: Fit, refitted: Fit, begin: Fit) -> Any:
+        asked.append((problem, begin.active))
+        return "found"
+
+    def whole(problem: Any, noise: Noise) -> Any:
+        asked.append((problem, ()))
+        return "found"
+
+    problem: Any = SimpleNamespace(
+        settings=SETTINGS, of_candidates=lambda names: names, report=lambda text: None,
+        engine=SimpleNamespace(filter=lambda values, noise: []), model=SimpleNamespace(channels=()),
+    )  # fmt: skip
+    bare = Fit((), {}, FINE)
+    given = {
+        "_rotors_stray": lambda problem: True, "_as_given": lambda problem, noise: (bare, bare),
+        "added": lambda problem, fit: (lag, None), "whiteness": lambda passes, channels: {},
+        "are_white": lambda seen, channels: white, "in_jitter": jitter, "_searched": whole,
+        "_searched_from": from_there, "_with_levels_of_jitter": lambda noise, wider, fit: "begun",
+    }  # fmt: skip
+    for name, stand_in in given.items():
+        monkeypatch.setattr(searched, name, stand_in)
+    found = searched._rotors_first(problem, FINE)
+    assert found == ("found", "begun" if jitters else FINE)
+    assert asked == [(wider if jitters else problem, begins)]
+    monkeypatch.setattr(searched, "_rotors_stray", lambda problem: False)
+    assert searched._rotors_first(problem, FINE) is None
 
 
 def believes_its_sensors(monkeypatch) -> None:

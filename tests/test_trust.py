@@ -32,12 +32,13 @@ from coax_env.diagnosis.replication import Asked, Replication, halves_of, replic
 from coax_env.diagnosis.scores import lost
 from coax_env.diagnosis.sensor_low_pass import may_hide_behind
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.diagnosis.trust import beside_large_axes, determined, of_line
+from coax_env.diagnosis.trust import beside_large_axes, determined, moved_far, of_line
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.model.generic_terms import TERMS
+from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle_file import load_vehicle
 
 NAMES = ("axial_damping.coefficient", "rotor_drag.coefficient", "flap_blowback.gain")
@@ -301,6 +302,7 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
         alternatives=(), nats=100.0, shaken=False, poses_alone=False,
         clock_error=0.0, smoothed=False, errors_left=0.0, beside_terms=(),
+        beside_moved=(),
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -456,6 +458,20 @@ def test_nothing_is_sure_where_rows_have_clock_errors():
     (text,) = doubts("marker_offset", against, SETTINGS)
     assert text == "the times of the log's rows are wrong by 0.69 ms"
     assert not without_name(against, SETTINGS)
+
+
+@pytest.mark.parametrize(("off", "said"), [(3.1, True), (-3.1, True), (2.9, False)])
+def test_what_shows_where_a_vehicles_own_number_went_far_is_doubted(off, said):
+    """By prior std from its file's; the mass shows in az, the wind in ax and ay."""
+    mass = FreeParameter("mass", 0.8, 0.01)
+    by_channel = np.zeros((1, len(CHANNELS)))
+    by_channel[0, CHANNELS.index("az")] = 1.0
+    problem: Any = SimpleNamespace(base=(mass,), base_names=lambda active: ["mass"])
+    quadratic: Any = SimpleNamespace(by_channel=by_channel, index=lambda names: [0])
+    fit = Fit(("wind",), {"mass": 0.8 + off * 0.01}, Noise({}))
+    assert moved_far(problem, fit, quadratic) == ({"mass": {"az"}} if said else {})
+    against = {"wind": known_of(["ax"], beside_moved=("mass",) if said else ())}
+    assert any("mass had to go far" in text for text in doubts("wind", against, SETTINGS)) == said
 
 
 @pytest.mark.parametrize(("worth", "left", "said"), [(65.0, 14725.0, True), (65.0, 60.0, False)])

@@ -12,6 +12,7 @@ from coax_env.diagnosis.fits import converged, fitted
 from coax_env.diagnosis.problem import SERVO_FORMS, Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import score, swap
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.logs.flight import Flight
 from coax_env.model.layout import CHANNELS
@@ -49,9 +50,19 @@ def channels_of(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -
         quadratic: linearised at the fit.
         effect: its name.
     """
-    own = problem.own[effect]
-    size = np.array([fit.values[f.name] - f.value for f in own])
-    strength = size**2 @ quadratic.by_channel[quadratic.index([f.name for f in own])]
+    return channels_of_numbers(fit, quadratic, problem.own[effect])
+
+
+def channels_of_numbers(
+    fit: Fit, quadratic: Quadratic, numbers: Sequence[FreeParameter]
+) -> list[str]:
+    """Channels that carry most of what some numbers do beyond their priors' means, strongest first.
+
+    Args:
+        fit: with the numbers. quadratic: linearised at the fit. numbers: free ones.
+    """
+    size = np.array([fit.values[f.name] - f.value for f in numbers])
+    strength = size**2 @ quadratic.by_channel[quadratic.index([f.name for f in numbers])]
     order = np.argsort(-strength)
     total = strength.sum()
     return [CHANNELS[i] for i in order if total > 0.0 and strength[i] > CHANNEL_SHARE * total]

@@ -50,6 +50,7 @@ class Against:
         errors_left: what errors of readings that last, which look like it, are worth beside it [nats];
             0 where they are in the model, or nothing asks for them.
         beside_terms: channels among its own in which what no effect explains acts, too.
+        beside_moved: numbers of the vehicle far from its file's that show in channels among its own.
     """
 
     channels: tuple[str, ...]
@@ -69,6 +70,7 @@ class Against:
     smoothed: bool
     errors_left: float
     beside_terms: tuple[str, ...]
+    beside_moved: tuple[str, ...]
 
     @property
     def at_limit(self) -> bool:
@@ -154,6 +156,9 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
     if of.beside_terms:
         acts = and_list([channel_name(c) for c in of.beside_terms])
         yield f"something that no effect explains acts in {acts}, too: it may be a part of that"
+    if of.beside_moved:
+        moved = and_list([plain(name) for name in of.beside_moved])
+        yield f"beside it the vehicle's {moved} had to go far from the file's: one of the two is wrong"
     yield from under_noise(of.falls_at)
     yield from on_parts(of.parts, of.runs, chosen)
     yield from of_sizes(of.sizes)

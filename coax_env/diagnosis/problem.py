@@ -77,6 +77,11 @@ LIKE_DRIFT = frozenset({
 PURE_DELAYS = frozenset({"command_delay", "servo_delay"})
 """Of these those that are a constant time."""
 
+OF_ROTORS = frozenset({
+    "motor_lag", "motor_droop", "command_delay", "battery_sag", "battery_voltage",
+})  # fmt: skip
+"""Effects that part a rotor's speed from its command."""
+
 ROTOR_SPEEDS = ("rpm_upper", "rpm_lower")
 """Channels that show commands, and no gust."""
 

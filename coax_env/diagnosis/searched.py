@@ -37,6 +37,7 @@ And where commands are late, by a delay of the readings' own (estimation/helicop
 likelier: what was found beside a delay that is off by a part of a row may stand for that part.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -49,11 +50,11 @@ from coax_env.diagnosis.fits import fitted, is_much_coloured, noise_fitted, star
 from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
-from coax_env.diagnosis.problem import ROTOR_SPEEDS, Fit, Problem
+from coax_env.diagnosis.problem import OF_ROTORS, ROTOR_SPEEDS, Fit, Problem
 from coax_env.diagnosis.rotor_jitter import in_jitter
 from coax_env.diagnosis.run_air import with_own_air
 from coax_env.diagnosis.scores import cost
-from coax_env.diagnosis.search import search
+from coax_env.diagnosis.search import added, search
 from coax_env.diagnosis.sensor_errors import lasting_errors
 from coax_env.diagnosis.sensor_low_pass import GROUPS, LIKE, hidden_behind, low_passes
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
@@ -70,13 +71,15 @@ from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import with_jitter
 from coax_env.estimation.state_space import Noise, Record
-from coax_env.estimation.whiteness import are_white, is_white, whiteness
-from coax_env.model.layout import INERTIAL
+from coax_env.estimation.whiteness import are_white, correlation, is_white, whiteness
+from coax_env.model.layout import INERTIAL, RPM_PER_RAD_S
 
 COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
 JITTER = (JITTER_LEVEL, JITTER_MEMORY, JITTER_REACTION)
 """What is found of jitter before the search in it, and kept."""
+STRAYING = 5.0
+"""std by which neighbouring differences of rotor speeds from their commands must be alike; ours."""
 SHOWN_BY = (*ROTOR_SPEEDS, "r")
 """Channels that a rotor's jitter colours."""
 READ_WITHIN = 0.02
@@ -125,7 +128,7 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         problem: what may be free. noise: levels to start from.
         clock: of all runs in the order in which they were flown.
     """
-    first = _searched(problem, noise)
+    first, noise = _rotors_first(problem, noise) or (_searched(problem, noise), noise)
     if _is_coloured(first, ROTOR_SPEEDS):
         first, noise = _jittery(first, noise)
     first = _with_clock_errors(_with_own_air(first, noise), noise)
@@ -381,13 +384,62 @@ def _searched_in_shocks(first: Searched, noise: Noise) -> Searched:
     return best
 
 
+def _rotors_first(problem: Problem, noise: Noise) -> tuple[Searched, Noise] | None:
+    """The search that begins with what moves the rotors, and levels it started from; None where
+    measured rotor speeds show nothing that does.
+
+    Jitter that these show plainly is in it at once: asked after a whole search, it costs another one.
+
+    Args:
+        problem: what may be free. noise: levels to start from.
+    """
+    if not _rotors_stray(problem):
+        return None
+    bare, refitted = _as_given(problem, noise)
+    problem.report("searching for causes")
+    rotors, quadratic = added(problem.of_candidates(OF_ROTORS), refitted)
+    passes = problem.engine.filter(rotors.values, rotors.noise)
+    white = are_white(whiteness(passes, problem.model.channels), ROTOR_SPEEDS)
+    jittery = None if white else in_jitter(problem, rotors, quadratic)
+    if jittery is None or rotors.objective - jittery[1].objective < problem.settings.clear:
+        return _searched_from(problem, bare, refitted, rotors), noise
+    begun = _with_levels_of_jitter(noise, *jittery)
+    problem.report("searching with rotor speeds that jitter")
+    return _searched(jittery[0], begun), begun
+
+
+def _rotors_stray(problem: Problem) -> bool:
+    """Whether a measured rotor speed less its command has a memory."""
+    channels = problem.model.channels
+    for k, channel in enumerate(ROTOR_SPEEDS):
+        for record in problem.engine.records:
+            apart = record.z[:, channels.index(channel)] - RPM_PER_RAD_S * record.command[:, k]
+            apart = apart[np.isfinite(apart)]
+            if apart.size > 2:
+                apart = apart - apart.mean()
+                if correlation(apart[1:], apart[:-1]) * math.sqrt(apart.size) > STRAYING:
+                    return True
+    return False
+
+
 def _searched(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
+    bare, refitted = _as_given(problem, noise, coarse)
+    problem.report("searching for causes")
+    return _searched_from(problem, bare, refitted, refitted, coarse)
+
+
+def _as_given(problem: Problem, noise: Noise, coarse: bool = False) -> tuple[Fit, Fit]:
+    """The model as given, and with its own numbers refitted, each with its own noise."""
     problem.report("estimating gusts and noise of the model as given")
     bare = start(problem, noise, held=LEAST_READING_STD if coarse else ())
     problem.report("fitting the model's own parameters")
-    refitted = steadied(problem, noise_fitted(problem, fitted(problem, bare)))
-    problem.report("searching for causes")
-    fit, quadratic = search(problem, refitted)
+    return bare, steadied(problem, noise_fitted(problem, fitted(problem, bare)))
+
+
+def _searched_from(
+    problem: Problem, bare: Fit, refitted: Fit, begin: Fit, coarse: bool = False
+) -> Searched:
+    fit, quadratic = search(problem, begin)
     late = _with_late_readings(problem, fit)
     if late is not None:
         problem = late  # without a delay it is as it was: `refitted` stays
@@ -483,12 +535,17 @@ def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
     if found.problem.aboard.isdisjoint(ROTOR_SPEEDS) and is_much_coloured(wider, fit):
         return found, noise
     wider.report("searching again with rotor speeds that jitter")
-    of_jitter = {name: fit.noise.level(name) for name in JITTER}
-    begun = with_jitter(noise, wider.model).with_levels(of_jitter)
+    begun = _with_levels_of_jitter(noise, wider, fit)
     other = _searched(wider, begun)
     gained = found.cost - other.cost
     wider.report(f"rotor speeds that jitter after the search: {gained:.1f} nats")
     return (other, begun) if gained > 0.0 else (found, noise)
+
+
+def _with_levels_of_jitter(noise: Noise, wider: Problem, fit: Fit) -> Noise:
+    """Levels to start from, with those of jitter as they were found."""
+    of_jitter = {name: fit.noise.level(name) for name in JITTER}
+    return with_jitter(noise, wider.model).with_levels(of_jitter)
 
 
 def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:
