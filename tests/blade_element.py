@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import injector
 import numpy as np
-from injector import _cross, _euler, _pilot, _rotation, _thrust_vector, _wrap
+from injector import _as_logged, _cross, _euler, _notice, _pilot, _rotation, _thrust_vector
 from injector_craft import CRAFTS, LAMA, SHIPPED, Craft, rotors_of, write_vehicle
 from injector_sensors import MIXED, MIXED_POSES, SENSORS, clock, kit, thin
 from numba import njit
@@ -254,9 +254,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, winds, shakes, pilot, 
         saw[k, 9:12] = s[10:13]
         if k == 0:
             seen[:] = saw[0]
-        for i in range(12):
-            error = saw[max(k - behind, 0), i] - seen[i]
-            seen[i] += min(pilot.senses * dt[k], 1.0) * (_wrap(error) if 6 <= i < 9 else error)
+        _notice(saw[max(k - behind, 0)], pilot.senses * dt[k], seen)
         if k % pilot.hold == 0:
             trust = trusts[k]
             wanted = _pilot(
@@ -272,9 +270,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, winds, shakes, pilot, 
         command = wanted + tremor[k]
         if clock[k] >= 0.0:
             command += extra[k]
-        for i in range(2):
-            command[i] = round(command[i] * injector.RPM * 10.0) / 10.0 / injector.RPM
-            command[2 + i] = round(min(max(command[2 + i], -0.25), 0.25) * 1e5) / 1e5
+        _as_logged(command)
         commands[k] = command
         rates = s[10:13].copy()
         wind = winds[k * SUBSTEPS]
@@ -349,15 +345,7 @@ def _fly_run(name, length, sensors, craft, machine, wind, turbulence, pilot, rng
     whole = injector.STEP * np.arange(round(injector.MANEUVERS[name] / injector.STEP))
     target, trust, extra = injector._plan(name, whole, craft)
     at = np.clip(np.round(times[:-1] / injector.STEP).astype(int), 0, len(target) - 1)
-    reach = injector._reach(craft)
-    tremor = np.empty((rows, 4))
-    stds = [hand.tremor_rotor[0] * reach.speed * min(reach.yaw, 1.0)] * 2
-    stds += [hand.tremor_swash[0] * min(reach.tilt, 1.0)] * 2
-    lasting = [hand.tremor_rotor[1]] * 2 + [hand.tremor_swash[1]] * 2
-    for i in range(4):
-        tremor[:, i] = injector._wander(
-            rng.standard_normal(rows), stds[i], lasting[i], sensors.step
-        )
+    tremor = injector._tremor(hand, craft, rows, sensors.step, rng)
     fine, steps = sensors.step / SUBSTEPS, rows * SUBSTEPS + 1
     winds = np.empty((steps, 3))
     for i, (mean, memory) in enumerate(((0.7, 0.9), (0.7, 0.9), (0.0, 0.3))):

@@ -674,10 +674,7 @@ def _fly(
         if k == 0:
             seen[:3] = s[:3]
             seen[8] = attitude[2]
-        keen = pilot.senses * dt[k]
-        for i in range(12):  # the pilot's own senses lag
-            error = saw[max(k - behind, 0), i] - seen[i]
-            seen[i] += keen * (_wrap(error) if 6 <= i < 9 else error)
+        _notice(saw[max(k - behind, 0)], pilot.senses * dt[k], seen)
         trust = trusts[k]
         if k % pilot.hold == 0:
             wanted = _pilot(
@@ -693,11 +690,7 @@ def _fly(
         command = wanted + tremor[k]
         if clock[k] >= 0.0:
             command += extra[k]
-        # what is logged is what is flown, to the last digit
-        command[0] = round(command[0] * RPM * 10.0) / 10.0 / RPM
-        command[1] = round(command[1] * RPM * 10.0) / 10.0 / RPM
-        command[2] = round(min(max(command[2], -0.25), 0.25) * 1e5) / 1e5
-        command[3] = round(min(max(command[3], -0.25), 0.25) * 1e5) / 1e5
+        _as_logged(command)
         commands[k] = command
         if arrives[k] or k == 0:
             arrived[k, :2] = _in_steps(command[:2], pilot.grain[0] * rotors.hover_upper)
@@ -732,6 +725,22 @@ def _fly(
             taken -= craft.rotor_lower * (later[9] - push[9])
             s[12] += taken / inertia
     return commands, readings
+
+
+@njit(cache=True)
+def _notice(there, keen, seen):
+    """What is there goes into what the pilot has seen, whose senses lag; in place."""
+    for i in range(12):
+        error = there[i] - seen[i]
+        seen[i] += keen * (_wrap(error) if 6 <= i < 9 else error)
+
+
+@njit(cache=True)
+def _as_logged(command):
+    """What is logged is what is flown, to the last digit; in place."""
+    for i in range(2):
+        command[i] = round(command[i] * RPM * 10.0) / 10.0 / RPM
+        command[2 + i] = round(min(max(command[2 + i], -0.25), 0.25) * 1e5) / 1e5
 
 
 @njit(cache=True)
@@ -1004,14 +1013,7 @@ def _fly_run(
     rows = len(dt)
     target, trust, extra = _plan(name, STEP * np.arange(round(MANEUVERS[name] / STEP)), craft)
     at = np.clip(np.round(times[:-1] / STEP).astype(int), 0, len(target) - 1)
-    reach = _reach(craft)
-    tremor = np.empty((rows, 4))
-    rotor, memory = pilot.tremor_rotor
-    rotor *= reach.speed * min(reach.yaw, 1.0)
-    swash, swash_memory = pilot.tremor_swash
-    swash *= min(reach.tilt, 1.0)
-    for i, (std, lasting) in enumerate([(rotor, memory)] * 2 + [(swash, swash_memory)] * 2):
-        tremor[:, i] = _wander(rng.standard_normal(rows), std, lasting, sensors.step)
+    tremor = _tremor(pilot, craft, rows, sensors.step, rng)
     pushes = disturbances(air, craft, rows, SUBSTEPS, sensors.step / SUBSTEPS, rng)
     if sensors.unrest > 0.0:
         pushes = _on(pushes, times, sensors.step)
@@ -1046,6 +1048,21 @@ def _fly_run(
             [volts(p, t, rotors) for p, t in zip(product, times[first:-1], strict=True)]
         )
     return columns
+
+
+def _tremor(
+    pilot: Pilot, craft: Craft, rows: int, step: float, rng: np.random.Generator
+) -> np.ndarray:
+    """What the pilot's hand adds to the commands (rows, 4)."""
+    reach = _reach(craft)
+    tremor = np.empty((rows, 4))
+    rotor, memory = pilot.tremor_rotor
+    rotor *= reach.speed * min(reach.yaw, 1.0)
+    swash, swash_memory = pilot.tremor_swash
+    swash *= min(reach.tilt, 1.0)
+    for i, (std, lasting) in enumerate([(rotor, memory)] * 2 + [(swash, swash_memory)] * 2):
+        tremor[:, i] = _wander(rng.standard_normal(rows), std, lasting, step)
+    return tremor
 
 
 def _arrives(rows: int, lost: float, rng: np.random.Generator) -> np.ndarray:
