@@ -44,6 +44,10 @@ from coax_env.diagnosis.scores import Score, loss, most_gains, scores, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 
+MOST_ROTORED = 2
+"""Sets of effects beside which one search tries rotors that follow late: each takes as long as some
+additions; ours."""
+
 
 def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
     """Add, drop and swap effects from a fitted model until nothing is gained.
@@ -246,8 +250,8 @@ def _with_late_rotors(
 ) -> Fit | None:
     """Rotors that follow late, where something late or weak is named and no rotor's speed is read."""
     rotors = set(LATE_ROTORS)
-    done = rotors <= set(fit.active) or fit.active in memory.rotored
-    if done or not set(fit.active) & {*WEAK_OR_LATE, *rotors}:
+    done = fit.active in memory.rotored or len(memory.rotored) == MOST_ROTORED
+    if done or rotors <= set(fit.active) or not set(fit.active) & {*WEAK_OR_LATE, *rotors}:
         return None
     may_be = rotors <= set(problem.candidates) and not rotors & set(problem.model.moments)
     if not may_be or not problem.aboard.isdisjoint(ROTOR_SPEEDS):
