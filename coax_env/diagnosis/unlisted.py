@@ -33,6 +33,9 @@ from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import whiteness
 from coax_env.kernel.compilation import compiled
 from coax_env.model import dynamics, effects
+from coax_env.model import inputs as U
+from coax_env.model import state as S
+from coax_env.model import workspace as F
 from coax_env.model.generic_terms import AXES, SCALES, SMALLEST, TERMS, Term, term_value
 from coax_env.model.layout import CHANNELS, GUSTS, N_CHANNELS
 from coax_env.model.usual_sizes import factor
@@ -57,9 +60,12 @@ PAIRS = tuple((a, b) for a, b in pairwise(TERMS) if a.kin and a.kin == b.kin)
 @compiled(makes_arrays=True)
 def _evaluate(states: np.ndarray, inputs: np.ndarray, p: np.ndarray, out: np.ndarray) -> None:
     """Every term at every row: states (n, 29), inputs (n, 5), out (n, terms)."""
-    work = np.empty(dynamics.WORK_SIZE)
+    work = np.zeros(dynamics.WORK_SIZE)
     readings = np.empty(N_CHANNELS)
     for k in range(len(states)):
+        # without an effect the kernel has no use for these, and leaves them
+        work[F.LON_STEP] = inputs[k, U.DELTA_LON] - states[k, S.SWASH_LON]
+        work[F.LAT_STEP] = inputs[k, U.DELTA_LAT] - states[k, S.SWASH_LAT]
         dynamics.measure(states[k], inputs[k], p, work, readings)  # leaves the workspace filled
         for i in range(out.shape[1]):
             out[k, i] = term_value(i, states[k], work, p)
