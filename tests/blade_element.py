@@ -20,7 +20,17 @@ from typing import NamedTuple
 
 import injector
 import numpy as np
-from injector import _as_logged, _cross, _euler, _notice, _pilot, _rotation, _thrust_vector
+from injector import (
+    _as_logged,
+    _cross,
+    _euler,
+    _log_motion,
+    _notice,
+    _pilot,
+    _rotation,
+    _see,
+    _thrust_vector,
+)
 from injector_craft import CRAFTS, LAMA, SHIPPED, Craft, rotors_of, write_vehicle
 from injector_sensors import MIXED, MIXED_POSES, SENSORS, clock, kit, thin
 from numba import njit
@@ -47,16 +57,16 @@ N_STATE = 25
 class Machine(NamedTuple):
     """What blades and motors add to a craft. pitch [rad], profile drag, of each rotor; motor: 1/s of a
     rotor's speed control; servo: s; stiffness: N m/rad of each hub; area: m2 of the fuselage; wander:
-    share of thrust and torque by which each rotor's own wake shakes it; lever: m, of the IMU."""
+    share of thrust and torque by which each rotor's own wake shakes it; wander_memory: s, of that."""
 
     pitch_upper: float
     pitch_lower: float
     drag_upper: float
     drag_lower: float
+    stiffness: float
+    area: float
     motor: float = 14.0
     servo: float = 0.02
-    stiffness: float = 0.1
-    area: float = 0.008
     wander: float = 0.01
     wander_memory: float = 0.15
 
@@ -81,9 +91,6 @@ def machine_of(craft: Craft, **changes: float) -> Machine:
     profile = (
         (np.array([craft.torque_upper, craft.torque_lower]) - inflow * wanted) * 8.0 / SOLIDITY
     )
-    for i in range(2):
-        found = _blades(pitch[i], profile[i], 0.0, inflow[i])
-        assert abs(found[0] / wanted[i] - 1.0) < 1e-9
     stiffness = 0.1 * craft.inertia_x / LAMA.inertia_x
     return Machine(
         *pitch.tolist(), *profile.tolist(),
@@ -249,9 +256,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, winds, shakes, pilot, 
     for k in range(rows):
         R = _rotation(s)
         attitude = _euler(R)
-        saw[k, 0:6] = s[0:6]
-        saw[k, 6:9] = attitude
-        saw[k, 9:12] = s[10:13]
+        _see(s, attitude, saw[k])
         if k == 0:
             seen[:] = saw[0]
         _notice(saw[max(k - behind, 0)], pilot.senses * dt[k], seen)
@@ -278,10 +283,7 @@ def _fly(clock, dt, step, targets, trusts, extra, tremor, winds, shakes, pilot, 
         readings[k, 0:2] = s[17:19]
         readings[k, 2:5] = rates
         readings[k, 5:8] = out[0:3]
-        readings[k, 8:11] = attitude
-        readings[k, 11:14] = s[0:3]
-        readings[k, 14:17] = s[3:6]
-        readings[k, 17] = R[2, 2]
+        _log_motion(s, attitude, R, readings[k])
         h = dt[k] / SUBSTEPS
         for j in range(SUBSTEPS):
             wind, shake = winds[k * SUBSTEPS + j], shakes[k * SUBSTEPS + j]

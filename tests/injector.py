@@ -668,9 +668,7 @@ def _fly(
         inertia = craft.inertia_z * (1.0 + hidden.yaw_inertia)
         R = _rotation(s)
         attitude = _euler(R)
-        saw[k, 0:6] = s[0:6]
-        saw[k, 6:9] = attitude
-        saw[k, 9:12] = s[10:13]
+        _see(s, attitude, saw[k])
         if k == 0:
             seen[:3] = s[:3]
             seen[8] = attitude[2]
@@ -706,10 +704,7 @@ def _fly(
         readings[k, 2:5] = rates
         lever = np.array([hidden.lever_x, hidden.lever_y, hidden.lever_z])
         readings[k, 5:8] = out[0:3] + _cross(out[3:6], lever) + _cross(rates, _cross(rates, lever))
-        readings[k, 8:11] = attitude
-        readings[k, 11:14] = s[0:3]
-        readings[k, 14:17] = s[3:6]
-        readings[k, 17] = R[2, 2]
+        _log_motion(s, attitude, R, readings[k])
         h = dt[k] / SUBSTEPS
         for j in range(SUBSTEPS):
             push, later = pushes[k * SUBSTEPS + j], pushes[k * SUBSTEPS + j + 1]
@@ -725,6 +720,23 @@ def _fly(
             taken -= craft.rotor_lower * (later[9] - push[9])
             s[12] += taken / inertia
     return commands, readings
+
+
+@njit(cache=True)
+def _see(s, attitude, there):
+    """What of a state a pilot may see (12,): place, velocity, attitude, rates."""
+    there[0:6] = s[0:6]
+    there[6:9] = attitude
+    there[9:12] = s[10:13]
+
+
+@njit(cache=True)
+def _log_motion(s, attitude, R, reading):
+    """A row's true readings of attitude, place, velocity and tilt, into their places (18,)."""
+    reading[8:11] = attitude
+    reading[11:14] = s[0:3]
+    reading[14:17] = s[3:6]
+    reading[17] = R[2, 2]
 
 
 @njit(cache=True)

@@ -161,8 +161,8 @@ def test_what_moves_the_rotors_comes_first_and_plain_jitter_with_it(
     bare = Fit((), {}, FINE)
     given = {
         "_rotors_stray": lambda problem: True, "_as_given": lambda problem, noise: (bare, bare),
-        "added": lambda problem, fit: (lag, None), "whiteness": lambda passes, channels: {},
-        "are_white": lambda seen, channels: white, "in_jitter": jitter, "_searched": whole,
+        "added": lambda problem, fit: (lag, None),
+        "_is_coloured": lambda found, channels: not white, "in_jitter": jitter, "_searched": whole,
         "_searched_from": from_there, "_with_levels_of_jitter": lambda noise, wider, fit: "begun",
     }  # fmt: skip
     for name, stand_in in given.items():

@@ -285,7 +285,8 @@ def late_rotors(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
         problem, fit: what may be free, and where; converged.
         quadratic: linearised at the fit.
     """
-    best, least = None, cost(problem, fit, quadratic) - problem.settings.tie
+    now = cost(problem, fit, quadratic)
+    best, least = None, now - problem.settings.tie
     for begin in _with_late_rotors(problem, fit):
         trial = fitted(problem, begin, FAR_STEPS)
         for _ in range(FAR_TURNS):
@@ -298,7 +299,7 @@ def late_rotors(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
             best, least = trial, nats
     if best is None:
         return None
-    gained = cost(problem, fit, quadratic) - least
+    gained = now - least
     problem.report(f"rotors that follow late, and their reaction: {gained:.1f} nats")
     return best.noted(f"+ {' and '.join(LATE_ROTORS)}", gained)
 

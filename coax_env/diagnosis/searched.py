@@ -398,9 +398,9 @@ def _rotors_first(problem: Problem, noise: Noise) -> tuple[Searched, Noise] | No
     bare, refitted = _as_given(problem, noise)
     problem.report("searching for causes")
     rotors, quadratic = added(problem.of_candidates(OF_ROTORS), refitted)
-    passes = problem.engine.filter(rotors.values, rotors.noise)
-    white = are_white(whiteness(passes, problem.model.channels), ROTOR_SPEEDS)
-    jittery = None if white else in_jitter(problem, rotors, quadratic)
+    found = Searched(problem, bare, refitted, rotors, quadratic)
+    coloured = _is_coloured(found, ROTOR_SPEEDS)
+    jittery = in_jitter(problem, rotors, quadratic) if coloured else None
     if jittery is None or rotors.objective - jittery[1].objective < problem.settings.clear:
         return _searched_from(problem, bare, refitted, rotors), noise
     begun = _with_levels_of_jitter(noise, *jittery)
@@ -439,6 +439,7 @@ def _as_given(problem: Problem, noise: Noise, coarse: bool = False) -> tuple[Fit
 def _searched_from(
     problem: Problem, bare: Fit, refitted: Fit, begin: Fit, coarse: bool = False
 ) -> Searched:
+    """The search from a fit, and again where readings see late commands at their own delay."""
     fit, quadratic = search(problem, begin)
     late = _with_late_readings(problem, fit)
     if late is not None:
