@@ -27,6 +27,7 @@ from coax_env.estimation.helicopter_noise import (
     JITTER_LEVEL,
     JITTER_MEMORY,
     JITTER_REACTION,
+    JITTER_RETURN,
     fitted_levels,
     starting_noise,
 )
@@ -40,7 +41,9 @@ from coax_env.model.layout import CHANNELS, N_CHANNELS, N_FULL, RPM_PER_RAD_S
 LAMA = load_vehicle("lama400d").with_values({"rotor_inertia_lower": 6e-4})  # unlike the upper's
 PLAIN = HeliModel(LAMA)
 MODEL = JitteryModel.like(PLAIN)
-LEVELS = Noise({JITTER_LEVEL: 0.5, JITTER_MEMORY: 0.08, JITTER_REACTION: 1.0})
+LEVELS = Noise(
+    {JITTER_LEVEL: 0.5, JITTER_MEMORY: 0.08, JITTER_REACTION: 1.0, JITTER_RETURN: 0.05}
+)
 HOVER, COMMAND = dynamics.hover_trim(LAMA)
 DT = 0.01
 
@@ -90,7 +93,8 @@ def turned_by_torque(upper: float, lower: float) -> float:
 def test_jitter_is_speed_on_top_of_the_rotors_and_turns_the_body(reaction, lag):
     """As rotor speeds and a yaw rate that are shifted by it do, with a motor's lag or without.
 
-    The rotors' own speeds follow their commands as ever; and it fades by its memory.
+    The rotors' own speeds follow their commands as ever; and it fades by its memory. The motors return
+    what they do not make of it in 50 ms: rate by mean jitter of the row.
     """
     lags = {"motor_lag.upper": lag, "motor_lag.lower": lag}
     lagging = PLAIN.vector(lags)
@@ -112,6 +116,8 @@ def test_jitter_is_speed_on_top_of_the_rotors_and_turns_the_body(reaction, lag):
     later = stepped(MODEL, x, COMMAND, p)
     expected = stepped(PLAIN, turned, faster, lagging)
     expected[S.R] -= reaction * taken_up(1.5, -0.8)
+    mean = 0.08 * (1.0 - math.exp(-DT / 0.08)) / 0.05
+    expected[S.R] -= (1.0 - reaction) * mean * taken_up(1.5, -0.8)
     alone = stepped(PLAIN, x[:N_FULL], COMMAND, lagging)
     rotors = [S.OMEGA_U, S.OMEGA_L]
     expected[rotors] = alone[rotors]
@@ -119,6 +125,26 @@ def test_jitter_is_speed_on_top_of_the_rotors_and_turns_the_body(reaction, lag):
     np.testing.assert_allclose(later[JITTER], math.exp(-DT / 0.08) * x[JITTER])
     arrived = COMMAND[0] - (4.0 * math.exp(-DT / lag) if lag else 0.0)
     assert later[S.OMEGA_U] == pytest.approx(arrived, rel=1e-12)
+
+
+@pytest.mark.parametrize(("share", "kept"), [(0.0, -1.0), (0.6, -0.4), (1.0, 0.0), (1.3, 0.0)])
+def test_what_the_air_gave_a_rotor_the_body_has_in_the_end(share, kept):
+    """Angular momentum: the air's stays in the helicopter, and a motor gives its own share back.
+
+    Of the body's rate when the jitter is gone, less that of a jitter which motors alone make; in still
+    air, with nothing that damps the rate, and torques that hardly change.
+    """
+    ends = []
+    for each in (share, 1.0):
+        x = state(0.02, -0.03)
+        x[S.U] = x[S.R] = 0.0
+        levels = LEVELS.with_levels({JITTER_REACTION: each, JITTER_RETURN: 0.08})
+        p = MODEL.vector({}, levels)
+        for _ in range(120):
+            x = stepped(MODEL, x, COMMAND, p)
+        assert abs(x[JITTER]).max() < 1e-7
+        ends.append(x[S.R])
+    assert ends[0] - ends[1] == pytest.approx(kept * taken_up(0.02, -0.03), rel=1e-4, abs=1e-9)
 
 
 def test_a_spin_up_reaction_is_of_what_is_commanded():
@@ -152,8 +178,9 @@ def test_without_jitter_it_is_the_helicopters_own_model_to_the_last_digit():
     assert np.array_equal(stepped(MODEL, x, COMMAND, p)[:N_FULL], alone)
 
 
-def test_the_drift_is_what_the_step_adds_to_first_order():
-    x, p = state(1.5, -0.8), vector()
+@pytest.mark.parametrize("reaction", [0.3, 1.0])
+def test_the_drift_is_what_the_step_adds_to_first_order(reaction):
+    x, p = state(1.5, -0.8), vector(reaction)
     out, work = np.zeros(N_JITTERY + N_CHANNELS), np.zeros(MODEL.work_size)
     u = np.tile(dynamics.kernel_input(COMMAND), 2)
     MODEL.drift_and_readings.__wrapped__(x, u, 1e-4, p, work, out)
@@ -181,13 +208,15 @@ def test_jitter_begins_at_a_thousandth_of_the_hover_speeds():
     bare = LAMA.with_values({"fuselage_drag_coefficient": 0.0})
     first = 1e-3 * dynamics.hover_trim(bare)[1][:2].mean()
     assert noise.process == pytest.approx(
-        {"force_xy": 1.0, JITTER_LEVEL: first, JITTER_MEMORY: 0.05, JITTER_REACTION: 1.0}
-    )
+        {"force_xy": 1.0, JITTER_LEVEL: first, JITTER_MEMORY: 0.05, JITTER_REACTION: 1.0,
+         JITTER_RETURN: 0.05}
+    )  # fmt: skip
     assert noise.floor == pytest.approx(
-        {JITTER_LEVEL: 0.01 * first, JITTER_MEMORY: 0.015, JITTER_REACTION: 0.05}
-    )
+        {JITTER_LEVEL: 0.01 * first, JITTER_MEMORY: 0.015, JITTER_REACTION: 0.05,
+         JITTER_RETURN: 0.015}
+    )  # fmt: skip
     assert noise.ceiling == pytest.approx(
-        {JITTER_LEVEL: 50.0 * first, JITTER_MEMORY: 2.0, JITTER_REACTION: 2.0}
+        {JITTER_LEVEL: 50.0 * first, JITTER_MEMORY: 2.0, JITTER_REACTION: 2.0, JITTER_RETURN: 2.0}
     )
     assert noise.prior == {JITTER_MEMORY: (0.05, 1.0)} and noise.reading == {"p": 0.1}
 
@@ -204,17 +233,23 @@ def test_a_record_starts_without_jitter_but_with_its_spread():
 
 
 def shaken_for_six_seconds(reaction: float) -> tuple[Engine, Noise]:
-    """Measured rotor speeds jitter by 0.6 rad/s for 60 ms, and the body takes it up, made here."""
+    """Measured rotor speeds jitter by 0.6 rad/s for 60 ms, and the body takes it up, made here.
+
+    The rest is the air's; the motors return it as fast as it fades.
+    """
     flight = simulate(LAMA, "yaw_3211", seed=3, sensors="onboard")
     record = record_of(flight.runs[0])
     rows = record.t < record.t[0] + 6.0
     z, rng = record.z[rows].copy(), np.random.default_rng(4)
     left = math.exp(-0.01 / 0.06)
-    jitter = np.zeros(2)
+    jitter, rate, angle = np.zeros(2), 0.0, 0.0
     for row in z:
+        rate -= (1.0 - reaction) * taken_up(*jitter) * 0.01 / 0.06
+        angle += 0.01 * (rate + reaction * taken_up(*jitter))
         jitter = left * jitter + math.sqrt(1.0 - left**2) * 0.6 * rng.standard_normal(2)
         row[:2] += RPM_PER_RAD_S * jitter
-        row[CHANNELS.index("r")] += reaction * taken_up(*jitter)
+        row[CHANNELS.index("r")] += reaction * taken_up(*jitter) + rate
+        row[CHANNELS.index("psi")] += angle
     short = replace(record, t=record.t[rows], command=record.command[rows], z=z)
     return Engine(MODEL, [short]), with_jitter(starting_noise(flight, LAMA), PLAIN)
 

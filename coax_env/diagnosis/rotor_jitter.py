@@ -10,7 +10,12 @@ from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.fits import fitted, noise_fitted, without
 from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem
-from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, JITTER_REACTION
+from coax_env.estimation.helicopter_noise import (
+    JITTER_LEVEL,
+    JITTER_MEMORY,
+    JITTER_REACTION,
+    JITTER_RETURN,
+)
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import (
     REACTION,
@@ -63,10 +68,13 @@ def _fitted(wider: Problem, fit: Fit, left: float) -> Fit:
 
 
 def _taken_up(wider: Problem, fit: Fit) -> Fit:
-    """With the reaction of largest posterior."""
+    """With the share of the motors that has the largest posterior; they return as late as found."""
+    lag = 0.5 * sum(fit.values.get(f"motor_lag.{rotor}", 0.0) for rotor in ("upper", "lower"))
+    back = lag if lag > 0.0 else fit.noise.level(JITTER_MEMORY)
 
     def at(share: float) -> Fit:
-        return replace(fit, noise=fit.noise.with_levels({JITTER_REACTION: share}))
+        levels = {JITTER_REACTION: share, JITTER_RETURN: back}
+        return replace(fit, noise=fit.noise.with_levels(levels))
 
     def cost(share: float) -> float:
         unusual = 0.5 * ((share - REACTION) / REACTION_STD) ** 2

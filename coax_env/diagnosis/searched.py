@@ -64,6 +64,7 @@ from coax_env.estimation.helicopter_noise import (
     JITTER_LEVEL,
     JITTER_MEMORY,
     JITTER_REACTION,
+    JITTER_RETURN,
     LEAST_READING_STD,
 )
 from coax_env.estimation.low_pass import LowPass, before_low_pass, records_before
@@ -76,7 +77,7 @@ from coax_env.model.layout import INERTIAL, RPM_PER_RAD_S
 
 COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
-JITTER = (JITTER_LEVEL, JITTER_MEMORY, JITTER_REACTION)
+JITTER = (JITTER_LEVEL, JITTER_MEMORY, JITTER_REACTION, JITTER_RETURN)
 """What is found of jitter before the search in it, and kept."""
 STRAYING = 5.0
 """std by which neighbouring differences of rotor speeds from their commands must be alike; ours."""

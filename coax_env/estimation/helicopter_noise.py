@@ -7,7 +7,8 @@ No level is a constant that evidence could depend on: all are fitted by maximum 
 - ``white_force_xy`` ..: force and moment without a memory
 - ``rotor_speed``: of the rotors' speeds, whose change the body feels where the model has that reaction
 - ``rotor_jitter``: std of speeds with a memory of their own, ``memory_rotor_jitter``, where flights
-  show them, and what the body takes up of these, ``reaction_rotor_jitter`` (rotor_jitter.py)
+  show them, and what the body takes up of these, ``reaction_rotor_jitter`` and
+  ``return_rotor_jitter`` (rotor_jitter.py)
 - ``trim_force_z``, ``trim_moment_z``: random walks of thrust and torque
 - ``error_attitude`` ..: std of errors of the readings that last, ``memory_error_attitude`` .., where
   flights show them (lasting_errors.py)
@@ -61,7 +62,9 @@ ROTOR_LEVEL = "rotor_speed"
 JITTER_LEVEL, JITTER_MEMORY = "rotor_jitter", "memory_rotor_jitter"
 """Std [rad/s] and correlation time [s] of what rotor_jitter.py adds to the rotor speeds."""
 JITTER_REACTION = "reaction_rotor_jitter"
-"""Share of their angular momentum that the body takes up then (rotor_jitter.py)."""
+"""Share of its changes that the body takes up: all, where motors shake rotors (rotor_jitter.py)."""
+JITTER_RETURN = "return_rotor_jitter"
+"""Time [s] in which a motor brings back a rotor that the air has shaken, against the body."""
 TRIM_LEVELS = ("trim_force_z", "trim_moment_z")
 """Intensity of the random walks of thrust and torque [N/s^1/2, N m/s^1/2] (effect `trim_drift`)."""
 TRIM_AXES = ("force_z", "moment_z")
@@ -91,6 +94,7 @@ LEVEL_UNITS = {
     JITTER_LEVEL: "rad/s",
     JITTER_MEMORY: "s",
     JITTER_REACTION: "1",
+    JITTER_RETURN: "s",
     "trim_force_z": "N/s^1/2",
     "trim_moment_z": "N m/s^1/2",
     **{error_level(group): CHANNEL_UNITS[SENSOR_GROUPS[group][0]] for group in ERRING_GROUPS},
