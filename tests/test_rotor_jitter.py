@@ -41,9 +41,7 @@ from coax_env.model.layout import CHANNELS, N_CHANNELS, N_FULL, RPM_PER_RAD_S
 LAMA = load_vehicle("lama400d").with_values({"rotor_inertia_lower": 6e-4})  # unlike the upper's
 PLAIN = HeliModel(LAMA)
 MODEL = JitteryModel.like(PLAIN)
-LEVELS = Noise(
-    {JITTER_LEVEL: 0.5, JITTER_MEMORY: 0.08, JITTER_REACTION: 1.0, JITTER_RETURN: 0.05}
-)
+LEVELS = Noise({JITTER_LEVEL: 0.5, JITTER_MEMORY: 0.08, JITTER_REACTION: 1.0, JITTER_RETURN: 0.05})
 HOVER, COMMAND = dynamics.hover_trim(LAMA)
 DT = 0.01
 
