@@ -32,7 +32,13 @@ from coax_env.diagnosis.replication import Asked, Replication, halves_of, replic
 from coax_env.diagnosis.scores import lost
 from coax_env.diagnosis.sensor_low_pass import may_hide_behind
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.diagnosis.trust import beside_large_axes, determined, moved_far, of_line
+from coax_env.diagnosis.trust import (
+    beside_large_axes,
+    determined,
+    may_be_none,
+    moved_far,
+    of_line,
+)
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
@@ -300,7 +306,7 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
     sound = Against(
         channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
-        alternatives=(), nats=100.0, shaken=False, poses_alone=False,
+        may_be_none=False, alternatives=(), nats=100.0, shaken=False, poses_alone=False,
         clock_error=0.0, smoothed=False, errors_left=0.0, beside_terms=(),
         beside_moved=(),
     )  # fmt: skip
@@ -409,6 +415,31 @@ def test_what_stands_for_something_else_has_no_name(
         not named or limited or coloured or undetermined or falls or beside or kept != 1.0
         or nats < SETTINGS.sure_evidence
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(("coloured", "falls"), [(0, 0), (1, 0), (0, 1)])
+def test_a_number_that_may_be_none_is_doubted_and_with_one_thing_more_has_no_name(coloured, falls):
+    one = EFFECTS[0]
+    of = known_of(may_be_none=True, coloured=("q",) * coloured, falls_at=("half of all",) * falls)
+    assert without_name({one: of}, SETTINGS) == ({one} if coloured or falls else set())
+    assert any("may as well be none" in text for text in doubts(one, {one: of}, SETTINGS))
+
+
+@pytest.mark.parametrize(
+    ("away", "ratio", "inflation", "none"),
+    [(2.1, 1.0, 1.0, False), (1.9, 1.0, 1.0, True), (3.0, 2.0, 1.0, True), (3.0, 1.0, 4.0, True),
+     (5.0, 2.0, 1.0, False)],
+)  # fmt: skip
+def test_nothing_is_in_the_interval_of_a_number_within_two_of_its_std(away, ratio, inflation, none):
+    """With what models that do as well make of it (`ratio`), and what colour does."""
+    problem = problem_of(8)
+    fit, quadratic, _ = fitted_to(
+        problem, *drawn(np.random.default_rng(3), [1.0] * 8, [1.0] * 8), EFFECTS[:1]
+    )
+    name = problem.own[EFFECTS[0]][0].name
+    std = quadratic.std(problem.free_names(fit.active))[name]
+    fit = replace(fit.at({name: -away * std}), std_ratio={name: ratio})
+    assert may_be_none(problem, fit, quadratic, EFFECTS[0], inflation) == none
 
 
 @pytest.mark.parametrize(

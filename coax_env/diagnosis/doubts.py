@@ -3,7 +3,7 @@
 What stands at the limit of what is believed and is not determined, or does not hold under other noise
 or on parts of the flights, stands for something else. Two of these take a name, too: noise left where
 it shows, little evidence there or by poses alone, other noise, parts of the flights, such a one
-beside it.
+beside it, numbers of which none is known to be another than nothing.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -42,6 +42,8 @@ class Against:
         parts: how it fared on parts of the flights. runs: number of runs that were fitted.
         sizes: of its numbers [usual sizes].
         determined: whether the flights say more of one of its numbers than the prior did.
+        may_be_none: whether nothing is within the 95 % interval of each of its numbers; in that is what
+            models that do as well make of them.
         alternatives: effects that would do as well.
         nats: its evidence. shaken: whether gusts come in single shocks.
         poses_alone: whether neither gyros nor accelerometers were read.
@@ -62,6 +64,7 @@ class Against:
     runs: int
     sizes: Mapping[str, float]
     determined: bool
+    may_be_none: bool
     alternatives: tuple[str, ...]
     nats: float
     shaken: bool
@@ -121,7 +124,7 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         weak = unseen and of.nats < chosen.sure_evidence
         beside = any(_shows_beside(effect, of, standing_in))
         parts = of.is_gone_on_parts(chosen)
-        return sum((bool(of.coloured), weak, bool(of.falls_at), parts, beside))
+        return sum((bool(of.coloured), weak, bool(of.falls_at), parts, beside, of.may_be_none))
 
     return {
         effect
@@ -165,6 +168,8 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
     yield from _beside_limits(effect, against)
     if not of.determined:
         yield "none of its numbers is determined"
+    if of.may_be_none:
+        yield "its numbers may as well be none: models that do as well have others"
     if of.alternatives:
         others = and_list([plain(name) for name in of.alternatives])
         yield f"these flights cannot distinguish it from {others}"

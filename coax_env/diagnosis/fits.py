@@ -289,11 +289,22 @@ def steadied(problem: Problem, fit: Fit) -> Fit:
     Args:
         problem, fit: with levels that were fitted, and the vehicle's own numbers.
     """
+    steady = from_steady_noise(problem, fit)
+    if steady is None:
+        return fit
+    return min(fitted(problem, noise_fitted(problem, fit)), steady, key=lambda end: end.objective)
+
+
+def from_steady_noise(problem: Problem, fit: Fit) -> Fit | None:
+    """The fit from there with steady noise; None where it is that already.
+
+    Args:
+        problem, fit: with levels that were fitted.
+    """
     steady = without_drifts(fit)
     if steady.noise.process == fit.noise.process:
-        return fit
-    ended = [fitted(problem, noise_fitted(problem, begun)) for begun in (fit, steady)]
-    return min(ended, key=lambda other: other.objective)
+        return None
+    return fitted(problem, noise_fitted(problem, steady))
 
 
 def _score(problem: Problem, fit: Fit, score: NoiseScore, name: str) -> float:

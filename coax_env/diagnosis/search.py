@@ -16,9 +16,9 @@ from dataclasses import dataclass, field, replace
 
 from coax_env.diagnosis.fits import (
     fitted,
+    from_steady_noise,
     linearise,
     noise_fitted,
-    steadied,
     stepped,
     with_latent_noise,
 )
@@ -87,11 +87,11 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
             continue
         if not complete:
             moved = moved or _steadier(problem, fit, memory)
-            moved = moved or _in_brief_gusts(problem, fit, quadratic, memory)
             moved = moved or _swap(problem, fit, quadratic, memory)
             moved = moved or _trial(problem, fit, quadratic, candidates, memory)
             moved = moved or _with_late_rotors(problem, fit, quadratic, memory)
             moved = moved or with_latent_noise(problem, fit)
+            moved = moved or _in_brief_gusts(problem, fit, quadratic, memory)
         if moved is None:  # what is active must also stand against coloured innovations
             complete = True
             moved = drop(problem, fit, quadratic, coloured=True)
@@ -206,8 +206,8 @@ def _steadier(problem: Problem, fit: Fit, memory: _Memory) -> Fit | None:
     if fit.active in memory.steadied:
         return None
     memory.steadied.add(fit.active)
-    steady = steadied(problem, fit)
-    if steady.objective >= fit.objective - problem.settings.tie:
+    steady = from_steady_noise(problem, fit)
+    if steady is None or steady.objective >= fit.objective - problem.settings.tie:
         return None
     problem.report("searching on from steadier noise")
     return steady
