@@ -7,6 +7,7 @@ fades by its memory.
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import injector
 import numpy as np
@@ -15,17 +16,18 @@ from injector_air import GUSTY
 from injector_sensors import SENSORS
 from numpy.testing import assert_allclose
 
-from coax_env import diagnose, load_vehicle
+from coax_env import diagnose, load_vehicle, simulate
 from coax_env.diagnosis import onboard_filter, sensor_errors
 from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import error_level, error_memory, starting_noise
-from coax_env.estimation.lasting_errors import ERRING, ErringModel, with_errors
+from coax_env.estimation.lasting_errors import ERRING, ErringModel, with_errors, without_errors
 from coax_env.estimation.noise_levels import fit_noise
+from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import JitteryModel
-from coax_env.estimation.state_space import Noise, Record
+from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.estimation.swinging_gusts import SwingingModel
 from coax_env.estimation.wrapping_model import with_innermost
 from coax_env.logs.flight import Run, read_flight
@@ -168,6 +170,39 @@ def test_without_errors_its_likelihood_is_the_helicopters_and_planted_ones_retur
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("inner", [HeliModel.like, JitteryModel.like])
+def test_errors_that_nothing_shakes_are_as_if_they_were_next_to_nothing(inner):
+    """Likelihood, slopes in numbers and in noise: of an error of 1e-9 of its reading's noise, whose
+    states are carried along, and of none, whose states have no covariance."""
+    flight = simulate(LAMA, "lat_doublet", seed=5, sensors="onboard")
+    record = record_of(flight.runs[0])
+    rows = slice(0, 250)
+    short = replace(record, t=record.t[rows], command=record.command[rows], z=record.z[rows])
+    model = ErringModel(inner(PLAIN))
+    engine, values = Engine(model, [short]), dict(model.bare_values)
+    noise = with_errors(starting_noise(flight, LAMA))
+    gone = ("velocity", "accelerometers", "heading")
+    least = noise.with_levels({error_level(g): 1e-9 * STD[g] for g in gone})
+    none = without_errors(noise, gone)
+    assert set(noise.process) - set(none.process) == {
+        name(group) for group in gone for name in (error_level, error_memory)
+    }
+    found = [engine.log_likelihood(values, each) for each in (least, none)]
+    assert found[0] == pytest.approx(found[1], abs=1e-5)
+    free = [FreeParameter("mass", values["mass"], 0.01), FreeParameter("gyro_bias.x", 0.0, 0.01)]
+    values = values | {"gyro_bias.x": 0.0}
+    kinds = [
+        Quadratic.of(engine.linearise(values, n, free)[1], free, values) for n in (least, none)
+    ]
+    assert_allclose(kinds[0].g, kinds[1].g, rtol=1e-6)
+    assert_allclose(kinds[0].precision, kinds[1].precision)
+    slopes = [engine.noise_score(values, n).in_noise.sum(axis=0) for n in (least, none)]
+    carried = [k for k in range(slopes[0].size) if slopes[1][k] != 0.0]
+    assert len(carried) > 6
+    assert_allclose(slopes[0][carried], slopes[1][carried], rtol=1e-5)
+
+
+@pytest.mark.slow
 def test_numbers_hold_the_truth_where_errors_last(wandering):
     """Taken for errors of a row, readings moved the tilt by 3 to 4.5 std. **Synthetic**."""
     found = diagnose(wandering)
@@ -240,6 +275,23 @@ def test_errors_last_where_that_is_worth_it_and_no_motion_stays_coloured(
         names = {name(g) for g in ("attitude", "velocity") for name in (error_level, error_memory)}
         assert found.fit.objective == 400.0 and set(found.begun.process) == {*process, *names}
         assert found.begun.process[error_level("velocity")] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("share", "lost", "kept"), [(0.14, 1.0, False), (0.16, 0.0, True), (0.14, 3.0, True)]
+)
+def test_small_errors_are_left_out_where_that_costs_no_more_than_convergence(share, lost, kept):
+    """Of groups that have less than 0.15 of their readings' own noise."""
+    noise = with_errors(Noise({"force_xy": 1.0}, {"phi": 0.01, "theta": 0.03, "h": 0.05}))
+    noise = noise.with_levels({error_level("height"): share * 0.05})
+    height = {error_level("height"), error_memory("height")}
+    every = (*noise.process, *noise.reading)
+    worth = lambda values, n: -lost * (error_level("height") not in n.process)  # noqa: E731
+    problem: Any = SimpleNamespace(engine=SimpleNamespace(log_likelihood=worth), settings=SETTINGS)
+    found = sensor_errors._without_small(problem, Fit((), {}, noise, levels=every))
+    gone = set() if kept else height
+    assert set(found.levels) == set(every) - gone
+    assert set(found.noise.process) == set(noise.process) - gone
 
 
 def turning(seed: int, carried: str, every: int = 1, common: float = 0.0) -> Run:

@@ -26,13 +26,21 @@ one-sided gusts, and a clean **synthetic** flight had a false name (`--arms mixe
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation.helicopter_noise import ERROR_LEVELS, ERROR_MEMORIES
-from coax_env.estimation.lasting_errors import ErringModel, with_errors
+from coax_env.estimation.helicopter_noise import ERROR_LEVELS, ERROR_MEMORIES, error_level
+from coax_env.estimation.lasting_errors import ErringModel, with_errors, without_errors
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import are_white, whiteness
-from coax_env.model.layout import ACCELEROMETERS, GYROS, MOTION, SENSOR_GROUPS
+from coax_env.model.layout import (
+    ACCELEROMETERS,
+    ERRING_GROUPS,
+    GYROS,
+    MOTION,
+    SENSOR_GROUPS,
+)
 from coax_env.plain_words import and_list
 
 FELT_BY = {"attitude": GYROS, "heading": GYROS} | dict.fromkeys(
@@ -45,6 +53,9 @@ FORCES = ("white_force_xy", "white_force_z")
 WHITE = 100.0
 """Times the floor of its level from which a white force stands for something: 0.05 N s^1/2 of a machine
 of 1 kg; ours."""
+SMALL = 0.15
+"""Of their readings' own noise, up to which a group's lasting errors may be left out together, if that
+costs no more than convergence does; ours."""
 LEVELS_OF_ERRORS = (*ERROR_LEVELS, *ERROR_MEMORIES)
 
 
@@ -93,7 +104,9 @@ def lasting_errors(problem: Problem, fit: Fit, noise: Noise) -> LastingErrors | 
         return None
     left = whiteness(wider.engine.filter(trial.values, trial.noise), channels)
     levels = {name: trial.noise.level(name) for name in trial.levels if name in LEVELS_OF_ERRORS}
-    begun = with_errors(noise).with_levels(levels)
+    begun = with_errors(noise)
+    none = [group for group in ERRING_GROUPS if error_level(group) not in levels]
+    begun = without_errors(begun, none).with_levels(levels)
     return LastingErrors(wider, trial, begun, gained, are_white(left, MOTION))
 
 
@@ -114,4 +127,28 @@ def _erring(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     own = [name for name in LEVELS_OF_ERRORS if name in begun.process]
     trial = replace(fit, noise=begun, levels=(*own, *fit.levels))
     trial = noise_fitted(wider, trial, evaluations=wider.settings.first_noise_evaluations)
-    return wider, converged(wider, fitted(wider, trial))
+    return wider, converged(wider, _without_small(wider, fitted(wider, trial)))
+
+
+def _without_small(problem: Problem, fit: Fit) -> Fit:
+    """Without errors of groups that have next to none: passes are quicker without their states."""
+    small = [
+        group
+        for group in ERRING_GROUPS
+        if error_level(group) in fit.levels and _share(fit.noise, group) < SMALL
+    ]
+    if not small:
+        return fit
+    rest = without_errors(fit.noise, small)
+    lost = problem.engine.log_likelihood(fit.values, fit.noise)
+    lost -= problem.engine.log_likelihood(fit.values, rest)
+    if lost > problem.settings.step_gain:
+        return fit
+    levels = tuple(n for n in fit.levels if n in rest.process or n in rest.reading)
+    return replace(fit, noise=rest, levels=levels)
+
+
+def _share(noise: Noise, group: str) -> float:
+    """Std of a group's lasting errors over that of its readings' own noise."""
+    read = [noise.reading[channel] for channel in SENSOR_GROUPS[group] if channel in noise.reading]
+    return noise.level(error_level(group)) / float(np.mean(read))

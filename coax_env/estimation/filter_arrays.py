@@ -7,6 +7,7 @@ import numpy as np
 from coax_env.estimation.compiled_model import lanes_of
 from coax_env.estimation.sparse import aligned, padded, with_places
 from coax_env.kernel.compilation import compiled
+from coax_env.model.layout import N_FULL
 
 
 class FilterArrays(NamedTuple):
@@ -45,7 +46,28 @@ class FilterArrays(NamedTuple):
     whole: Any  # a Jacobian of all states as they are (nx + m, nx)
     work: Any  # the model's scratch
     lanes: Any  # Lanes of moved states
-    per_change: Any  # (width,) 1 / how far a state is moved, 0 beyond the last
+    per_change: Any  # (width,) 1 / how far a state is moved, 0 of one at rest and beyond the last
+
+
+@compiled()
+def _rests(j, model, assumed):
+    """Whether a state is nothing, and known to be: one behind the helicopter's, which no noise shakes.
+
+    It does nothing to any reading, and so has no covariance. Such are errors that last of readings that
+    have none: with all of them a pass takes more than twice as long.
+
+    Args:
+        j: the state. model: a CompiledModel. assumed: Variances.
+    """
+    if j < N_FULL:
+        return False
+    for i in range(assumed.x0.size):
+        if assumed.P0[j, i] != 0.0:
+            return False
+    for e in range(model.noise_places.shape[0]):
+        if model.noise_places[e, 0] == j and assumed.q[e] != 0.0:
+            return False
+    return True
 
 
 @compiled(makes_arrays=True)
@@ -84,7 +106,8 @@ def arrays_of(model, run, assumed, p, shown, channels):
         lanes=lanes_of(nx, run.u.shape[1], p, scratch, m), per_change=aligned(1, long)[0],
     )  # fmt: skip
     for j in range(nx):
-        w.per_change[j] = 1.0 / model.scale[order[j]]
+        if not _rests(order[j], model, assumed):
+            w.per_change[j] = 1.0 / model.scale[order[j]]
     for i in range(r):
         for j in range(r):
             w.P[i, j] = assumed.P0[order[i], order[j]]

@@ -10,6 +10,7 @@ off so, where it is 1.0 to 1.6 with these.
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
@@ -118,6 +119,12 @@ def _by_channel(noise: Noise | None, name_of: Any, otherwise: float) -> np.ndarr
     """A level of each of the channels ERRING, by its group's name."""
     levels = {} if noise is None else noise.process
     return np.array([levels.get(name_of(GROUP_OF[channel]), otherwise) for channel in ERRING])
+
+
+def without_errors(noise: Noise, groups: Collection[str]) -> Noise:
+    """Noise levels without those of lasting errors of some groups, whose states are at rest then."""
+    gone = {name(group) for group in groups for name in (error_level, error_memory)}
+    return replace(noise, process={n: v for n, v in noise.process.items() if n not in gone})
 
 
 def with_errors(noise: Noise) -> Noise:

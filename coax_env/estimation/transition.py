@@ -37,7 +37,7 @@ def linearise(model, u, dt, p, w):
     for i in range(w.base.size):
         row = w.order[i] if i < w.x.size else i
         for j in range(w.x.size):
-            w.AH[i, j] = w.whole[row, w.order[j]]
+            w.AH[i, j] = w.whole[row, w.order[j]] if w.per_change[j] > 0.0 else 0.0
 
 
 @compiled(**REORDER)
