@@ -159,6 +159,38 @@ def test_weak_causes_are_asked_from_brief_gusts_together_and_alone(monkeypatch, 
     assert set(fit.active) == set(worth) - set(asked[-1] if asked else ())
 
 
+def test_weak_causes_are_weighed_before_stronger_ones_that_are_in_doubt_too(monkeypatch):
+    """One that is removed is gone before those are weighed; what was weighed as strong stays behind."""
+    worth = {"gyro_bias": 5.0, "yaw_damping": 2.0, "motor_droop": 0.95, "motor_lag": CLEAR}
+    flights = Flights({e: w if w == CLEAR else w * THRESHOLD for e, w in worth.items()})
+    _, found = flights.pruned(monkeypatch, GOOD)
+    assert flights.asked[:2] == ["yaw_damping", "motor_droop"]
+    assert flights.asked[2:] == ["yaw_damping", "gyro_bias", "motor_lag"]
+    assert set(found) == set(worth) - {"motor_droop"}
+
+
+def test_a_refit_that_loses_too_little_need_not_converge(monkeypatch):
+    """Its loss can only become less."""
+    flights = Flights({"gyro_bias": 0.5 * THRESHOLD, "yaw_damping": 2.0 * THRESHOLD})
+    flights.pruned(monkeypatch, GOOD)
+    fit = Fit(("gyro_bias", "yaw_damping"), {}, GOOD)
+    fit = replace(fit, objective=flights.objective(fit))
+    turns: list[tuple[str, ...]] = []
+    monkeypatch.setattr(
+        evidence, "converged", lambda problem, fit, held: turns.append(fit.active) or fit
+    )
+    problem: Any = SimpleNamespace(
+        settings=SETTINGS, file_values=lambda effect: {}, reads_seldom=False, unlike_gusts=False,
+        smoothed=False, sees_poses_alone=False,
+        for_each=lambda one, which: {e: one(e) for e in which},
+    )  # fmt: skip
+    found = evidence.weigh(problem, fit, None, fit.active, THRESHOLD)  # type: ignore[arg-type]
+    assert turns == [("gyro_bias",)]
+    assert {e: r.evidence.nats / THRESHOLD for e, r in found.items()} == pytest.approx(
+        {"gyro_bias": 0.5, "yaw_damping": 2.0}
+    )
+
+
 def test_without_a_cause_latent_noise_is_asked_for(monkeypatch):
     flights = Flights({"gyro_bias": CLEAR, "yaw_damping": 0.1 * THRESHOLD})
     beside: list[tuple[str, ...]] = []
@@ -279,7 +311,7 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
         return Tables(problem.alone, problem.joint, gains=True), fit
 
     def removals(
-        problem: Tables, fit: Fit, _: object, which: Sequence[str]
+        problem: Tables, fit: Fit, _: object, which: Sequence[str], enough: float
     ) -> dict[str, evidence.Removal]:
         worth = problem.worth(fit.active)
         return {e: evidence.Removal(worth[e], replace(fit, active=fit.rest(e))) for e in which}

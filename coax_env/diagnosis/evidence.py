@@ -44,6 +44,8 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import is_white, whiteness
 from coax_env.model.layout import ACCELEROMETERS
 
+WEAK = 3.0
+"""Thresholds below which a cause is weighed before stronger ones: most of what is removed is; ours."""
 AMISS = 2.0
 """Times what the quadratic foretells that a refit without a cause may lose and be believed at once. One
 that had not converged lost 3,706 nats where 182 were foretold, and 2 in the end: a play, sure, on a
@@ -72,7 +74,11 @@ class Removal:
 
 
 def weigh(
-    problem: Problem, fit: Fit, quadratic: Quadratic, which: Sequence[str]
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    which: Sequence[str],
+    enough: float = -math.inf,
 ) -> dict[str, Removal]:
     """Evidence of active effects, each from a refit without it.
 
@@ -80,6 +86,7 @@ def weigh(
         problem, fit: what may be free, and where.
         quadratic: linearised at the fit.
         which: the effects.
+        enough: nats that a cause must be worth; a refit that loses less need not converge.
     """
     chosen = problem.settings
 
@@ -91,7 +98,7 @@ def weigh(
         lost = rest.objective - fit.objective
         foretold = loss(problem, quadratic, fit.active, effect, 1.0)
         clear = chosen.clear * factor
-        if lost < clear or lost > AMISS * foretold:
+        if enough * factor < lost < clear or lost > AMISS * foretold:
             rest = converged(problem, rest, held)
         return Removal(Evidence(float(rest.objective - fit.objective), factor), rest)
 
@@ -103,8 +110,9 @@ def prune(
 ) -> tuple[Fit, Quadratic, dict[str, Evidence]]:
     """Remove, one at a time, causes whose evidence is gone once the noise levels are fitted too.
 
-    What is in doubt by the quadratic is weighed first: the clear ones wait until nothing is removed.
-    What has none by it is weighed before the fit is refined, which takes as long as all else here.
+    What is in doubt is weighed first, by what it was worth before or the quadratic: the clear ones wait
+    until nothing is removed. What has no evidence by the quadratic is weighed before the fit is
+    refined, which takes as long as all else here.
 
     Args:
         problem, fit: what may be free, and where.
@@ -115,6 +123,7 @@ def prune(
         the fit, refined where something was weighed, the quadratic at it, with the candidates then, and
         the evidence of what is left and was weighed.
     """
+    worth: dict[str, float] = {}  # as weighed beside other causes
     while True:
         fit = _without_small(problem, converged(problem, fit))
         alone = problem.of_candidates(fit.active)
@@ -123,14 +132,15 @@ def prune(
         if better is not None:
             fit = with_latent_noise(problem, better) or better
             continue
-        if fit.active and not _asked(problem, fit, quadratic, clear):
+        if fit.active and not _asked(problem, fit, quadratic, clear, worth):
             return fit, quadratic, {}
         beside = problem if fit.active else alone  # for whom could the candidates stand?
         fit, quadratic = quadratic_at(beside, refined(problem, fit))
         enough = threshold(problem, quadratic, fit.active)
         removals: dict[str, Removal] = {}
-        for which in _asked(problem, fit, quadratic, clear):
-            removals |= weigh(problem, fit, quadratic, which)
+        for which in _asked(problem, fit, quadratic, clear, worth):
+            removals |= weigh(problem, fit, quadratic, which, enough)
+            worth |= {e: removals[e].evidence.nats for e in which}
             better = _better(problem, fit, enough, removals)
             if better is not None:
                 break
@@ -183,12 +193,23 @@ def _in_brief_gusts(
 
 
 def _asked(
-    problem: Problem, fit: Fit, quadratic: Quadratic, clear: Collection[str]
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    clear: Collection[str],
+    worth: Mapping[str, float],
 ) -> list[list[str]]:
-    """Causes that are to be weighed together: those in doubt, then the rest but for the clear ones."""
+    """Causes that are to be weighed together: weak ones, others in doubt, the rest but for clear ones.
+
+    Args:
+        worth: of those that were weighed beside other causes [nats]; of the others the quadratic says.
+    """
     doubtful = [e for e in fit.active if _is_doubtful(problem, fit, quadratic, e)]
     rest = [e for e in fit.active if e not in doubtful and e not in clear]
-    return [which for which in (doubtful, rest) if which]
+    most = WEAK * problem.settings.evidence
+    known = {e: worth[e] if e in worth else _worth(problem, fit, quadratic, e) for e in doubtful}
+    weak, other = ([e for e in doubtful if (known[e] < most) == so] for so in (True, False))
+    return [which for which in (weak, other, rest) if which]
 
 
 def _without_hopeless(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
@@ -196,7 +217,7 @@ def _without_hopeless(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit |
     enough = threshold(problem, quadratic, fit.active)
     most = enough - problem.settings.tie
     asked = [e for e in fit.active if _worth(problem, fit, quadratic, e) < most]
-    removals = weigh(problem, fit, quadratic, asked)
+    removals = weigh(problem, fit, quadratic, asked, most)
     hopeless = {e: r for e, r in removals.items() if r.evidence.nats < most}
     return _better(problem, fit, enough, hopeless)
 
