@@ -239,6 +239,27 @@ def test_what_commands_foretell_is_no_outlier(tmp_path: Path) -> None:
     assert set(alone) <= set(left_out) and not set(genuine[answers[genuine]]) & set(left_out)
 
 
+@pytest.mark.parametrize(("every", "whole"), [(1, True), (5, False)])
+def test_a_trackers_pose_with_an_outlier_in_it_is_left_out_whole(tmp_path, every, whole):
+    """Not where position comes at another rate than attitudes, from a sensor of its own."""
+    rng, n = np.random.default_rng(5), 600
+    pose = {c: rng.normal(0.0, 1e-3, n) for c in ("phi", "theta", "psi", "h", "pn", "pe")}
+    for channel in ("pn", "pe"):
+        pose[channel][np.arange(n) % every > 0] = np.nan
+    pose["theta"][205] += 0.1
+    rates = {"q": rng.normal(0.0, 1e-2, n)}
+    run = Run("hover", 0.01 * np.arange(n), np.tile([200.0, 200.0, 0.0, 0.0], (n, 1)), pose | rates)
+    flight = read_flight(write_flight(Flight("lama400d", (run,)), tmp_path / "flight"))
+    found = flight.run("hover").measured
+    gone = {c for c in (*pose, "q") if np.isnan(found[c][205])}
+    assert gone == (set(pose) if whole else {"theta"})
+    assert {c: int(np.isnan(found[c]).sum()) for c in ("phi", "theta", "q")} == {
+        "phi": int(whole), "theta": 1, "q": 0
+    }  # fmt: skip
+    said = "poses of a tracker left out whole for an outlier in them"
+    assert flight.counts.get(said, 0) == int(whole) and flight.counts["outliers in theta removed"]
+
+
 def test_one_jump_of_a_command_foretells_nothing() -> None:
     """What it alone would explain is not foretold by any other row."""
     rate = np.random.default_rng(0).normal(0.0, 0.01, 400)
