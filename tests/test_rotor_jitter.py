@@ -267,6 +267,25 @@ def test_a_planted_reaction_returns(reaction):
     assert found.noise.level(JITTER_REACTION) == pytest.approx(reaction, abs=0.15)
 
 
+@pytest.mark.parametrize(
+    ("begun", "summits"), [(1.0, (0.1, 1.9)), (0.1, (1.9, 0.1)), (1.9, (0.1, 1.9))]
+)
+def test_of_two_summits_the_higher_one_is_taken_and_never_a_lower_share(begun, summits):
+    """The likelihood in the share has both; the second is 5 nats lower."""
+
+    def likelihood(values: dict[str, float], noise: Noise) -> float:
+        share = noise.level(JITTER_REACTION)
+        return max(-2e2 * (share - summits[0]) ** 2, -2e2 * (share - summits[1]) ** 2 - 5.0)
+
+    wider: Any = SimpleNamespace(engine=SimpleNamespace(log_likelihood=likelihood))
+    fit = Fit((), {}, LEVELS.with_levels({JITTER_REACTION: begun}))
+    found = asking._taken_up(wider, fit).noise
+    assert found.level(JITTER_REACTION) == pytest.approx(summits[0], abs=0.05)
+    assert found.level(JITTER_RETURN) == LEVELS.level(JITTER_MEMORY)  # no motor lags
+    late = asking._taken_up(wider, fit.at({"motor_lag.upper": 0.06, "motor_lag.lower": 0.1}))
+    assert late.noise.level(JITTER_RETURN) == pytest.approx(0.08)
+
+
 def test_slopes_in_level_and_memory_are_those_of_the_likelihood(engine_and_noise):
     """That in the memory is half as large again here, why is not known; it leads to where it should."""
     engine, noise = engine_and_noise
