@@ -1,5 +1,6 @@
 """Readings behind a sensor's low-pass, taken back through it; how it is found in a flight."""
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -166,3 +167,42 @@ def test_a_low_pass_is_worth_what_it_is_at_the_likeliest_levels(monkeypatch, fro
     low_pass, noise = sensor_low_pass._likeliest(problem, Fit((), {}, searched), first, ["p"], {})
     assert (low_pass != NONE) == found
     assert noise.level("force_xy") == (1.0 if found else 2.0)
+
+
+@pytest.mark.parametrize(("had", "fits"), [(NONE, 8), (LowPass(0.012, 2), 1)])
+def test_of_a_low_pass_that_was_found_the_time_alone_is_looked_for_anew(monkeypatch, had, fits):
+    """The likelihood is highest at 13 ms; of one that was found the order stays. The first fit begins
+    from the search's levels, each other one where the one before it ended."""
+    begun: list[float] = []
+    order = had.order if had != NONE else 1
+
+    class Stand(SimpleNamespace):
+        def log_likelihood(self, values: Any, noise: Noise) -> float:
+            low_pass = self.low_pass
+            if low_pass == NONE:
+                return -1000.0
+            wrong = 500.0 * (low_pass.order != order)
+            return -wrong - 100.0 * math.log(low_pass.time / 0.013) ** 2
+
+    def fit_noise(engine: Any, values: Any, noise: Noise, *rest: Any) -> Noise:
+        begun.append(noise.level("force_xy"))
+        return noise.with_levels({"force_xy": noise.level("force_xy") + 1.0})
+
+    monkeypatch.setattr(
+        sensor_low_pass, "before_low_pass", lambda record, channels, passes: (passes["p"], 0.0)
+    )
+    monkeypatch.setattr(
+        sensor_low_pass, "Engine", lambda model, records, threads: Stand(low_pass=records[0])
+    )
+    monkeypatch.setattr(sensor_low_pass, "fit_noise", fit_noise)
+    problem: Any = SimpleNamespace(
+        row=0.01, settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
+        engine=SimpleNamespace(records=["logged"], threads=1),
+        model=SimpleNamespace(channels=("p",)),
+    )  # fmt: skip
+    levels = Noise({"force_xy": 1.0}, {"p": 0.1})
+    fit = Fit((), {}, levels)
+    found, _ = sensor_low_pass._likeliest(problem, fit, levels, ["p"], {"p": had})
+    assert found.order == order and found.time == pytest.approx(0.013, rel=0.02)
+    assert begun[:fits] == [1.0, 2.0, 3.0, 4.0, 1.0, 2.0, 3.0, 4.0][:fits]
+    assert len(begun) == fits + 2  # at the likeliest time, and without

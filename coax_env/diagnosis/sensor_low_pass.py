@@ -160,6 +160,8 @@ def _likeliest(
 ) -> tuple[LowPass, Noise]:
     """A group's low-pass, NONE where it is not worth the threshold; the noise with it.
 
+    Of one that was found already the order is known, and its time looked for anew.
+
     Args:
         problem, fit: after a search. noise: levels from which fits of them begin.
         group: channels. others: low-passes of all channels as found by now.
@@ -192,11 +194,15 @@ def _likeliest(
         return max((fitted_at(low_pass, start) for start in starts), key=lambda fit: fit[0])
 
     had = others.get(group[0], NONE)
-    tried = {}
-    for order in (1, 2):
+    tried: dict[tuple[int, int], tuple[LowPass, float, Noise]] = {}
+    for order in (1, 2) if had == NONE else (had.order,):
+        near, levels = had, noise  # a fit begins where the one before it ended
         for k, time in enumerate(TIMES):
+            if had != NONE and k != _nearest(had.time / row):
+                continue
             trial = LowPass(time * row, order)
-            tried[order, k] = trial, *fitted_at(trial, scaled(noise, had, trial))
+            nats, levels = fitted_at(trial, scaled(levels, near, trial))
+            tried[order, k], near = (trial, nats, levels), trial
     order, k = max(tried, key=lambda place: tried[place][1])
     best, _, levels = tried[order, k]
     bounds = (BOUNDS[0], *TIMES, BOUNDS[1])
@@ -217,6 +223,15 @@ def _likeliest(
         f" {gained:.1f} nats"
     )
     return (found, levels) if gained > chosen.evidence else (NONE, scaled(noise, had, NONE))
+
+
+def _nearest(time: float) -> int:
+    """Place of the nearest of TIMES, by their ratios.
+
+    Args:
+        time: of a row.
+    """
+    return min(range(len(TIMES)), key=lambda k: abs(math.log(time / TIMES[k])))
 
 
 def _refitted(problem: Problem, fit: Fit, passes: Mapping[str, LowPass]) -> Fit:

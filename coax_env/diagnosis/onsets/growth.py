@@ -31,6 +31,11 @@ WORSE = 100.0
 """nats by which growth with a step's numbers may be worse than the step, to be fitted; ours. One that
 was fitted was 128 worse before and 30 better then."""
 
+STEPS = (2, 4)
+"""Gauss-Newton steps of each start, and more of those that are near the best then; ours."""
+BEHIND = 40.0
+"""nats behind the best that a start may be after its first steps to get more; ours."""
+
 GONE, MOST_POINTS = 4.5, 10
 """nats from the best at which a time has no share in its interval, and points to each side; ours."""
 BETWEEN = 50
@@ -89,8 +94,11 @@ def growing(
         price = math.log(width / own.width(problem.seconds))
         return wider, fit, replace(own, nats=step.objective - fit.objective - price)
 
-    tried = [judged(wider, fitted(wider, begun, steps=6))
-             for wider, begun in _starts(problem, step, effect, moment)]  # fmt: skip
+    begun = [(wider, fitted(wider, fit, STEPS[0]))
+             for wider, fit in _starts(problem, step, effect, moment)]  # fmt: skip
+    least = min((fit.objective for _, fit in begun), default=math.inf)
+    near = [(wider, fit) for wider, fit in begun if fit.objective < least + BEHIND]
+    tried = [judged(wider, fitted(wider, fit, STEPS[1])) for wider, fit in near]
     tried = [t for t in tried if t[2].grown - t[2].begins > 1.01 * SHORTEST]
     if not tried:
         return None
