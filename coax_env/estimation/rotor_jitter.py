@@ -86,14 +86,9 @@ def _taken_up(x, p):
 
 
 @compiled()
-def _turned_back(x, p, left):
-    """Yaw rate [rad/s] that motors which bring rotors back give to the body.
-
-    Args:
-        x: (31,) state. p: as everywhere. left: share of the jitter that is left.
-    """
-    back = p[p.size + _UPPER_BACK] * x[N_FULL] - p[p.size + _LOWER_BACK] * x[N_FULL + 1]
-    return (left - 1.0) * back
+def _turned_back(x, p):
+    """Yaw rate [rad/s] that motors give to the body until they have brought the rotors back."""
+    return p[p.size + _LOWER_BACK] * x[N_FULL + 1] - p[p.size + _UPPER_BACK] * x[N_FULL]
 
 
 @compiled()
@@ -121,7 +116,11 @@ def _shaken(x, u, p, work):
 
 
 def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """The helicopter's step; jitter fades."""
+    """The helicopter's step with the jitter that a row begins with; jitter fades, motors turn it back.
+
+    Not with the jitter of the row's mean: what shakes the rotors within a row is in the next row's, and
+    of that the heading would never know. What motors turn back within the row it does.
+    """
     for i in range(N_JITTERY):
         out[i] = x[i]
     _take_in_innovations(u, p, out)
@@ -133,8 +132,11 @@ def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     out[S.R] -= taken
     out[S.OMEGA_U] -= out[N_FULL]
     out[S.OMEGA_L] -= out[N_FULL + 1]
-    left = math.exp(-dt / p[p.size + _MEMORY])
-    out[S.R] += _turned_back(out, p, left)
+    memory = p[p.size + _MEMORY]
+    left = math.exp(-dt / memory)
+    back = _turned_back(out, p)
+    out[S.R] += (1.0 - left) * back
+    out[S.PSI] += (dt - memory * (1.0 - left)) * back
     for i in range(N_FULL, N_JITTERY):
         out[i] *= left
 
@@ -146,7 +148,7 @@ def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
 
 
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
-    """The helicopter's; jitter fades exactly."""
+    """The helicopter's; jitter fades exactly, and what that does in a row the exponential knows."""
     own = work[_OUT:_WORK_SIZE]
     _shaken(x, u, p, work)
     kernel_drift(work[_STATE:_INPUT], work[_INPUT:_OUT], dt, p, work, own)
@@ -157,7 +159,7 @@ def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) 
     left = math.exp(-dt / p[p.size + _MEMORY])
     for i in range(N_FULL):
         out[i] = own[i]
-    out[S.R] += _turned_back(x, p, left)
+    out[S.R] += (1.0 - left) * _turned_back(x, p)
     for i in range(N_FULL, N_JITTERY):
         out[i] = (left - 1.0) * x[i]
     for i in range(N_CHANNELS):
