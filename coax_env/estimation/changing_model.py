@@ -214,7 +214,8 @@ class ChangingModel(HeliModel):
         at_once = {m: e for e, m in self.moments.items() if m.grows == 0.0}
         self._changes = [*at_once.values(), *(e for e, m in self.moments.items() if m.grows > 0.0)]
         self._size = base.vector(base.bare_values).size
-        self.exact, self.work_size = base.exact, base.work_size + self._size
+        self.exact, self.of_noise = base.exact, base.of_noise
+        self.work_size = base.work_size + self._size
         self.state_scale, self.noise_places = base.state_scale, base.noise_places
         self.air = base.air
 

@@ -39,6 +39,7 @@ class CompiledModel(NamedTuple):
     measure: Any
     drift_and_readings: Any
     exact: np.ndarray
+    of_noise: np.ndarray
     wraps: np.ndarray
     scale: np.ndarray
     work_size: int
@@ -57,6 +58,7 @@ class CompiledModel(NamedTuple):
             model.measure,
             model.drift_and_readings,
             np.ascontiguousarray(model.exact, bool),
+            np.array(getattr(model, "of_noise", np.zeros(len(model.exact))), bool),
             np.ascontiguousarray(model.wraps, bool),
             np.ascontiguousarray(model.state_scale, float),
             int(model.work_size),
@@ -67,8 +69,8 @@ class CompiledModel(NamedTuple):
 
 
 MODEL = types.NamedTuple(
-    [STEP, MEASURE, STEP, boolean[::1], boolean[::1], VECTOR, int64, int64[:, ::1], boolean, LANES_STEP,
-     LANES_MEASURE, LANES_STEP], CompiledModel
+    [STEP, MEASURE, STEP, boolean[::1], boolean[::1], boolean[::1], VECTOR, int64, int64[:, ::1],
+     boolean, LANES_STEP, LANES_MEASURE, LANES_STEP], CompiledModel
 )  # fmt: skip
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from coax_env.estimation.compiled_model import lanes_of
 from coax_env.estimation.sparse import aligned, padded, with_places
 from coax_env.kernel.compilation import compiled
-from coax_env.model.layout import N_FULL
 
 
 class FilterArrays(NamedTuple):
@@ -51,7 +50,7 @@ class FilterArrays(NamedTuple):
 
 @compiled()
 def _rests(j, model, assumed):
-    """Whether a state is nothing, and known to be: one behind the helicopter's, which no noise shakes.
+    """Whether a state is nothing, and known to be: one of noise alone that no noise shakes.
 
     It does nothing to any reading, and so has no covariance. Such are errors that last of readings that
     have none: with all of them a pass takes more than twice as long.
@@ -59,7 +58,7 @@ def _rests(j, model, assumed):
     Args:
         j: the state. model: a CompiledModel. assumed: Variances.
     """
-    if j < N_FULL:
+    if not model.of_noise[j]:
         return False
     for i in range(assumed.x0.size):
         if assumed.P0[j, i] != 0.0:

@@ -269,6 +269,7 @@ class HeliModel:
     moments: Mapping[str, Moment] = {}  # when effects begin or change; see changing_model.py
     air = np.arange(GUST_FORCE.start, GUST_MOMENT.stop)  # states of the gusts
     exact = np.arange(N_FULL) >= N_STATES
+    of_noise = np.zeros(N_FULL, bool)
     work_size = dynamics.WORK_SIZE
     noise_places = helicopter_noise.NOISE_PLACES
     state_scale = _small_changes()

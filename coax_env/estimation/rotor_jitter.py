@@ -171,6 +171,7 @@ class JitteryModel(HeliModel):
 
     motion = Motion(_step, _measure, _drift_and_readings)
     exact = np.append(HeliModel.exact, [True, True])
+    of_noise = np.append(HeliModel.of_noise, [True, True])
     work_size = _WORK_SIZE
     state_scale = np.append(HeliModel.state_scale, [1e-2, 1e-2])
     noise_places = np.insert(HeliModel.noise_places, N_FULL, [[N_FULL] * 2, [N_FULL + 1] * 2], 0)

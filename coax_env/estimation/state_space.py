@@ -156,8 +156,9 @@ class Model(Protocol):
     Derivatives are taken of `drift_and_readings`: into `out`, (nx + m,), what a row of `dt` seconds
     adds to the state, to first order at least, and the readings at its start. A run's last row has 0.
     A model may have `side_by_side`: pointers to `step`, `measure` and `drift_and_readings` of
-    SIMD_WIDTH states, inputs and parameter vectors at once, a column each, (.., SIMD_WIDTH); and
-    `input_places`: the places in the parameter vector of all that `inputs` follows.
+    SIMD_WIDTH states, inputs and parameter vectors at once, a column each, (.., SIMD_WIDTH);
+    `input_places`: the places in the parameter vector of all that `inputs` follows; and `of_noise`:
+    (nx,) True of states that are nothing, and move nothing, but for the noise that shakes them.
     """
 
     channels: tuple[str, ...]

@@ -51,7 +51,8 @@ class WrappingModel(HeliModel):
         self.motion = _around(self.own, inner.motion, self.states, inner.work_size, inner.kind)
         super().__init__(inner.vehicle, inner.bare_values)
         self.read_delay, self.frequencies, self.air = inner.read_delay, inner.frequencies, inner.air
-        self.exact = np.append(inner.exact, np.ones(self.added_scale.size, bool))
+        added = np.ones(self.added_scale.size, bool)
+        self.exact, self.of_noise = np.append(inner.exact, added), np.append(inner.of_noise, added)
         self.work_size = inner.work_size + self.states + N_CHANNELS
         self.state_scale = np.append(inner.state_scale, self.added_scale)
         places = np.repeat(np.r_[self.added][:, None], 2, axis=1)
