@@ -204,11 +204,12 @@ def _asked(
     Args:
         worth: of those that were weighed beside other causes [nats]; of the others the quadratic says.
     """
-    doubtful = [e for e in fit.active if _is_doubtful(problem, fit, quadratic, e)]
+    by_quadratic = {e: _worth(problem, fit, quadratic, e) for e in fit.active}
+    doubtful = [e for e in fit.active if by_quadratic[e] < problem.settings.clear]
     rest = [e for e in fit.active if e not in doubtful and e not in clear]
     most = WEAK * problem.settings.evidence
-    known = {e: worth[e] if e in worth else _worth(problem, fit, quadratic, e) for e in doubtful}
-    weak, other = ([e for e in doubtful if (known[e] < most) == so] for so in (True, False))
+    weak = [e for e in doubtful if worth.get(e, by_quadratic[e]) < most]
+    other = [e for e in doubtful if e not in weak]
     return [which for which in (weak, other, rest) if which]
 
 
@@ -333,12 +334,6 @@ def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) ->
     # what poses show late colours them, where they are fine enough to show it
     slack = problem.sees_poses_alone and effect not in PURE_DELAYS
     return max(colour, unseen) if slack else colour
-
-
-def _is_doubtful(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:
-    """Whether a cause is not worth several thresholds by the quadratic."""
-    enough = problem.settings.clear
-    return _worth(problem, fit, quadratic, effect) < enough
 
 
 def _worth(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:

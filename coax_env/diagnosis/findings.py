@@ -1,6 +1,5 @@
 """The entries of findings.json: causes, what is unexplained, the verdict."""
 
-import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -167,8 +166,7 @@ def stated_std(
         inflation: variance inflation by coloured innovations.
         dt: seconds per row, for lags and delays.
     """
-    ratio = fit.std_ratio.get(parameter.name, 1.0)
-    return with_timing(parameter, std * math.sqrt(inflation) * ratio, dt)
+    return with_timing(parameter, fit.spread(parameter.name, std, inflation), dt)
 
 
 def _vibration(lines: Sequence[Line]) -> dict[str, Any]:

@@ -339,6 +339,15 @@ class Fit:
         """With some values changed."""
         return replace(self, values={**self.values, **values})
 
+    def spread(self, name: str, std: float, inflation: float) -> float:
+        """Std of a parameter as it is believed.
+
+        Args:
+            name: of the parameter. std: by the signatures.
+            inflation: of its variance, by coloured innovations.
+        """
+        return std * math.sqrt(inflation) * self.std_ratio.get(name, 1.0)
+
     def noted(self, move: str, nats: float) -> "Fit":
         """With a move in its history."""
         return replace(self, history=(*self.history, (move, nats)))

@@ -26,12 +26,15 @@ one-sided gusts, and a clean **synthetic** flight had a false name (`--arms mixe
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import ERROR_LEVELS, ERROR_MEMORIES, error_level
-from coax_env.estimation.lasting_errors import ErringModel, with_errors, without_errors
+from coax_env.estimation.lasting_errors import (
+    ErringModel,
+    reading_std,
+    with_errors,
+    without_errors,
+)
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import are_white, whiteness
 from coax_env.model.layout import (
@@ -135,7 +138,8 @@ def _without_small(problem: Problem, fit: Fit) -> Fit:
     small = [
         group
         for group in ERRING_GROUPS
-        if error_level(group) in fit.levels and _share(fit.noise, group) < SMALL
+        if error_level(group) in fit.levels
+        and fit.noise.level(error_level(group)) < SMALL * reading_std(fit.noise, group)
     ]
     if not small:
         return fit
@@ -146,9 +150,3 @@ def _without_small(problem: Problem, fit: Fit) -> Fit:
         return fit
     levels = tuple(n for n in fit.levels if n in rest.process or n in rest.reading)
     return replace(fit, noise=rest, levels=levels)
-
-
-def _share(noise: Noise, group: str) -> float:
-    """Std of a group's lasting errors over that of its readings' own noise."""
-    read = [noise.reading[channel] for channel in SENSOR_GROUPS[group] if channel in noise.reading]
-    return noise.level(error_level(group)) / float(np.mean(read))

@@ -195,12 +195,13 @@ def _likeliest(
 
     had = others.get(group[0], NONE)
     tried: dict[tuple[int, int], tuple[LowPass, float, Noise]] = {}
-    for order in (1, 2) if had == NONE else (had.order,):
+    orders, places = [1, 2], list(range(len(TIMES)))
+    if had != NONE:
+        orders, places = [had.order], [_nearest(had.time / row)]
+    for order in orders:
         near, levels = had, noise  # a fit begins where the one before it ended
-        for k, time in enumerate(TIMES):
-            if had != NONE and k != _nearest(had.time / row):
-                continue
-            trial = LowPass(time * row, order)
+        for k in places:
+            trial = LowPass(TIMES[k] * row, order)
             nats, levels = fitted_at(trial, scaled(levels, near, trial))
             tried[order, k], near = (trial, nats, levels), trial
     order, k = max(tried, key=lambda place: tried[place][1])

@@ -160,7 +160,7 @@ def moved_far(problem: Problem, fit: Fit, quadratic: Quadratic) -> dict[str, set
 def may_be_none(
     problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, inflation: float
 ) -> bool:
-    """Whether nothing is within KNOWN std of each of an effect's numbers, as stated.
+    """Whether nothing is within KNOWN std of each of an effect's numbers.
 
     By poses alone a `swash_gain` of -0.63 +- 0.50 was worth 58 nats and is not there
     (`tests/blade_element.py`, **synthetic**).
@@ -172,8 +172,7 @@ def may_be_none(
     std = quadratic.std(problem.free_names(fit.active))
     acting = set(problem.acting_names(effect))
     return all(
-        abs(fit.values[f.name] - f.value)
-        < KNOWN * std[f.name] * fit.std_ratio.get(f.name, 1.0) * math.sqrt(inflation)
+        abs(fit.values[f.name] - f.value) < KNOWN * fit.spread(f.name, std[f.name], inflation)
         for f in problem.own[effect]
         if f.name in acting
     )

@@ -121,6 +121,12 @@ def _by_channel(noise: Noise | None, name_of: Any, otherwise: float) -> np.ndarr
     return np.array([levels.get(name_of(GROUP_OF[channel]), otherwise) for channel in ERRING])
 
 
+def reading_std(noise: Noise, group: str) -> float:
+    """Mean std of a group's readings, of which there is one at least."""
+    read = [noise.reading[channel] for channel in SENSOR_GROUPS[group] if channel in noise.reading]
+    return float(np.mean(read))
+
+
 def without_errors(noise: Noise, groups: Collection[str]) -> Noise:
     """Noise levels without those of lasting errors of some groups, whose states are at rest then."""
     gone = {name(group) for group in groups for name in (error_level, error_memory)}
@@ -135,7 +141,7 @@ def with_errors(noise: Noise) -> Noise:
         read = [channel for channel in SENSOR_GROUPS[group] if channel in noise.reading]
         if not read:
             continue
-        std = float(np.mean([noise.reading[channel] for channel in read]))
+        std = reading_std(noise, group)
         level, memory = error_level(group), error_memory(group)
         inertial = group not in MOTION_GROUPS
         lasts = MEMORY_OF_INERTIAL if inertial else MEMORY_START

@@ -11,7 +11,7 @@ the body takes up -Q_motor. Of a jitter w whose share s motors make, this is -(s
 T), where T is the time of that return, a motor's lag; what a faster rotor's torque turns the body by is
 the kernel's. Taken for motors', such jitter made a spin-up reaction of 1.77 +- 0.15 for 1, an inertia
 35 % too large and a yaw damping on a flight of another simulator (`tests/blade_element.py`,
-**synthetic**); 1.24 +- 0.08 since, and neither of these.
+**synthetic**); 1.21 +- 0.08 since, and neither of these.
 
 Two states more than the helicopter's own, in the filter alone, each with an exponential memory. The
 rotors' speeds are the helicopter's plus these, and so no lag of a motor smooths them; the yaw rate is
