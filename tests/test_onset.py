@@ -969,13 +969,16 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, form, inf
     found = changes.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
     of_moment = math.log(100.0 / 2.0)
 
-    def worth(always: float = 900.0, same: float = 160.0, t: float = 9.0) -> float:
+    def onset(always: float = 900.0, same: float = 160.0, t: float = 9.0) -> changes.Onset:
         at = replace(found, moment=Moment("a", t))
         rivals = trials.Rivals(
             replace(state.fit, objective=same),
             None if form == "changes" else replace(trial, objective=always),
         )
-        return trials._worth(state, problem, trial, rivals, quadratic, at).nats  # type: ignore[arg-type]
+        return trials._worth(state, problem, trial, rivals, quadratic, at)  # type: ignore[arg-type]
+
+    def worth(**rivals: float) -> float:
+        return onset(**rivals).nats
 
     expected = 60.0 / inflation - (10.0 if form == "ends" else 5.0) - of_moment
     assert worth() == pytest.approx(expected)
@@ -986,6 +989,8 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, form, inf
     else:
         assert worth(always=tie - 0.1) == -math.inf
         assert worth(always=tie + 0.1) == pytest.approx(expected)
+        assert onset(always=tie + 0.1).beside == pytest.approx(SETTINGS.tie + 0.1 / inflation)
+    assert onset().beside == pytest.approx(expected)
     for key, wrong in (("lasting", 6.0 * inflation - 0.1), ("matters", False), ("white", False)):
         kept, made[key] = made[key], wrong
         assert worth() == -math.inf, key

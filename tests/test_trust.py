@@ -306,8 +306,8 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
     sound = Against(
         channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
-        may_be_none=False, alternatives=(), nats=100.0, shaken=False, poses_alone=False,
-        clock_error=0.0, smoothed=False, errors_left=0.0, beside_terms=(),
+        may_be_none=False, alternatives=(), nats=100.0, of_moment=math.inf, shaken=False,
+        poses_alone=False, clock_error=0.0, smoothed=False, errors_left=0.0, beside_terms=(),
         beside_moved=(),
     )  # fmt: skip
     return replace(sound, **but)
@@ -604,3 +604,10 @@ def test_a_trial_that_diverges_is_refused_and_says_so(monkeypatch):
 def test_little_evidence_leaves_a_doubt_and_more_of_it_is_asked_in_shocks(nats, in_shocks, words):
     found = list(weak(nats, in_shocks, SETTINGS))
     assert bool(found) == bool(words) and all(words in text for text in found)
+
+
+@pytest.mark.parametrize("nats", [21.7, 41.9, 42.0])
+def test_a_moment_worth_little_beside_no_change_leaves_a_doubt(nats):
+    """An axial damping that grows in a forward run: of blade elements, where it is always there."""
+    found = list(doubts("axial_damping", {"axial_damping": known_of(of_moment=nats)}, SETTINGS))
+    assert [f"worth {nats:.0f} nats only" in text for text in found] == [True] * (nats < 42.0)

@@ -200,7 +200,7 @@ def diagnose(
     fit = confounding.beside_alternatives(problem, fit, quadratic, evidence, found)
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)
     report("asking left-out runs, halves and other noise whether the names hold")
-    trust = trusts(problem, fit, quadratic, evidence, found, white["after"])
+    trust = trusts(problem, fit, quadratic, evidence, found, white["after"], onsets)
     causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)

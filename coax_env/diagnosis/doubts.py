@@ -45,7 +45,8 @@ class Against:
         may_be_none: whether nothing is within the 95 % interval of each of its numbers; in that is what
             models that do as well make of them.
         alternatives: effects that would do as well.
-        nats: its evidence. shaken: whether gusts come in single shocks.
+        nats: its evidence. of_moment: what it is worth that it began or changed when it did; endless
+            where it did not. shaken: whether gusts come in single shocks.
         poses_alone: whether neither gyros nor accelerometers were read.
         clock_error: std by which the times of the log's rows are wrong [s].
         smoothed: whether a low-pass of a sensor too fast to be seen would do the same.
@@ -67,6 +68,7 @@ class Against:
     may_be_none: bool
     alternatives: tuple[str, ...]
     nats: float
+    of_moment: float
     shaken: bool
     poses_alone: bool
     clock_error: float
@@ -179,6 +181,9 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
         yield "a low-pass of the accelerometers too fast to be seen does the same"
     if of.nats < of.errors_left:
         yield "readings have errors that last, worth more than it: a sensor that drifts has a bias"
+    if of.of_moment < chosen.sure_evidence:
+        worth = f"that it was not always so is worth {of.of_moment:.0f} nats only"
+        yield f"{worth}: a law of another form may look like a change"
     yield from weak(of.nats, of.shaken, chosen)
 
 

@@ -23,6 +23,7 @@ from coax_env.diagnosis.confounding import (
 from coax_env.diagnosis.doubts import LOUD, Against, doubts, on_parts, sizes, without_name
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.noise_variation import not_holding
+from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import LIKE_DRIFT, Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, of_runs, replications
 from coax_env.diagnosis.sensor_low_pass import may_hide_behind
@@ -88,6 +89,7 @@ def trusts(
     evidence: Mapping[str, Evidence],
     found: Alternatives,
     white: Mapping[str, Whiteness],
+    onsets: Mapping[str, Onset],
 ) -> dict[str, Trust]:
     """Every active effect judged.
 
@@ -97,6 +99,7 @@ def trusts(
         evidence: of each cause.
         found: the confounded alternatives of each cause.
         white: whiteness of the innovations, by channel.
+        onsets: of causes that began or changed.
     """
     worth = {effect: weighed.nats for effect, weighed in evidence.items()}
     replicated = replications(problem, fit, quadratic, worth)
@@ -124,6 +127,7 @@ def trusts(
             may_be_none=may_be_none(problem, fit, quadratic, effect, evidence[effect].inflation),
             alternatives=(*found[effect], *alike_by_poses_alone(problem, effect)),
             nats=worth[effect],
+            of_moment=onsets[effect].beside if effect in onsets else math.inf,
             shaken=shaken,
             poses_alone=problem.sees_poses_alone,
             clock_error=problem.clock_error,

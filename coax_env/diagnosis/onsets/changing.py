@@ -1,5 +1,6 @@
 """A problem in which causes begin or change in flight, and when each does."""
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,6 +28,7 @@ class Onset:
         t, std: mean and std of its posterior in that run [s].
         width: s that this posterior is wide; of what grows, `Growth.width`.
         nats: what it is worth to have the change, its price paid.
+        beside: the same beside the nearest model without one, a cause that was always there among them.
         growth: as what grows, where that was fitted.
         at_once: probability that it came at once, and did not grow.
         grown: when it had its size, and the std of that [s]; None where the model has a step.
@@ -43,6 +45,7 @@ class Onset:
     at_once: float = 1.0
     grown: tuple[Moment, float] | None = None
     run: str = ""
+    beside: float = math.inf
 
     def entry(self) -> dict[str, Any]:
         """findings.json's `since`."""

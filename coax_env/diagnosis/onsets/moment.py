@@ -118,7 +118,7 @@ def moments_of(
                 found[effect] = _as_growth(problem, replace(onset, growth=own))
             else:
                 step = moment_of(problem, fit, effect, inflation)
-                step = replace(step, nats=onset.nats, growth=onset.growth)
+                step = replace(step, nats=onset.nats, beside=onset.beside, growth=onset.growth)
                 found[effect] = _as_step(problem, step, inflation)
     return found
 

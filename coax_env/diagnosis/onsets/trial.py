@@ -217,6 +217,7 @@ def _worth(
         beside_constant -= quadratic.occam(was, alike) if was else 0.0
     without = state.problem.engine.filter(same.values, trial.noise)
     with_it = problem.engine.filter(trial.values, trial.noise)
+    beside = min(nats, beside_constant)
     lasting = _lasting(without, with_it, found.moment) / inflation
     if (
         min(lasting, beside_constant) < problem.settings.tie
@@ -225,7 +226,7 @@ def _worth(
         or _is_coloured(problem, trial, quadratic, effect)
     ):
         nats = -math.inf
-    return replace(found, nats=nats)
+    return replace(found, nats=nats, beside=beside)
 
 
 def _is_coloured(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> bool:
