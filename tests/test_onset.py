@@ -19,7 +19,8 @@ from coax_env.diagnosis.onsets import every_moment, growth, search
 from coax_env.diagnosis.onsets import moment as moments
 from coax_env.diagnosis.onsets import trial as trials
 from coax_env.diagnosis.onsets.changing import Changing
-from coax_env.diagnosis.onsets.every_moment import Table, at_an_end, rows_of
+from coax_env.diagnosis.onsets.ends import at_an_end
+from coax_env.diagnosis.onsets.every_moment import Table, rows_of
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.settings import SETTINGS
@@ -840,9 +841,16 @@ def test_two_times_pay_as_one_that_is_as_rare():
     assert own.at_once() == 0.5 and replace(own, nats=2.0).at_once(2.0) == 1.0 / (1.0 + math.e)
 
 
-def test_growth_is_not_credited_with_what_a_step_would_gain_as_well(short, monkeypatch):
-    """Both are taken until nothing is gained: 15 nats beside a step that had ten to gain are five."""
+@pytest.mark.parametrize(("begins", "nats"), [(None, 5.0), (1.4, 15.0)])
+def test_growth_is_not_credited_with_what_a_step_would_gain_as_well(
+    short, monkeypatch, begins, nats
+):
+    """Both are taken until nothing is gained: 15 nats beside a step that had ten to gain are five. But
+    not where it begins with the flight: it is no change then.
+    """
     problem, found = ambiguous(short, 0.0)
+    problem.engine = SimpleNamespace(records=short[1])
+    own = found.growth if begins is None else replace(found.growth, begins=begins)
     problem.settings, problem.seconds = SETTINGS, 8.0
     gained = {"step": 10.0, "grows": 0.0}
 
@@ -852,17 +860,17 @@ def test_growth_is_not_credited_with_what_a_step_would_gain_as_well(short, monke
     step, grows = (
         Fit((e,), {}, NOISE_OF_ALL, nats) for e, nats in (("step", 100.0), ("grows", 85.0))
     )
-    wider = SimpleNamespace(free=lambda active: [])
+    wider = SimpleNamespace(free=lambda active: [], model=problem.model)
     monkeypatch.setattr(growth, "_starts", lambda *given: [(wider, grows)])
     monkeypatch.setattr(growth, "_about", lambda of, effect, own: of)
     monkeypatch.setattr(growth, "noise_fitted", lambda of, fit: fit)
     monkeypatch.setattr(growth, "fitted", lambda of, fit, steps: fit)
     monkeypatch.setattr(growth, "converged", converged)
     monkeypatch.setattr(growth, "quadratic_at", lambda of, fit, free: (fit, None))
-    monkeypatch.setattr(growth, "growth_at", lambda *given: found.growth)
-    width = found.growth.width(8.0)  # of a step that is known as well, and pays the same price
+    monkeypatch.setattr(growth, "growth_at", lambda *given: own)
+    width = own.width(8.0)  # of a step that is known as well, and pays the same price
     tried = growth.growing(problem, step, "gyro_bias", found.moment, width)
-    assert tried is not None and tried[2].nats == pytest.approx(5.0)
+    assert tried is not None and tried[2].nats == pytest.approx(nats)
 
 
 @pytest.mark.parametrize(("nats", "grows"), [(5.9, False), (6.1, True), (None, False)])
@@ -969,13 +977,12 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, form, inf
     found = changes.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
     of_moment = math.log(100.0 / 2.0)
 
-    def onset(always: float = 900.0, same: float = 160.0, t: float = 9.0) -> changes.Onset:
-        at = replace(found, moment=Moment("a", t))
+    def onset(always: float = 900.0, same: float = 160.0) -> changes.Onset:
         rivals = trials.Rivals(
             replace(state.fit, objective=same),
             None if form == "changes" else replace(trial, objective=always),
         )
-        return trials._worth(state, problem, trial, rivals, quadratic, at)  # type: ignore[arg-type]
+        return trials._worth(state, problem, trial, rivals, quadratic, found)  # type: ignore[arg-type]
 
     def worth(**rivals: float) -> float:
         return onset(**rivals).nats
@@ -997,7 +1004,6 @@ def test_a_change_pays_for_its_numbers_and_for_its_moment(monkeypatch, form, inf
         made[key] = kept
     made["lasting"] = 6.0 * inflation + 0.1
     assert worth() == pytest.approx(expected)
-    assert worth(t=1.4) == -math.inf  # the flight begins
 
 
 @pytest.mark.parametrize(
@@ -1104,15 +1110,17 @@ def test_what_drifts_explain_as_well_is_not_worth_a_fit(monkeypatch, drifts, kep
     [(500.0, True, True), (500.0, False, False), (5.0, True, False)],
 )
 def test_colour_is_asked_of_a_fit_that_has_converged(monkeypatch, gained, coloured, closer):
-    """Its noise may be what is coloured on the way; what gains less than a tie is not asked."""
+    """Its noise may be what is coloured on the way; what gains less than a tie is not asked. What comes
+    as the flight begins is no change.
+    """
     state, problem, trial, quadratic = weighed("begins", 1.0)
     problem.free = lambda active: []
-    found = changes.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0)
+    found, at = changes.Onset("gyro_bias", Moment("a", 9.0), 9.0, 0.5, 2.0, 0.0), [9.0]
     rivals = trials.Rivals(replace(trial, objective=100.0 + gained), None)
     stand_ins = {
         "beginning": lambda *given: problem, "fitted": lambda of, fit, steps=3: trial,
         "noise_fitted": lambda of, fit: fit, "moved_to_best": lambda *given: (problem, found),
-        "grown_or_step": lambda of, fit, found: (of, fit, found),
+        "grown_or_step": lambda of, fit, found: (of, fit, replace(found, moment=Moment("a", at[0]))),
         "_with_noise_of": lambda of, fit, other: fit, "_compared": lambda *given: (trial, rivals),
         "converged": lambda of, fit: replace(fit, objective=90.0),
         "quadratic_at": lambda of, fit, free: (fit, quadratic),
@@ -1130,6 +1138,8 @@ def test_colour_is_asked_of_a_fit_that_has_converged(monkeypatch, gained, colour
     assert after is not None
     ended = 90.0 if closer else 100.0
     assert after.state.fit.objective == ended and after.onset.nats == -ended
+    at[:] = [1.4]
+    assert trials.fitted_change(changing_state, steady, candidate, {}, None) is None  # type: ignore[arg-type]
 
 
 def trial_worth(nats: float, gained: float) -> trials.Trial:

@@ -14,6 +14,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
 from coax_env.diagnosis.onsets.changing import Changing, may_begin
+from coax_env.diagnosis.onsets.ends import MARGIN
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.beginnings import Asked, Beginning
 from coax_env.estimation.changing_model import BEFORE
@@ -27,9 +28,6 @@ SPACING = 0.01
 as thrust does in specific force, shows at its own row and is gone 0.02 s beside it; ours."""
 MOST_MOMENTS = 6000
 """On long flights they are farther apart than that; ours, a bound on time."""
-MARGIN = 1.5
-"""s from the first row of all, and to the last, in which nothing begins: the filter settles in one, and
-what lasts a second cannot be told from a gust; ours."""
 SETTLED = 1.0
 """s of a run after which a change in it can be told from its start; ours."""
 
@@ -119,13 +117,6 @@ def rows_of(records: Sequence[Record]) -> list[np.ndarray]:
             times = times[times < t[-1] - MARGIN]
         found.append(np.unique(np.searchsorted(t, times - 1e-9)).astype(np.int64))
     return found
-
-
-def at_an_end(records: Sequence[Record], moment: Moment) -> bool:
-    """Whether a moment is in the MARGIN from the first row of all, or to the last."""
-    first, last = records[0], records[-1]
-    begins = moment.run == first.whole and moment.t < first.t[0] + MARGIN
-    return begins or (moment.run == last.whole and moment.t > last.t[-1] - MARGIN)
 
 
 def _asked(problem: Problem, fit: Fit, names: Mapping[str, Sequence[str]]) -> Asked:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_at
+from coax_env.diagnosis.onsets.ends import at_an_end
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.changing_model import (
     BEGINS,
@@ -34,7 +35,7 @@ was fitted was 128 worse before and 30 better then."""
 STEPS = (2, 4)
 """Gauss-Newton steps of each start, and more of those that are near the best then; ours."""
 BEHIND = 40.0
-"""nats behind the best that a start may be after its first steps to get more; ours."""
+"""nats behind the best, or the step, that a start may be after its first steps to get more; ours."""
 
 GONE, MOST_POINTS = 4.5, 10
 """nats from the best at which a time has no share in its interval, and points to each side; ours."""
@@ -96,7 +97,7 @@ def growing(
 
     begun = [(wider, fitted(wider, fit, STEPS[0]))
              for wider, fit in _starts(problem, step, effect, moment)]  # fmt: skip
-    least = min((fit.objective for _, fit in begun), default=math.inf)
+    least = min(fit.objective for fit in (step, *(fit for _, fit in begun)))
     near = [(wider, fit) for wider, fit in begun if fit.objective < least + BEHIND]
     tried = [judged(wider, fitted(wider, fit, STEPS[1])) for wider, fit in near]
     tried = [t for t in tried if t[2].grown - t[2].begins > 1.01 * SHORTEST]
@@ -104,7 +105,9 @@ def growing(
         return None
     wider, fit, own = max(tried, key=lambda t: t[2].nats)
     wider = _about(wider, effect, own)
-    if own.nats > -problem.settings.tie:
+    begins = changing_model(wider).moment(own.begins)
+    in_between = not at_an_end(problem.engine.records, begins)  # else it is no change, however likely
+    if own.nats > -problem.settings.tie and in_between:
         step = converged(problem, step)  # or growth is credited with what a step would gain as well
         return judged(wider, converged(wider, fit))
     return wider, fit, own

@@ -9,7 +9,8 @@ import numpy as np
 from coax_env.diagnosis.confounding import channels_of
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_at
 from coax_env.diagnosis.onsets.changing import Changing, Onset, before_names, beginning
-from coax_env.diagnosis.onsets.every_moment import Scored, at_an_end
+from coax_env.diagnosis.onsets.ends import at_an_end
+from coax_env.diagnosis.onsets.every_moment import Scored
 from coax_env.diagnosis.onsets.moment import grown_or_step, moved_to_best
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.changing_model import BEFORE, Lap
@@ -62,8 +63,8 @@ def fitted_change(
 ) -> Trial | None:
     """A change fitted at its best moment, and what it is worth beside the state without it.
 
-    None where the filter diverges with it, where it is out of the best's reach, or where it leaves most
-    of the colour where it shows.
+    None where the filter diverges with it, where it is out of the best's reach, where it leaves most of
+    the colour where it shows, or comes as the flight begins or ends.
 
     It is fitted from the steady noise in which it was seen. What ends has numbers after it too. The
     quadratic is that of what is free.
@@ -92,6 +93,8 @@ def fitted_change(
     if _leaves_colour(state, problem, trial, effect):
         return None
     problem, trial, found = grown_or_step(problem, trial, found)
+    if at_an_end(problem.engine.records, found.moment):
+        return None
     trial = _with_noise_of(problem, trial, state.fit)
     trial, rivals = _compared(state, problem, trial, effect)
     trial, quadratic = quadratic_at(problem, trial, problem.free(trial.active))
@@ -198,8 +201,8 @@ def _worth(
     """An onset with its evidence: beside no change, its numbers and its moment paid for.
 
     Minus infinity where it is within a tie of a cause that was always there, where a gust could have
-    made it, or what a flight begins or ends with, where it is too small to matter, and where the
-    channels that show it stay coloured: a model that is wrong there always finds a moment.
+    made it, where it is too small to matter, and where the channels that show it stay coloured: a model
+    that is wrong there always finds a moment.
     """
     effect, same = found.effect, rivals.same
     was = before_names(problem, effect)
@@ -221,7 +224,6 @@ def _worth(
     lasting = _lasting(without, with_it, found.moment) / inflation
     if (
         min(lasting, beside_constant) < problem.settings.tie
-        or at_an_end(problem.engine.records, found.moment)
         or not _matters(problem, trial, effect)
         or _is_coloured(problem, trial, quadratic, effect)
     ):
