@@ -129,24 +129,27 @@ def test_rotors_stray_where_what_parts_them_from_their_commands_has_a_memory(
 @pytest.mark.parametrize(
     ("white", "gained", "jitters", "begins"),
     [
-        (True, 900.0, False, ("motor_lag",)),
-        (False, 900.0, True, ()),  # at once, and everything is searched for in it
-        (False, 139.0, False, ("motor_lag",)),  # asked after the search, as ever
-        (False, None, False, ("motor_lag",)),
+        ("at once", 900.0, False, ("motor_lag",)),
+        ("beside a drift", 900.0, False, ("motor_lag",)),  # 3,898 nats of jitter that is not there
+        ("never", 900.0, True, ()),  # at once, and everything is searched for in it
+        ("never", 139.0, False, ("motor_lag",)),  # asked after the search, as ever
+        ("never", None, False, ("motor_lag",)),
     ],
 )
 def test_what_moves_the_rotors_comes_first_and_plain_jitter_with_it(
     monkeypatch, white, gained, jitters, begins
 ):
     lag = Fit(("motor_lag",), {}, FINE, objective=1000.0)
+    drifting = replace(lag, noise=FINE.with_levels({"trim_force_z": 0.1}))
     wider: Any = SimpleNamespace(model="wider", report=lambda text: None)
     asked: list[tuple[Any, tuple[str, ...]]] = []
 
     def jitter(problem: Any, fit: Fit, quadratic: object) -> Any:
-        assert fit is lag
+        assert fit is drifting
         return None if gained is None else (wider, replace(fit, objective=1000.0 - gained))
 
     def from_there(problem: Any, bare: Fit, refitted: Fit, begin: Fit) -> Any:
+        assert begin is (lag if white == "at once" else drifting)
         asked.append((problem, begin.active))
         return "found"
 
@@ -162,7 +165,10 @@ def test_what_moves_the_rotors_comes_first_and_plain_jitter_with_it(
     given = {
         "_rotors_stray": lambda problem: True, "_as_given": lambda problem, noise: (bare, bare),
         "added": lambda problem, fit: (lag, None),
-        "_is_coloured": lambda found, channels: not white, "in_jitter": jitter, "_searched": whole,
+        "_is_coloured": lambda found, channels: white == "never" or (
+            white == "beside a drift" and found.fit is lag),
+        "_with_latent_noise": lambda problem, fit: drifting,
+        "in_jitter": jitter, "_searched": whole,
         "_searched_from": from_there, "_with_levels_of_jitter": lambda noise, wider, fit: "begun",
     }  # fmt: skip
     for name, stand_in in given.items():
