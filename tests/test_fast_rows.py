@@ -128,10 +128,13 @@ def test_what_was_done_is_said():
     assert flight.counts == {"rows averaged": 2000 - rows}
 
 
+RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "forward_run", "heading_turn")
+
+
 @pytest.mark.slow
 def test_a_log_of_500_hz_gives_up_what_is_hidden_in_it(tmp_path: Path):
     hidden = {"motor_lag": {"upper": 0.08, "lower": 0.08}, "gyro_bias": {"x": 0.02}}
-    folder = fly(tmp_path, hidden, gusts=True, sensors="fast", seed=5)
+    folder = fly(tmp_path, hidden, gusts=True, sensors="fast", seed=5, runs=RUNS, longest=10.0)
     result = coax_env.diagnose(read_flight(folder))
     assert any("rows taken as" in remark for remark in result.remarks)
     check_causes(result.findings, *truth_of(folder))

@@ -387,14 +387,13 @@ def test_an_onboard_filters_states_are_read_once_a_second():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 4])
-def test_an_onboard_filters_drift_is_no_stabiliser_bars(tmp_path, monkeypatch, seed):
+def test_an_onboard_filters_drift_is_no_stabiliser_bars(tmp_path, monkeypatch):
     """Its gyros drift by a third of their noise and its attitudes, read once a second, cannot look
     coloured: errors that last are asked for all the same, and nothing is named. **Synthetic**."""
     sensors = SENSORS["fused"]._replace(flicker=dict.fromkeys(GYROS, 0.01))
     monkeypatch.setitem(SENSORS, "fused", sensors)
     runs = ("lon_3211", "lat_3211", "low_hover", "heading_turn")
-    injector.fly(tmp_path, {}, gusts=GUSTY, sensors="fused", seed=seed, runs=runs, longest=14.0)
+    injector.fly(tmp_path, {}, gusts=GUSTY, sensors="fused", seed=4, runs=runs, longest=14.0)
     found = diagnose(tmp_path)
     assert found.findings["causes"] == []
     (said,) = [line for line in found.remarks if line.startswith("readings have errors that last")]

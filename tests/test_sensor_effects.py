@@ -111,11 +111,10 @@ def test_the_bodys_own_gyroscopic_moment_misleads_nobody(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [21, 22])
-def test_turned_markers_are_named_or_among_the_alternatives(tmp_path, seed):
+def test_turned_markers_are_named_or_among_the_alternatives(tmp_path):
     """A pose alone hardly tells turned markers from a turned swash plate, and then says so."""
     folder = injector.fly(
-        tmp_path / "f", {"frame_yaw": {}}, sensors="pose", runs=ON_AXES, seed=seed
+        tmp_path / "f", {"frame_yaw": {}}, sensors="pose", runs=ON_AXES, seed=22
     )
     (folder / "truth.json").unlink()
     findings = diagnose(folder, hold_out=[]).findings
