@@ -1,9 +1,11 @@
 """Which effects would do as well in a cause's place: its confounded alternatives, by refits."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import expit
 
 from coax_env.design.discrimination import Alternative, logged_rates
 from coax_env.design.next_maneuver import Design, design
@@ -115,6 +117,68 @@ def beside_alternatives(
         for other in others.values():
             fit = as_far_apart(problem, fit, quadratic, evidence, other, but=effect)
     return fit
+
+
+def undecided(
+    problem: Problem, fit: Fit, quadratic: Quadratic
+) -> dict[str, tuple[float, np.ndarray]]:
+    """What effects that these flights may neither show nor rule out would make of the free numbers.
+
+    Each at its own best fit beside the causes, before any look as likely as not (Bayesian model
+    averaging: Hoeting, Madigan, Raftery and Volinsky 1999, Statistical Science 14). A hub stiffness was
+    worth -0.3 nats beside inertias 17 % off; with it a spin-up reaction of 1.21 +- 0.04 is 0.93, and 1
+    is true (`tests/blade_element.py`, **synthetic**).
+
+    Args:
+        problem, fit: with the causes. quadratic: linearised at the fit, the candidates in it.
+
+    Returns:
+        by effect its probability and the move in the order of `problem.free_names`, (k,); none without
+        a cause.
+    """
+    if not fit.active:
+        return {}
+    free = problem.free_names(fit.active)
+    beside = {e for active in fit.active for e in exclusive_with(active)}.union(fit.active)
+    others = [e for e in problem.candidates if e not in beside and not problem.file_values(e)]
+    at = quadratic.index(free)
+    _, now = quadratic.best(free)
+    found = {}
+    for effect in others:
+        nats = score(problem, quadratic, fit.active, effect).nats
+        _, move = quadratic.best([*free, *problem.acting_names(effect)])
+        found[effect] = (float(expit(nats)), (move - now)[at])
+    return found
+
+
+def of_undecided(problem: Problem, fit: Fit, quadratic: Quadratic) -> np.ndarray:
+    """Covariance (k, k) of the free numbers by effects that are undecided; zero without a cause.
+
+    Args:
+        problem, fit: with the causes. quadratic: linearised at the fit, the candidates in it.
+    """
+    count = len(problem.free_names(fit.active))
+    moves = undecided(problem, fit, quadratic).values()
+    return sum((p * np.outer(move, move) for p, move in moves), np.zeros((count, count)))
+
+
+def beside_undecided(
+    problem: Problem, fit: Fit, quadratic: Quadratic, evidence: Mapping[str, Evidence]
+) -> Fit:
+    """The fit whose std of each number has in it what undecided effects make of it.
+
+    Args:
+        problem, fit: with the causes. quadratic: linearised at the fit, the candidates in it.
+        evidence: of the causes, with the inflation of their variances.
+    """
+    names = problem.free_names(fit.active)
+    apart = np.diag(of_undecided(problem, fit, quadratic))
+    ratios = dict(fit.std_ratio)
+    for (name, std), more in zip(quadratic.std(names).items(), apart, strict=True):
+        known = evidence.get(name.partition(".")[0])
+        variance = std**2 * (known.inflation if known else 1.0)
+        ratios[name] = math.sqrt(ratios.get(name, 1.0) ** 2 + more / variance)
+    return replace(fit, std_ratio=ratios)
 
 
 def _of_one(

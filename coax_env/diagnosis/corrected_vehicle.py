@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from coax_env.diagnosis.confounding import of_undecided
 from coax_env.diagnosis.findings import stated_std
 from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.problem import Fit, Problem
@@ -54,7 +55,7 @@ def corrected_vehicle(
         of_vehicle,
         values,
         {f.name: std(f) for f in of_vehicle},
-        covariance[np.ix_(own, own)],
+        (covariance + of_undecided(problem, fit, quadratic))[np.ix_(own, own)],
         source,
         flight,
     )

@@ -198,6 +198,7 @@ def diagnose(
     onsets = moments_of(problem, fit, quadratic, evidence, state.onsets)
     found = confounding.alternatives(problem, fit, quadratic, evidence, white["after"])
     fit = confounding.beside_alternatives(problem, fit, quadratic, evidence, found)
+    fit = confounding.beside_undecided(problem, fit, quadratic, evidence)
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)
     report("asking left-out runs, halves and other noise whether the names hold")
     trust = trusts(problem, fit, quadratic, evidence, found, white["after"], onsets)

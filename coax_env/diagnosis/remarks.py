@@ -1,11 +1,12 @@
 """What a reader should know beside the findings: white process noise, moved numbers, unseen effects."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.confounding import Alternatives
+from coax_env.diagnosis.confounding import Alternatives, undecided
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.run_air import has_own_air
 from coax_env.diagnosis.settings import Settings
@@ -46,6 +47,7 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
         *_white_noise(problem, fit),
         *_moved_base(problem, fit),
         *_resting_on_unseen(problem, fit, quadratic, found),
+        *_resting_on_undecided(problem, fit, quadratic, found),
     ]
 
 
@@ -253,6 +255,27 @@ def _resting_on_unseen(
                 f" ({f.std:.2g}) cannot be seen here and would move it by {moved[k]:.2g}"
             )
             worst[name] = max(worst.get(name, (0.0, "")), (float(moved[k] / std[k]), text))
+    return [text for _, text in sorted(worst.values(), reverse=True)[: chosen.most_warnings]]
+
+
+def _resting_on_undecided(
+    problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternatives
+) -> list[str]:
+    """Causes' numbers that an effect which these flights neither show nor rule out has elsewhere."""
+    chosen = problem.settings
+    free = problem.free_names(fit.active)
+    std = np.sqrt(np.diag(quadratic.covariance(free)))
+    of_cause = np.array([name.partition(".")[0] in found for name in free], bool)
+    worst: dict[str, tuple[float, str]] = {}
+    for effect, (probability, move) in undecided(problem, fit, quadratic).items():
+        far = math.sqrt(probability) * np.abs(move) / std
+        for k in np.flatnonzero(of_cause & (far > chosen.moved_by_undecided)):
+            name = free[k]
+            text = (
+                f"{name} = {fit.values[name]:.3g} holds without {effect}, which these flights neither"
+                f" show nor rule out: with it {fit.values[name] + move[k]:.3g} fits as well"
+            )
+            worst[name] = max(worst.get(name, (0.0, "")), (float(far[k]), text))
     return [text for _, text in sorted(worst.values(), reverse=True)[: chosen.most_warnings]]
 
 

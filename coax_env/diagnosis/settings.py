@@ -148,6 +148,8 @@ class Settings:
     """Times its floor above which a level of white process noise is reported; ours."""
     moved_by_unseen: float = 5.0
     """std that an effect which these flights cannot show must move a number to be reported; ours."""
+    moved_by_undecided: float = 2.0
+    """std by which one that they neither show nor rule out must move it; ours."""
     most_warnings: int = 3
     """Such remarks; ours."""
 

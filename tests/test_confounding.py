@@ -1,0 +1,90 @@
+"""What effects that are neither shown nor ruled out make of the numbers, against closed forms."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coax_env.diagnosis import remarks
+from coax_env.diagnosis.confounding import beside_undecided, of_undecided, undecided
+from coax_env.diagnosis.evidence import Evidence
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.quadratic import Linearised, Quadratic
+from coax_env.estimation.state_space import FreeParameter, Noise
+from coax_env.model.vehicle_file import load_vehicle
+
+MASS, DAMPING, DRAG, LAG = (
+    "mass", "axial_damping.coefficient", "rotor_drag.coefficient", "servo_lag.time"
+)  # fmt: skip
+STD = {MASS: 0.5, DAMPING: 2.0, DRAG: 3.0}
+COUPLED = np.array([[9.0, 2.0, 3.0], [2.0, 8.0, -4.0], [3.0, -4.0, 6.0]])
+"""Information on mass, a damping in the model and a drag that is not."""
+
+
+def fitted_with(slope: float) -> tuple[Problem, Fit, Quadratic]:
+    """Mass and damping at their best, all priors about where they stand; a slope in the drag."""
+    free = {name: FreeParameter(name, 0.0, std) for name, std in STD.items()}
+    own = {"axial_damping": (free[DAMPING],), "rotor_drag": (free[DRAG],)}
+    model = HeliModel(load_vehicle("lama400d"))
+    problem = Problem(model, None, (free[MASS],), own)  # type: ignore[arg-type]
+    lin = Linearised(
+        tuple(STD), COUPLED[None], np.array([[0.0, 0.0, slope]]), np.zeros((1, 3, 2)), np.zeros((4, 3))
+    )
+    values = dict.fromkeys(STD, 0.0)
+    fit = Fit(("axial_damping",), values, Noise({}))
+    return problem, fit, Quadratic.of(lin, problem.parameters, values)
+
+
+@pytest.mark.parametrize("slope", [0.0, -1.0, -8.0, 5.0])
+def test_an_undecided_effect_is_as_likely_as_its_evidence_and_moves_the_rest_to_its_own_fit(slope):
+    """Least squares of all three numbers, and the evidence by Gaussian integrals, written out."""
+    problem, fit, quadratic = fitted_with(slope)
+    prior = np.diag([STD[name] ** -2 for name in STD])
+    whole, rest = COUPLED + prior, (COUPLED + prior)[:2, :2]
+    best = np.linalg.solve(whole, [0.0, 0.0, -slope])
+    gained = 0.5 * best @ whole @ best
+    nats = gained - 0.5 * math.log(np.linalg.det(whole) / np.linalg.det(rest) * STD[DRAG] ** 2)
+    probability = 1.0 / (1.0 + math.exp(-nats))
+    (found,) = undecided(problem, fit, quadratic).items()
+    assert found[0] == "rotor_drag" and found[1][0] == pytest.approx(probability)
+    np.testing.assert_allclose(found[1][1], best[:2], atol=1e-12)
+    np.testing.assert_allclose(
+        of_undecided(problem, fit, quadratic), probability * np.outer(best[:2], best[:2]), atol=1e-12
+    )
+    inflation = {"axial_damping": Evidence(50.0, 4.0)}
+    begun = replace(fit, std_ratio={DAMPING: 1.5})
+    ratios = beside_undecided(problem, begun, quadratic, inflation).std_ratio
+    variance = np.diag(np.linalg.inv(rest))
+    assert ratios[MASS] == pytest.approx(math.hypot(1.0, best[0] * (probability / variance[0]) ** 0.5))
+    moved = best[1] * (probability / variance[1]) ** 0.5 / 2.0  # colour doubles the std
+    assert ratios[DAMPING] == pytest.approx(math.hypot(1.5, moved))
+
+
+def test_nothing_is_averaged_over_without_a_cause_nor_what_no_model_has_beside_it():
+    problem, fit, quadratic = fitted_with(-8.0)
+    none = replace(fit, active=())
+    assert undecided(problem, none, quadratic) == {}
+    np.testing.assert_array_equal(of_undecided(problem, none, quadratic), np.zeros((1, 1)))
+    delay = FreeParameter("servo_delay.time", 0.0, 0.02)
+    lag = FreeParameter(LAG, 0.0, 0.04)
+    servo = replace(problem, own={"servo_lag": (lag,), "servo_delay": (delay,)})
+    there: Any = SimpleNamespace(index=lambda names: [0], best=lambda names: (0.0, np.zeros(1)))
+    assert undecided(servo, replace(fit, active=("servo_lag",)), there) == {}
+
+
+def test_what_an_undecided_effect_would_make_of_a_number_is_said():
+    """A drag as likely as not, with which the damping is 0.4 of what it is without."""
+    problem, fit, quadratic = fitted_with(-8.0)
+    fit = fit.at({DAMPING: 10.0})
+    (probability, move) = undecided(problem, fit, quadratic)["rotor_drag"]
+    far = math.sqrt(probability) * abs(move[1]) / quadratic.std([MASS, DAMPING])[DAMPING]
+    assert far > problem.settings.moved_by_undecided
+    (said,) = remarks._resting_on_undecided(problem, fit, quadratic, {"axial_damping": {}})
+    assert said.startswith(f"{DAMPING} = 10 holds without rotor_drag")
+    assert said.endswith(f"with it {10.0 + move[1]:.3g} fits as well")
+    problem, fit, quadratic = fitted_with(-0.1)
+    assert remarks._resting_on_undecided(problem, fit, quadratic, {"axial_damping": {}}) == []
