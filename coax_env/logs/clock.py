@@ -28,7 +28,7 @@ from coax_env.model.layout import ANGLES, MOTION
 WRONG = 0.1
 """Slope, and its std, up to which times are wrong; ours. Smoothed poses have 0.15 to 0.45; times that
 are right are ten such std away. (With two std within it 0.00 +- 0.07 was not believed. A low-pass does
-not come back from times that are 2.4 ms off: a ground effect of 798 nats had no name; **synthetic**.)"""
+not come back from times 2.4 ms off: a ground effect of 798 nats had no name; **synthetic**.)"""
 UNEVEN = 0.02
 """Share of the usual step by which times scatter where there is anything to mend; ours."""
 LARGEST = 0.3
