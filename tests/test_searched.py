@@ -167,7 +167,7 @@ def test_what_moves_the_rotors_comes_first_and_plain_jitter_with_it(
         "added": lambda problem, fit: (lag, None),
         "_is_coloured": lambda found, channels: white == "never" or (
             white == "beside a drift" and found.fit is lag),
-        "_with_latent_noise": lambda problem, fit: drifting,
+        "_in_noise_anew": lambda problem, fit, noise: drifting,
         "in_jitter": jitter, "_searched": whole,
         "_searched_from": from_there, "_with_levels_of_jitter": lambda noise, wider, fit: "begun",
     }  # fmt: skip

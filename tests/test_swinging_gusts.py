@@ -218,7 +218,7 @@ def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, peak, alone, 
     monkeypatch.setattr(asking, "noise_fitted", gained)
     monkeypatch.setattr(asking, "with_latent_noise", lambda problem, fit: None)
     monkeypatch.setattr(asking, "_swinging", lambda problem, frequencies: problem)
-    monkeypatch.setattr(asking, "_likeliest", lambda part, trial, found, axes: (found, trial))
+    monkeypatch.setattr(asking, "_likeliest", lambda part, trial, found, *how: (found, trial))
     monkeypatch.setattr(asking, "evenly_picked", lambda records, seconds: records)
     problem = SimpleNamespace(
         engine=SimpleNamespace(filter=lambda values, noise: [], records=[]), row=0.01,
@@ -260,7 +260,7 @@ def test_one_group_swings_alone(monkeypatch, axes, alone):
     monkeypatch.setattr(
         asking,
         "_likeliest",
-        lambda part, trial, found, of: asked.append((found, of)) or (found, trial),
+        lambda part, trial, found, of, reach: asked.append((found, of)) or (found, trial),
     )
     frequencies = [0.8, 0.9, 0.0, 0.0, 0.0, 0.5]
     assert asking._gained_by(problem, Fit((), {}, NOISE), frequencies, axes) == 13.0

@@ -41,13 +41,22 @@ def start(problem: Problem, noise: Noise, held: Collection[str] = ()) -> Fit:
     values = dict(problem.model.bare_values)
     for f in problem.parameters:
         values.setdefault(f.name, f.value)
+    return in_noise_from(problem, Fit((), values, noise), noise, held)
+
+
+def in_noise_from(problem: Problem, fit: Fit, noise: Noise, held: Collection[str] = ()) -> Fit:
+    """The fit with noise levels from a first guess, white noise and drifts among them where asked for.
+
+    Args:
+        problem, fit: whose values stay. noise: levels to start from. held: those that stay.
+    """
     chosen = problem.settings
     levels = tuple(name for name in fitted_levels(noise) if name not in held)
     noise = fit_noise(
-        problem.engine, values, noise, levels,
+        problem.engine, fit.values, noise, levels,
         chosen.first_noise_evaluations, chosen.step_gain, problem.noise_fit_seconds,
     )  # fmt: skip
-    fit = Fit((), values, noise, levels=levels)
+    fit = replace(fit, noise=noise, levels=levels)
     return with_latent_noise(problem, fit) or fit
 
 

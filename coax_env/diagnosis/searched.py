@@ -48,11 +48,11 @@ from coax_env.diagnosis.clock_errors import with_clock_errors
 from coax_env.diagnosis.doubts import has_limit, sizes
 from coax_env.diagnosis.fits import (
     fitted,
+    in_noise_from,
     is_much_coloured,
     noise_fitted,
     start,
     steadied,
-    with_latent_noise,
 )
 from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.changing import Changing
@@ -408,7 +408,7 @@ def _rotors_first(problem: Problem, noise: Noise) -> tuple[Searched, Noise] | No
     rotors, quadratic = added(problem.of_candidates(OF_ROTORS), refitted)
     found = Searched(problem, bare, refitted, rotors, quadratic)
     if _is_coloured(found, ROTOR_SPEEDS):
-        rotors = _with_latent_noise(problem, rotors)
+        rotors = _in_noise_anew(problem, rotors, noise)
         found = replace(found, fit=rotors)
     coloured = _is_coloured(found, ROTOR_SPEEDS)
     jittery = in_jitter(problem, rotors, quadratic) if coloured else None
@@ -419,14 +419,19 @@ def _rotors_first(problem: Problem, noise: Noise) -> tuple[Searched, Noise] | No
     return _searched(jittery[0], begun), begun
 
 
-def _with_latent_noise(problem: Problem, fit: Fit) -> Fit:
-    """With white noise and drifts of trim, where these are asked for; refitted then.
+def _in_noise_anew(problem: Problem, fit: Fit, noise: Noise) -> Fit:
+    """The fit with noise levels from the first guess, where that ends likelier.
 
-    Else jitter stands for them: beside a motor's lag of another form it seemed to be worth 3,898 nats,
-    where rotor speeds are white with a drift of the thrust (**synthetic**).
+    They were fitted beside rotors that do not lag. Jitter stands for what they lack: beside a motor's
+    lag of another form it seemed to be worth 3,898 nats, on a longer flight 77,839, where rotor speeds
+    are white with a drift of the thrust (**synthetic**).
+
+    Args:
+        problem, fit: with what moves the rotors. noise: the first guess.
     """
-    wider = with_latent_noise(problem, fit)
-    return fitted(problem, noise_fitted(problem, fitted(problem, wider))) if wider else fit
+    other = fitted(problem, in_noise_from(problem, fit, noise))
+    other = fitted(problem, noise_fitted(problem, other))
+    return other if other.objective < fit.objective else fit
 
 
 def _rotors_stray(problem: Problem) -> bool:

@@ -30,6 +30,8 @@ TURNS = 3
 """Of frequencies, noise levels and numbers, at most; ours."""
 EVALUATIONS = 60
 """Likelihoods of a group's frequencies, memory and level, at most; ours."""
+REACH = (0.3, 0.1)
+"""Of their logarithms, by which they are moved first in the first turn, and in later ones; ours."""
 SWUNG = 1.0
 """Swings that a memory lasts, where its fit begins: a sixth of critical damping; ours."""
 FAR = 1.7
@@ -83,7 +85,7 @@ def _fitted_from(
         last = trial.objective
         part = best.with_records(evenly_picked(best.engine.records, best.noise_fit_seconds))
         for axes in AXES:
-            frequencies, trial = _likeliest(part, trial, frequencies, axes)
+            frequencies, trial = _likeliest(part, trial, frequencies, axes, REACH[turn > 0])
         best = _swinging(problem, frequencies)
     trial = noise_fitted(best, trial)
     trial = fitted(best, with_latent_noise(best, trial) or trial)
@@ -105,7 +107,7 @@ def _gained_by(problem: Problem, fit: Fit, frequencies: Sequence[float], axes: s
     part = problem.with_records(evenly_picked(problem.engine.records, problem.noise_fit_seconds))
     alone = [f if of == axes else 0.0 for f, of in zip(frequencies, GUST_AXES, strict=True)]
     begun = replace(fit, noise=_lasting(fit.noise, alone))
-    found, trial = _likeliest(part, begun, alone, axes)
+    found, trial = _likeliest(part, begun, alone, axes, REACH[0])
     gained = _swinging(part, found).engine.log_likelihood(trial.values, trial.noise)
     return gained - part.engine.log_likelihood(fit.values, fit.noise)
 
@@ -124,12 +126,13 @@ def _lasting(noise: Noise, frequencies: Sequence[float]) -> Noise:
 
 
 def _likeliest(
-    problem: Problem, fit: Fit, frequencies: Sequence[float], axes: str
+    problem: Problem, fit: Fit, frequencies: Sequence[float], axes: str, reach: float
 ) -> tuple[list[float], Fit]:
     """Frequencies [Hz], memory and level of one group of axes, by the likelihood itself.
 
     Args:
         problem, fit: with the frequencies. axes: one of AXES.
+        reach: by which logarithms are moved first.
     """
     swinging = [i for i, f in enumerate(frequencies) if f > 0.0 and GUST_AXES[i] == axes]
     if not swinging:
@@ -156,7 +159,7 @@ def _likeliest(
         bounds=bounds,
         options={
             "maxfev": EVALUATIONS, "fatol": 1.0, "xatol": 0.03,
-            "initial_simplex": start + np.vstack([np.zeros(len(start)), 0.3 * np.eye(len(start))]),
+            "initial_simplex": start + reach * np.vstack([np.zeros(len(start)), np.eye(len(start))]),
         },
     )  # fmt: skip
     found, noise = at(least.x)
