@@ -25,10 +25,10 @@ from coax_env.logs.repairs import Repaired
 from coax_env.logs.smoothed import are_steep
 from coax_env.model.layout import ANGLES, MOTION
 
-WRONG = 0.1
+WRONG, UNSURE = 0.1, 0.15
 """Slope, and its std, up to which times are wrong; ours. Smoothed poses have 0.15 to 0.45; times that
-are right are ten such std away. (With two std within it 0.00 +- 0.07 was not believed. A low-pass does
-not come back from times 2.4 ms off: a ground effect of 798 nats had no name; **synthetic**.)"""
+are right are six such std away. (With two std within WRONG 0.00 +- 0.07 was not believed. A low-pass
+does not come back from times 2.4 ms off: a ground effect of 798 nats had no name; **synthetic**.)"""
 UNEVEN = 0.02
 """Share of the usual step by which times scatter where there is anything to mend; ours."""
 LARGEST = 0.3
@@ -54,7 +54,7 @@ def on_even_clock(runs: Sequence[Repaired], counts: Counter[str]) -> list[Repair
         runs: of one flight. counts: what was repaired -> how often; rows with other times are added.
     """
     slope, std = slope_of(runs)
-    if not max(slope, std) < WRONG or are_steep(runs):
+    if not (slope < WRONG and std < UNSURE) or are_steep(runs):
         return list(runs)
     found = [replace(run, t=even_times(run.t)) for run in runs]
     others = sum(np.count_nonzero(a.t != b.t) for a, b in zip(found, runs, strict=True))
