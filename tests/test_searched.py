@@ -180,6 +180,22 @@ def test_what_moves_the_rotors_comes_first_and_plain_jitter_with_it(
     assert searched._rotors_first(problem, FINE) is None
 
 
+@pytest.mark.parametrize("nats", [999.0, 1001.0])
+def test_noise_from_the_first_guess_stands_where_that_is_likelier(monkeypatch, nats):
+    """What was fitted beside rotors that do not lag may have no way back."""
+    lag = Fit(("motor_lag",), {}, FINE.with_levels({"white_force_z": 9.0}), objective=1000.0)
+
+    def from_guess(problem: Any, fit: Fit, noise: Noise) -> Fit:
+        assert fit is lag and noise is FINE
+        return replace(fit, noise=noise)
+
+    monkeypatch.setattr(searched, "in_noise_from", from_guess)
+    monkeypatch.setattr(searched, "noise_fitted", lambda problem, fit: fit)
+    monkeypatch.setattr(searched, "fitted", lambda problem, fit: replace(fit, objective=nats))
+    found = searched._in_noise_anew(None, lag, FINE)  # type: ignore[arg-type]
+    assert found.noise is (FINE if nats < 1000.0 else lag.noise)
+
+
 def believes_its_sensors(monkeypatch) -> None:
     """No errors that last, times that are right, white rotor speeds, gusts that push or turn."""
     monkeypatch.setattr(searched, "lasting_errors", lambda problem, fit, noise: None)
