@@ -151,7 +151,7 @@ def test_the_study(tmp_path, monkeypatch):
 
     def is_killed() -> bool:
         """Sooner at first: beside other work what is usual may be far too long."""
-        seconds = rng.uniform(0.05, 0.4) * usual * min(0.2 * (1 + kills), 1 + kills / 5)
+        seconds = rng.uniform(0.05, 0.4) * usual * 0.2 * (1 + kills)
         return killed(partial(study, tmp_path / "killed"), seconds)
 
     while is_killed():

@@ -1,6 +1,5 @@
 """Which effects would do as well in a cause's place: its confounded alternatives, by refits."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -9,7 +8,7 @@ from scipy.special import expit
 
 from coax_env.design.discrimination import Alternative, logged_rates
 from coax_env.design.next_maneuver import Design, design
-from coax_env.diagnosis.evidence import Evidence, as_far_apart
+from coax_env.diagnosis.evidence import Evidence, as_far_apart, less_sure
 from coax_env.diagnosis.fits import converged, fitted
 from coax_env.diagnosis.problem import SERVO_FORMS, Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import score, swap
@@ -171,14 +170,10 @@ def beside_undecided(
         problem, fit: with the causes. quadratic: linearised at the fit, the candidates in it.
         evidence: of the causes, with the inflation of their variances.
     """
+    spread = np.sqrt(np.diag(of_undecided(problem, fit, quadratic)))
     names = problem.free_names(fit.active)
-    apart = np.diag(of_undecided(problem, fit, quadratic))
-    ratios = dict(fit.std_ratio)
-    for (name, std), more in zip(quadratic.std(names).items(), apart, strict=True):
-        known = evidence.get(name.partition(".")[0])
-        variance = std**2 * (known.inflation if known else 1.0)
-        ratios[name] = math.sqrt(ratios.get(name, 1.0) ** 2 + more / variance)
-    return replace(fit, std_ratio=ratios)
+    apart = dict(zip(names, spread.tolist(), strict=True))
+    return less_sure(problem, fit, quadratic, evidence, apart)
 
 
 def _of_one(

@@ -277,16 +277,34 @@ def as_far_apart(
         evidence: of the causes, with the inflation of their variances. other: of the same numbers.
         but: a cause whose numbers stay as they are.
     """
-    names = problem.free_names(fit.active)
+    apart = {
+        name: other.values[name] - fit.values[name]
+        for name in problem.free_names(fit.active)
+        if name.partition(".")[0] != but
+    }
+    return less_sure(problem, fit, quadratic, evidence, apart)
+
+
+def less_sure(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    evidence: Mapping[str, Evidence],
+    apart: Mapping[str, float],
+) -> Fit:
+    """The fit whose std of some numbers has in it how far they may be from where they are.
+
+    Args:
+        problem, fit: with the causes. quadratic: linearised at the fit.
+        evidence: of the causes, with the inflation of their variances.
+        apart: number -> how far, in its unit.
+    """
+    std = quadratic.std(problem.free_names(fit.active))
     ratios = dict(fit.std_ratio)
-    for name, std in quadratic.std(names).items():
-        effect = name.partition(".")[0]
-        if effect == but:
-            continue
-        known = evidence.get(effect)
-        stated = std * math.sqrt(known.inflation if known else 1.0)
-        apart = (other.values[name] - fit.values[name]) / stated
-        ratios[name] = math.hypot(ratios.get(name, 1.0), apart)
+    for name, far in apart.items():
+        known = evidence.get(name.partition(".")[0])
+        stated = std[name] * math.sqrt(known.inflation if known else 1.0)
+        ratios[name] = math.hypot(ratios.get(name, 1.0), far / stated)
     return replace(fit, std_ratio=ratios)
 
 

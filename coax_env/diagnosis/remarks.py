@@ -255,7 +255,7 @@ def _resting_on_unseen(
                 f" ({f.std:.2g}) cannot be seen here and would move it by {moved[k]:.2g}"
             )
             worst[name] = max(worst.get(name, (0.0, "")), (float(moved[k] / std[k]), text))
-    return [text for _, text in sorted(worst.values(), reverse=True)[: chosen.most_warnings]]
+    return _of_the_worst(worst, chosen)
 
 
 def _resting_on_undecided(
@@ -276,6 +276,11 @@ def _resting_on_undecided(
                 f" show nor rule out: with it {fit.values[name] + move[k]:.3g} fits as well"
             )
             worst[name] = max(worst.get(name, (0.0, "")), (float(far[k]), text))
+    return _of_the_worst(worst, chosen)
+
+
+def _of_the_worst(worst: Mapping[str, tuple[float, str]], chosen: Settings) -> list[str]:
+    """What is said of the numbers that would move farthest: number -> std by which, and the text."""
     return [text for _, text in sorted(worst.values(), reverse=True)[: chosen.most_warnings]]
 
 
