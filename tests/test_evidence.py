@@ -6,6 +6,7 @@ what its noise levels have not converged by.
 Two clean flights of the study had names that stood by one of the two likelihoods alone.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType, SimpleNamespace
@@ -326,8 +327,11 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "refined", lambda problem, fit: fit)
     monkeypatch.setattr(evidence, "quadratic_at", lambda problem, fit: (fit, nothing))
     apart: list[bool] = []
+    monkeypatch.setattr(evidence, "fitted", lambda problem, fit: fit)
     monkeypatch.setattr(
-        evidence, "as_far_apart", lambda problem, fit, *rest: apart.append(problem.gains) or fit
+        evidence,
+        "beside_unseen_answers",
+        lambda problem, fit, *rest: apart.append(problem.gains) or fit,
     )
     monkeypatch.setattr(evidence, "_worth", lambda problem, fit, quadratic, effect: THRESHOLD)
     monkeypatch.setattr(evidence, "threshold", lambda problem, quadratic, active: THRESHOLD)
@@ -335,7 +339,7 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     problem, fit, _, found = weighed(tables, Fit(active, {}, Noise({})))
     assert problem.gains == (tables.worth_it and tables.white and tables.feels)
     assert set(found) == set(fit.active)
-    assert apart == ([False] if tables.worth_it and not tables.feels and fit.active else [])
+    assert apart == ([False] if tables.worth_it and not tables.feels else [])
     return fit.active
 
 
@@ -353,6 +357,29 @@ def test_a_number_is_as_unsure_as_the_commands_would_have_it_elsewhere():
     assert found.values == values
     kept = evidence.as_far_apart(problem, fit, quadratic, {}, other, but="wind")
     assert kept.std_ratio == pytest.approx({"mass": 1.25, "wind.east": 0.75})
+
+
+def test_a_number_is_as_unsure_as_commands_that_answer_unseen_gusts_may_have_it():
+    """Three times the variance of an inertia, and what it carries along: of a number with correlation
+    0.6 to it 1 + 2 x 0.6^2 times, of one without none, beside how far the other fit has it (here 0 and
+    one std)."""
+    names = ["inertia_zz", "spin_up_reaction.gain", "mass"]
+    std, tie = np.array([2.0, 0.5, 3.0]), 0.6
+    covariance = np.outer(std, std) * np.array([[1.0, tie, 0.0], [tie, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    problem: Any = SimpleNamespace(
+        free_names=lambda active: names, settings=SimpleNamespace(unseen_inflation=3.0)
+    )
+    quadratic: Any = SimpleNamespace(
+        std=lambda of: dict(zip(names, std.tolist(), strict=True)),
+        covariance=lambda of: covariance,
+    )
+    fit = Fit(("spin_up_reaction",), dict.fromkeys(names, 1.0), Noise({}))
+    found = evidence.beside_unseen_answers(
+        problem, fit, quadratic, {}, fit.at({"mass": 1.0 + std[2]})
+    )
+    assert found.std_ratio == pytest.approx(
+        {"inertia_zz": math.sqrt(3.0), "spin_up_reaction.gain": math.sqrt(1.72), "mass": math.sqrt(2.0)}
+    )
 
 
 def of(**nats: float) -> dict[frozenset[str], dict[str, float]]:

@@ -69,6 +69,9 @@ answers gusts between the rows of a log, which holds each command until the next
 better than the filter does, as by poses alone: of 30 clean **synthetic** flights (`--arms mixed_poses`,
 seed 503) three at 60 Hz had a motor lag, yaw damping or yaw inertia of 34 to 60 nats."""
 
+OWN_WEAK_OR_LATE = frozenset({"inertia_xx", "inertia_yy", "inertia_zz", "flap_time_constant"})
+"""The vehicle's own numbers by which it does."""
+
 LIKE_DRIFT = frozenset({
     "gyro_bias", "accel_bias", "attitude_bias", "accel_scale", "imu_tilt", "magnetic_field",
 })  # fmt: skip
