@@ -285,8 +285,8 @@ def beside_unseen_answers(
 
     How far their gains move it; and what comes of the vehicle's own numbers that make it weak or late,
     whose variance is as many times larger than it seems as such an effect's worth is smaller
-    (`Settings.unseen_inflation`). On 28 **synthetic** flights by poses alone, fresh, that know their
-    causes, errors over std were 1.6, 1.7, 2.3 and 3.0 (root mean square: inertias about x, y and z, time
+    (`Settings.unseen_inflation`). On 28 **synthetic** flights by poses alone, fresh, with the causes
+    given, errors over std were 1.6, 1.7, 2.3 and 3.0 (root mean square: inertias about x, y and z, time
     constant of the flaps); with the first 1.4, 1.4, 1.5 and 1.5, with both 0.9, 0.9, 1.0 and 1.3.
 
     Args:
