@@ -378,7 +378,11 @@ def test_a_number_is_as_unsure_as_commands_that_answer_unseen_gusts_may_have_it(
         problem, fit, quadratic, {}, fit.at({"mass": 1.0 + std[2]})
     )
     assert found.std_ratio == pytest.approx(
-        {"inertia_zz": math.sqrt(3.0), "spin_up_reaction.gain": math.sqrt(1.72), "mass": math.sqrt(2.0)}
+        {
+            "inertia_zz": math.sqrt(3.0),
+            "spin_up_reaction.gain": math.sqrt(1.72),
+            "mass": math.sqrt(2.0),
+        }
     )
 
 

@@ -300,7 +300,9 @@ def beside_unseen_answers(
     across = covariance[:, slack]
     share = np.einsum("ij,ij->i", across, np.linalg.solve(across[slack], across.T).T)
     more = np.sqrt((problem.settings.unseen_inflation - 1.0) * np.maximum(share, 0.0))
-    return less_sure(problem, fit, quadratic, evidence, dict(zip(names, more.tolist(), strict=True)))
+    return less_sure(
+        problem, fit, quadratic, evidence, dict(zip(names, more.tolist(), strict=True))
+    )
 
 
 def as_far_apart(
