@@ -709,6 +709,21 @@ def test_when_a_cause_came_is_said_in_words(at_once, grown, words):
     assert ("grown at 1.30 +- 0.3 s of circles" in line) == (grown is not None)
 
 
+def test_what_a_number_rests_on_is_said_beside_its_cause():
+    remarks = (
+        "cg_offset.x = 0.05 holds without wind, which these flights neither show nor rule out: "
+        "with it 0.03 fits as well",
+        "wind is not asked",
+    )
+    cause = finding("cg_offset", x=0.05, y=0.0) | {
+        "channels": [], "trust": "sure", "robust": {"noise": True, "runs": 1.0, "kept": 1.0},
+    }  # fmt: skip
+    sections = causes.cause_sections({"causes": [cause]}, LAMA, LAMA, remarks)
+    said = "".join(str(block) for section in sections for block in section.blocks)
+    assert "with it 0.03 fits as well." in said
+    assert "wind is not asked" not in said
+
+
 def test_a_cause_s_interval_knows_its_correlation():
     """Two numbers that move together leave their difference well known."""
     cause = finding("ground_effect", gain=0.5, decay=2.0)

@@ -1,7 +1,7 @@
 """The causes on a page: each with its size in words, interval, evidence and alternatives."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from coax_env.model import effects
@@ -36,13 +36,16 @@ from coax_env.report.page import (
 Findings = Mapping[str, Any]
 
 
-def cause_sections(findings: Findings, bare: Vehicle, corrected: Vehicle) -> list[Section]:
+def cause_sections(
+    findings: Findings, bare: Vehicle, corrected: Vehicle, remarks: Sequence[str] = ()
+) -> list[Section]:
     """Every cause in words, sure and doubtful ones apart, strongest first, and all its numbers.
 
     Args:
         findings: as in findings.json.
         bare: the vehicle as given.
         corrected: the vehicle with the causes in it.
+        remarks: of the diagnosis; what begins with a cause's number is said beside the cause.
     """
     causes = findings["causes"]
     if not causes:
@@ -61,7 +64,10 @@ def cause_sections(findings: Findings, bare: Vehicle, corrected: Vehicle) -> lis
     ]
     shown = {t: [(k, c) for k, c in enumerate(causes) if c["trust"] == t] for t in TRUST}
     sections = [
-        Section(heading, [prose(words), cards(_card(k, c, bare, corrected) for k, c in shown[t])])
+        Section(
+            heading,
+            [prose(words), cards(_card(k, c, bare, corrected, remarks) for k, c in shown[t])],
+        )
         for t, (heading, words) in TRUST.items()
         if shown[t]
     ]
@@ -101,7 +107,13 @@ def _robust_row(cause: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicle) -> str:
+def _card(
+    index: int,
+    cause: Mapping[str, Any],
+    bare: Vehicle,
+    corrected: Vehicle,
+    remarks: Sequence[str],
+) -> str:
     effect, doubts = cause["effect"], cause["doubts"]
     lines = [f"**{capital(since(cause))}.** {_was(cause)}"] if cause.get("since") else []
     lines += [f"**{capital(doubt)}.**" for doubt in doubts] or [
@@ -109,6 +121,7 @@ def _card(index: int, cause: Mapping[str, Any], bare: Vehicle, corrected: Vehicl
     ]
     if cause["channels"]:
         lines.append(f"Seen in {and_list([channel_name(c) for c in cause['channels']])}.")
+    lines += [f"{remark}." for remark in remarks if remark.startswith(f"{effect}.")]
     evidence = cause["evidence"]
     nats = datum(f"{number(evidence)} nats", f"causes/{index}/evidence", evidence)
     return card(

@@ -51,7 +51,7 @@ def diagnosis_page(
     sections = [
         Section("The flights", _flights(result)),
         Section("Where the bare model is wrong", error_blocks(result)),
-        *cause_sections(findings, bare, corrected),
+        *cause_sections(findings, bare, corrected, result.remarks),
         Section("Confounded alternatives", confounding_blocks(findings)),
         Section("What the corrected model gains", gain_blocks(findings)),
         Section("Still unexplained", _unexplained(findings, bare)),
