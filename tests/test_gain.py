@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coax_env.diagnosis.gain import BLOCK, gain_of
+from coax_env.diagnosis.gain import BLOCK, flies_worse, gain_of
 from coax_env.estimation.prediction import ChannelReplay, RunReplay
 
 NOISE = {"h": 0.3, "q": 0.05, "psi": 0.01}
@@ -62,6 +62,15 @@ def test_the_share_removed_is_the_contracts():
 def test_a_worse_model_removes_less_than_nothing():
     found = gain(run({"h": 0.5}), run({"h": 0.5}), run({"h": math.hypot(0.3, 0.8)}))
     assert found["error_removed_percent"] == pytest.approx(-100.0)
+
+
+@pytest.mark.parametrize(
+    ("interval", "worse"),
+    [([-40.0, -2.0], True), ([-40.0, 2.0], False), ([2.0, 40.0], False), ([None, None], False)],
+)
+def test_it_flies_worse_where_chance_does_not_do_that(interval, worse):
+    assert flies_worse({"ci95": interval}) == worse
+    assert not flies_worse(None)
 
 
 def test_below_the_noise_nothing_is_left_and_no_error_is_no_channel():

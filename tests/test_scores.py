@@ -17,7 +17,7 @@ from coax_env import load_vehicle
 from coax_env.diagnosis import confounding, remarks
 from coax_env.diagnosis.confounding import channels_of
 from coax_env.diagnosis.evidence import Evidence
-from coax_env.diagnosis.findings import FLIES_WORSE, doubted_by_held_out, mixtures_as_one
+from coax_env.diagnosis.findings import mixtures_as_one
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import (
     exchanges,
@@ -456,32 +456,3 @@ def test_an_unseen_effect_is_said_where_it_would_move_a_cause_by_many_std():
     assert texts(0.001) == []
     assert texts(100.0, 0.1 * tie) == [], "moved by four std, and five are needed"
     assert len(texts(100.0, 0.14 * tie)) == 1
-
-
-@pytest.mark.parametrize(
-    ("interval", "since", "doubted"),
-    [
-        ([-40.0, -2.0], None, True),
-        ([-40.0, 2.0], None, False),  # chance may do that
-        ([None, None], None, False),
-        ([-40.0, -2.0], {"run": "a"}, False),  # those runs may have been flown before it
-    ],
-)
-def test_nothing_is_sure_where_the_corrected_model_flies_worse(interval, since, doubted):
-    """But a vibration, which is found by its line and not by a model that flies."""
-    causes: list[dict[str, Any]] = [
-        {"effect": name, "evidence": nats, "trust": "sure", "doubts": [], "since": None}
-        for name, nats in (("wind", 90.0), ("vibration", 50.0), ("drag", 20.0))
-    ]
-    causes[2]["since"] = since
-    found = doubted_by_held_out(causes, {"ci95": interval})
-    shown = [(c["effect"], c["trust"], c["doubts"]) for c in found]
-    if doubted:
-        assert shown == [
-            ("vibration", "sure", []),
-            ("wind", "doubtful", [FLIES_WORSE]),
-            ("drag", "doubtful", [FLIES_WORSE]),
-        ]
-    else:
-        assert found == causes
-    assert causes[0]["trust"] == "sure" and doubted_by_held_out(causes, None) == causes

@@ -306,9 +306,9 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
     sound = Against(
         channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
-        may_be_none=False, alternatives=(), nats=100.0, of_moment=math.inf, shaken=False,
-        poses_alone=False, clock_error=0.0, smoothed=False, errors_left=0.0, beside_terms=(),
-        beside_moved=(),
+        may_be_none=False, flies_worse=False, alternatives=(), nats=100.0, of_moment=math.inf,
+        shaken=False, poses_alone=False, clock_error=0.0, smoothed=False, errors_left=0.0,
+        beside_terms=(), beside_moved=(),
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -423,6 +423,14 @@ def test_a_number_that_may_be_none_is_doubted_and_with_one_thing_more_has_no_nam
     of = known_of(may_be_none=True, coloured=("q",) * coloured, falls_at=("half of all",) * falls)
     assert without_name({one: of}, SETTINGS) == ({one} if coloured or falls else set())
     assert any("may as well be none" in text for text in doubts(one, {one: of}, SETTINGS))
+
+
+@pytest.mark.parametrize("none", [False, True])
+def test_what_flies_the_held_out_runs_worse_is_doubted_and_with_one_thing_more_has_no_name(none):
+    one = EFFECTS[0]
+    of = known_of(flies_worse=True, may_be_none=none)
+    assert without_name({one: of}, SETTINGS) == ({one} if none else set())
+    assert any("flies the held-out runs worse" in text for text in doubts(one, {one: of}, SETTINGS))
 
 
 @pytest.mark.parametrize(

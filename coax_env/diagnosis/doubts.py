@@ -3,7 +3,8 @@
 What stands at the limit of what is believed and is not determined, or does not hold under other noise
 or on parts of the flights, stands for something else. Two of these take a name, too: noise left where
 it shows, little evidence there or by poses alone, other noise, parts of the flights, such a one
-beside it, numbers of which none is known to be another than nothing.
+beside it, numbers of which none is known to be another than nothing, held-out runs that the model flies
+worse with the causes.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -44,6 +45,8 @@ class Against:
         determined: whether the flights say more of one of its numbers than the prior did.
         may_be_none: whether nothing is within the 95 % interval of each of its numbers; in that is what
             models that do as well make of them.
+        flies_worse: whether the model with the causes flies the held-out runs worse than without, which
+            may have been flown before one that began.
         alternatives: effects that would do as well.
         nats: its evidence. of_moment: what it is worth that it began or changed when it did; endless
             where it did not. shaken: whether gusts come in single shocks.
@@ -66,6 +69,7 @@ class Against:
     sizes: Mapping[str, float]
     determined: bool
     may_be_none: bool
+    flies_worse: bool
     alternatives: tuple[str, ...]
     nats: float
     of_moment: float
@@ -126,7 +130,8 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         weak = unseen and of.nats < chosen.sure_evidence
         beside = any(_shows_beside(effect, of, standing_in))
         parts = of.is_gone_on_parts(chosen)
-        return sum((bool(of.coloured), weak, bool(of.falls_at), parts, beside, of.may_be_none))
+        of_numbers = (of.may_be_none, of.flies_worse)
+        return sum((bool(of.coloured), weak, bool(of.falls_at), parts, beside, *of_numbers))
 
     return {
         effect
@@ -172,6 +177,8 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
         yield "none of its numbers is determined"
     if of.may_be_none:
         yield "its numbers may as well be none: models that do as well have others"
+    if of.flies_worse:
+        yield "with the causes the model flies the held-out runs worse than without"
     if of.alternatives:
         others = and_list([plain(name) for name in of.alternatives])
         yield f"these flights cannot distinguish it from {others}"

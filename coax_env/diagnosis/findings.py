@@ -93,30 +93,6 @@ def _in_order(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(entries, key=lambda c: (c["trust"] != "sure", -c["evidence"]))
 
 
-FLIES_WORSE = "with the causes the model flies the held-out runs worse than without"
-
-
-def doubted_by_held_out(
-    causes: Iterable[dict[str, Any]], gain: Mapping[str, Any] | None
-) -> list[dict[str, Any]]:
-    """The causes, none of them sure where the corrected model flies the held-out runs worse.
-
-    A vibration stays, which is found by its line; and all, where one began in flight: it may have begun
-    after those runs. Of 202 sure names of **synthetic** flights, by many codes, 9 were so: 6 of
-    180 that were true and 3 of 22 that were not.
-
-    Args:
-        causes: as of `causes`.
-        gain: of the corrected model over the bare one, with the interval that chance leaves it; None:
-            nothing was held out.
-    """
-    known = list(causes)
-    most = None if gain is None else gain["ci95"][1]
-    if most is None or most >= 0.0 or any(c.get("since") for c in known):
-        return known
-    return _in_order(c if c["effect"] == "vibration" else _doubted(c, FLIES_WORSE) for c in known)
-
-
 def _doubted(cause: dict[str, Any], why: str) -> dict[str, Any]:
     """The cause in doubt, with one more reason."""
     return cause | {"trust": "doubtful", "doubts": [*cause["doubts"], why]}

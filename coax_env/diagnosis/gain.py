@@ -80,6 +80,16 @@ def gain_of(
     }
 
 
+def flies_worse(gain: Mapping[str, Any] | None) -> bool:
+    """Whether the corrected model flies the held-out runs worse than the bare one, beyond chance.
+
+    Args:
+        gain: as of `gain_of`; None: nothing was held out.
+    """
+    most = None if gain is None else gain["ci95"][1]
+    return most is not None and most < 0.0
+
+
 def removed(before: Mapping[str, Any], after: Mapping[str, Any], noise: Mapping[str, float]) -> Any:
     """Percent of the error removed, averaged over channels that had any.
 

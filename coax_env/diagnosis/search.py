@@ -253,6 +253,8 @@ def _with_late_rotors(
     done = fit.active in memory.rotored or len(memory.rotored) == MOST_ROTORED
     if done or rotors <= set(fit.active) or not set(fit.active) & {*WEAK_OR_LATE, *rotors}:
         return None
+    if rotors & set(fit.active) and any(memory.drops[e] for e in rotors):
+        return None  # the one stood beside the other, and was worth nothing there
     may_be = rotors <= set(problem.candidates) and not rotors & set(problem.model.moments)
     if not may_be or not problem.aboard.isdisjoint(ROTOR_SPEEDS):
         return None

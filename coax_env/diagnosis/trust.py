@@ -90,6 +90,7 @@ def trusts(
     found: Alternatives,
     white: Mapping[str, Whiteness],
     onsets: Mapping[str, Onset],
+    worse: bool,
 ) -> dict[str, Trust]:
     """Every active effect judged.
 
@@ -100,6 +101,9 @@ def trusts(
         found: the confounded alternatives of each cause.
         white: whiteness of the innovations, by channel.
         onsets: of causes that began or changed.
+        worse: whether the model flies the held-out runs worse with the causes. Of 202 sure names of
+            **synthetic** flights, by many codes, 9 were so: 6 of 180 that were true and 3 of 22 that
+            were not.
     """
     worth = {effect: weighed.nats for effect, weighed in evidence.items()}
     replicated = replications(problem, fit, quadratic, worth)
@@ -125,6 +129,7 @@ def trusts(
             sizes=sizes(problem, fit, effect),
             determined=any(known[effect][name] for name in problem.acting_names(effect)),
             may_be_none=may_be_none(problem, fit, quadratic, effect, evidence[effect].inflation),
+            flies_worse=worse and not onsets,
             alternatives=(*found[effect], *alike_by_poses_alone(problem, effect)),
             nats=worth[effect],
             of_moment=onsets[effect].beside if effect in onsets else math.inf,
