@@ -72,6 +72,16 @@ def test_a_fast_log_is_read_as_seldom_as_its_cut_off_asks_though_its_last_digit_
     assert 90.0 / cut_off <= kept(rounded, "theta") <= 180.0 / cut_off
 
 
+def test_motion_that_swings_is_no_smoothing():
+    """A heading that a stabiliser has swing at 5.5 Hz, read at 50 Hz: two rows apart that is the middle
+    band, and 150 times as dense."""
+    slow = T[::2]
+    swings = 0.3 * np.sin(2.0 * np.pi * 5.5 * slow + 0.8 * np.sin(3.0 * slow))
+    heading = run_of(slow, psi=swings + 0.013 * WHITE[::2])
+    assert steepness([heading.measured["psi"]], 2) > 40.0
+    assert kept(heading, "psi") == 1
+
+
 @pytest.mark.parametrize(
     "values",
     [
