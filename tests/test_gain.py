@@ -69,8 +69,9 @@ def test_a_worse_model_removes_less_than_nothing():
     [([-40.0, -2.0], True), ([-40.0, 2.0], False), ([2.0, 40.0], False), ([None, None], False)],
 )
 def test_it_flies_worse_where_chance_does_not_do_that(interval, worse):
-    assert flies_worse({"ci95": interval}) == worse
-    assert not flies_worse(None)
+    assert flies_worse({"ci95": interval}, begun=False) == worse
+    assert not flies_worse({"ci95": interval}, begun=True), "they may have been flown before"
+    assert not flies_worse(None, begun=False)
 
 
 def test_below_the_noise_nothing_is_left_and_no_error_is_no_channel():

@@ -203,7 +203,7 @@ def diagnose(
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     replays, gain = _gain(problem, (bare, refitted, fit), held, sensors, ceiling)
     report("asking left-out runs, halves and other noise whether the names hold")
-    worse = flies_worse(gain)
+    worse = flies_worse(gain, begun=bool(onsets))
     trust = trusts(problem, fit, quadratic, evidence, found, white["after"], onsets, worse)
     causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)

@@ -45,8 +45,7 @@ class Against:
         determined: whether the flights say more of one of its numbers than the prior did.
         may_be_none: whether nothing is within the 95 % interval of each of its numbers; in that is what
             models that do as well make of them.
-        flies_worse: whether the model with the causes flies the held-out runs worse than without, which
-            may have been flown before one that began.
+        flies_worse: whether the model with the causes flies the held-out runs worse than without.
         alternatives: effects that would do as well.
         nats: its evidence. of_moment: what it is worth that it began or changed when it did; endless
             where it did not. shaken: whether gusts come in single shocks.

@@ -80,14 +80,16 @@ def gain_of(
     }
 
 
-def flies_worse(gain: Mapping[str, Any] | None) -> bool:
+def flies_worse(gain: Mapping[str, Any] | None, begun: bool) -> bool:
     """Whether the corrected model flies the held-out runs worse than the bare one, beyond chance.
 
+    Not where a cause began in flight: they may have been flown before.
+
     Args:
-        gain: as of `gain_of`; None: nothing was held out.
+        gain: as of `gain_of`; None: nothing was held out. begun: whether a cause did.
     """
     most = None if gain is None else gain["ci95"][1]
-    return most is not None and most < 0.0
+    return most is not None and most < 0.0 and not begun
 
 
 def removed(before: Mapping[str, Any], after: Mapping[str, Any], noise: Mapping[str, float]) -> Any:

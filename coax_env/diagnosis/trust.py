@@ -129,7 +129,7 @@ def trusts(
             sizes=sizes(problem, fit, effect),
             determined=any(known[effect][name] for name in problem.acting_names(effect)),
             may_be_none=may_be_none(problem, fit, quadratic, effect, evidence[effect].inflation),
-            flies_worse=worse and not onsets,
+            flies_worse=worse,
             alternatives=(*found[effect], *alike_by_poses_alone(problem, effect)),
             nats=worth[effect],
             of_moment=onsets[effect].beside if effect in onsets else math.inf,
