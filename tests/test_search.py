@@ -237,3 +237,25 @@ def test_late_rotors_are_asked_for_once_where_nobody_sees_them(
         fit = replace(FIT, active=active)
         assert module._with_late_rotors(problem, fit, quadratic, memory) is None
     assert beside == [active] * asked
+
+
+@pytest.mark.parametrize(
+    ("active", "dropped", "asked"),
+    [
+        ("motor_lag", ["spin_up_reaction"], False),
+        ("motor_lag", ["wind"], True),
+        ("yaw_damping", ["spin_up_reaction"], True),  # neither is there
+    ],
+)
+def test_late_rotors_are_not_asked_for_again_beside_one_when_the_other_was_dropped(
+    monkeypatch, active, dropped, asked
+):
+    beside: list[tuple[str, ...]] = []
+    monkeypatch.setattr(module, "late_rotors", lambda problem, fit, q: beside.append(fit.active))
+    problem: Any = SimpleNamespace(
+        candidates=LATE_ROTORS, model=SimpleNamespace(moments={}), aboard=frozenset({"phi"})
+    )
+    memory, quadratic = _Memory(), SimpleNamespace()
+    memory.drops.update(dropped)
+    module._with_late_rotors(problem, replace(FIT, active=(active,)), quadratic, memory)
+    assert beside == [(active,)] * asked

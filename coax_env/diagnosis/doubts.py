@@ -129,8 +129,8 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         weak = unseen and of.nats < chosen.sure_evidence
         beside = any(_shows_beside(effect, of, standing_in))
         parts = of.is_gone_on_parts(chosen)
-        of_numbers = (of.may_be_none, of.flies_worse)
-        return sum((bool(of.coloured), weak, bool(of.falls_at), parts, beside, *of_numbers))
+        seen = (bool(of.coloured), bool(of.falls_at), of.may_be_none, of.flies_worse)
+        return sum((*seen, weak, parts, beside))
 
     return {
         effect

@@ -114,7 +114,7 @@ def weigh(
 
 
 def prune(
-    problem: Problem, fit: Fit, clear: Collection[str] = (), again: bool = False
+    problem: Problem, fit: Fit, again: bool = False
 ) -> tuple[Fit, Quadratic, dict[str, Evidence]]:
     """Remove, one at a time, causes whose evidence is gone once the noise levels are fitted too.
 
@@ -124,7 +124,6 @@ def prune(
 
     Args:
         problem, fit: what may be free, and where.
-        clear: known to be, and not weighed unless the quadratic doubts them.
         again: whether these causes were weighed, and asked from brief gusts, in another model of the
             commands: only those that the quadratic has as weak are weighed in this one, too.
 
@@ -141,13 +140,13 @@ def prune(
         if better is not None:
             fit = with_latent_noise(problem, better) or better
             continue
-        if fit.active and not _asked(problem, fit, quadratic, clear, again, worth):
+        if fit.active and not _asked(problem, fit, quadratic, again, worth):
             return fit, quadratic, {}
         beside = problem if fit.active else alone  # for whom could the candidates stand?
         fit, quadratic = quadratic_at(beside, refined(problem, fit))
         enough = threshold(problem, quadratic, fit.active)
         removals: dict[str, Removal] = {}
-        for which in _asked(problem, fit, quadratic, clear, again, worth):
+        for which in _asked(problem, fit, quadratic, again, worth):
             removals |= weigh(problem, fit, quadratic, which, enough)
             worth |= {e: removals[e].evidence.nats for e in which}
             better = _better(problem, fit, enough, removals)
@@ -205,21 +204,20 @@ def _asked(
     problem: Problem,
     fit: Fit,
     quadratic: Quadratic,
-    clear: Collection[str],
     again: bool,
     worth: Mapping[str, float],
 ) -> list[list[str]]:
-    """Causes that are to be weighed together: weak ones, others in doubt, the rest but for clear ones.
+    """Causes that are to be weighed together: weak ones, others in doubt, the rest.
 
     Args:
-        problem, fit: with the causes. quadratic: linearised at the fit. clear, again: as of `prune`.
+        problem, fit: with the causes. quadratic: linearised at the fit. again: as of `prune`.
         worth: of those that were weighed beside other causes [nats]; of the others the quadratic says.
     """
     by_quadratic = {e: _worth(problem, fit, quadratic, e) for e in fit.active}
     most = WEAK * problem.settings.evidence
     doubt = most if again else problem.settings.clear
     doubtful = [e for e in fit.active if by_quadratic[e] < doubt]
-    rest = [e for e in fit.active if e not in doubtful and e not in clear]
+    rest = [] if again else [e for e in fit.active if e not in doubtful]
     weak = [e for e in doubtful if worth.get(e, by_quadratic[e]) < most]
     other = [e for e in doubtful if e not in weak]
     return [which for which in (weak, other, rest) if which]
@@ -262,7 +260,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
             return first, pruned, quadratic, evidence
         rest = _only(second, again, pruned.active)
         if pruned.active:
-            asked, _, other = prune(second, rest, pruned.active, again=True)
+            asked, _, other = prune(second, rest, again=True)
         else:
             asked, other = fitted(second, rest), {}
         if asked.active == pruned.active:

@@ -93,11 +93,6 @@ def _in_order(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(entries, key=lambda c: (c["trust"] != "sure", -c["evidence"]))
 
 
-def _doubted(cause: dict[str, Any], why: str) -> dict[str, Any]:
-    """The cause in doubt, with one more reason."""
-    return cause | {"trust": "doubtful", "doubts": [*cause["doubts"], why]}
-
-
 def confusable_with(problem: Problem, effect: str, alternatives: Iterable[str]) -> list[str]:
     """What a cause may as well be: its alternatives, and those that no flight or not this one tells.
 
@@ -122,7 +117,10 @@ def mixtures_as_one(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
             kept.append(dict(weaker))
             continue
         alike = dict.fromkeys([*stronger["confusable_with"], weaker["effect"]])
-        stronger |= _doubted(stronger, f"it is a mixture with {plain(weaker['effect'])}") | {
+        mixed = f"it is a mixture with {plain(weaker['effect'])}"
+        stronger |= {
+            "trust": "doubtful",
+            "doubts": [*stronger["doubts"], mixed],
             "confusable_with": [e for e in alike if e != stronger["effect"]],
             "channels": list(dict.fromkeys([*stronger["channels"], *weaker["channels"]])),
             "mixture": {**stronger.get("mixture", {}), **weaker["parameters"]},

@@ -254,7 +254,7 @@ def _with_late_rotors(
     if done or rotors <= set(fit.active) or not set(fit.active) & {*WEAK_OR_LATE, *rotors}:
         return None
     if rotors & set(fit.active) and any(memory.drops[e] for e in rotors):
-        return None  # the one stood beside the other, and was worth nothing there
+        return None  # beside the one that is there a slope shows the other, which was dropped
     may_be = rotors <= set(problem.candidates) and not rotors & set(problem.model.moments)
     if not may_be or not problem.aboard.isdisjoint(ROTOR_SPEEDS):
         return None

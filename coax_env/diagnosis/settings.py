@@ -22,7 +22,8 @@ class Settings:
     the filter has them, and behind a low-pass. Measured by 26 Hz telemetry (`study_diagnosis.py --arms
     telemetry`, seeds 70 and 71): 5 of 71 clean flights had a name, motor_droop four times, worth 31
     nats at most; true ones that should show 51 to 196. In gusts with a frequency, taken for gusts that
-    fade: a play or a lag of the servos on 5 of 8 clean flights, 23 to 41 nats."""
+    fade: a play or a lag of the servos on 5 of 8 clean flights, 23 to 41 nats. And times that the
+    variance of the vehicle's own such numbers is larger (evidence.beside_unseen_answers)."""
     tie: float = 6.0
     """nats within which alternatives are confounded: odds of 400 to 1, ours."""
     form_share: float = 0.1
