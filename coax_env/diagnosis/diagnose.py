@@ -34,7 +34,7 @@ from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
 from coax_env.diagnosis.evidence import weighed
-from coax_env.diagnosis.gain import flies_worse, gain_of
+from coax_env.diagnosis.gain import flies_worse, gain_of, likelier_without
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.model_check import model_check
@@ -203,7 +203,9 @@ def diagnose(
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     replays, gain = _gain(problem, (bare, refitted, fit), held, sensors, ceiling)
     report("asking left-out runs, halves and other noise whether the names hold")
-    worse = flies_worse(gain, begun=bool(onsets))
+    worse = set()
+    if flies_worse(gain, begun=bool(onsets)):
+        worse = likelier_without(problem, fit, quadratic, held)
     trust = trusts(problem, fit, quadratic, evidence, found, white["after"], onsets, worse)
     causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)

@@ -4,7 +4,7 @@ What stands at the limit of what is believed and is not determined, or does not 
 or on parts of the flights, stands for something else. Two of these take a name, too: noise left where
 it shows, little evidence there or by poses alone, other noise, parts of the flights, such a one
 beside it, numbers of which none is known to be another than nothing, held-out runs that the model flies
-worse with the causes.
+worse with the causes and that are likelier without it.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -45,7 +45,8 @@ class Against:
         determined: whether the flights say more of one of its numbers than the prior did.
         may_be_none: whether nothing is within the 95 % interval of each of its numbers; in that is what
             models that do as well make of them.
-        flies_worse: whether the model with the causes flies the held-out runs worse than without.
+        flies_worse: whether the model with the causes flies the held-out runs worse than as given, and
+            these are likelier without it.
         alternatives: effects that would do as well.
         nats: its evidence. of_moment: what it is worth that it began or changed when it did; endless
             where it did not. shaken: whether gusts come in single shocks.
@@ -177,7 +178,8 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
     if of.may_be_none:
         yield "its numbers may as well be none: models that do as well have others"
     if of.flies_worse:
-        yield "with the causes the model flies the held-out runs worse than without"
+        worse = "with the causes the model flies the held-out runs worse than as given"
+        yield f"{worse}, and they are likelier without it"
     if of.alternatives:
         others = and_list([plain(name) for name in of.alternatives])
         yield f"these flights cannot distinguish it from {others}"

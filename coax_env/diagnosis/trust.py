@@ -10,7 +10,7 @@ unexplained.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -90,7 +90,7 @@ def trusts(
     found: Alternatives,
     white: Mapping[str, Whiteness],
     onsets: Mapping[str, Onset],
-    worse: bool,
+    worse: Collection[str],
 ) -> dict[str, Trust]:
     """Every active effect judged.
 
@@ -101,9 +101,8 @@ def trusts(
         found: the confounded alternatives of each cause.
         white: whiteness of the innovations, by channel.
         onsets: of causes that began or changed.
-        worse: whether the model flies the held-out runs worse with the causes. Of 202 sure names of
-            **synthetic** flights, by many codes, 9 were so: 6 of 180 that were true and 3 of 22 that
-            were not.
+        worse: causes with which the model flies the held-out runs worse, and that these are likelier
+            without.
     """
     worth = {effect: weighed.nats for effect, weighed in evidence.items()}
     replicated = replications(problem, fit, quadratic, worth)
@@ -129,7 +128,7 @@ def trusts(
             sizes=sizes(problem, fit, effect),
             determined=any(known[effect][name] for name in problem.acting_names(effect)),
             may_be_none=may_be_none(problem, fit, quadratic, effect, evidence[effect].inflation),
-            flies_worse=worse,
+            flies_worse=effect in worse,
             alternatives=(*found[effect], *alike_by_poses_alone(problem, effect)),
             nats=worth[effect],
             of_moment=onsets[effect].beside if effect in onsets else math.inf,
