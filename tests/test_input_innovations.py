@@ -192,25 +192,25 @@ def test_a_replay_has_no_innovations_in_its_open_loop(tmp_path):
     assert not np.array_equal(plain.channels["phi"].predicted, moved.channels["phi"].predicted)
     # the last start's prediction by hand, from the filtered state with the bare inputs
     first = moved_start(engine.records[0].t)
-    out = np.full(len(CHANNELS), np.nan)
-    x = run.states[first].copy()
-    x[GUSTS] = 0.0
+    out = np.full((1, len(CHANNELS)), np.nan)
+    x = run.states[[first]]
+    x[:, GUSTS] = 0.0
     inputs = engine.model.inputs(problem.engine.records[0], engine.model.vector(gains))
-    targets = np.full(len(CHANNELS), -1, np.int64)
+    targets = np.full((1, len(CHANNELS)), -1, np.int64)
     phi = CHANNELS.index("phi")
     t_end = moved.channels["phi"].t[-1]
-    targets[phi] = int(np.argmin(np.abs(engine.records[0].t - t_end)))
+    targets[0, phi] = int(np.argmin(np.abs(engine.records[0].t - t_end)))
     compiled_model.fly_open_loop(
         engine.compiled,
         engine.intervals[0],
         inputs,
         x,
         engine.model.vector(gains),
-        first,
+        np.array([first]),
         targets,
         out,
     )
-    assert out[phi] == pytest.approx(moved.channels["phi"].predicted[-1], abs=1e-12)
+    assert out[0, phi] == pytest.approx(moved.channels["phi"].predicted[-1], abs=1e-12)
 
 
 def moved_start(t: np.ndarray, horizon: float = 1.0) -> int:

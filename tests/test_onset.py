@@ -170,8 +170,9 @@ def test_a_changes_worth_is_what_the_joint_quadratic_gains(least):
         [np.array(own)], [np.zeros(2)], (np.array([3, 3, 4, 4]), np.array([3, 4, 3, 4])),
         np.array([0, 2, 1, 3]),
     )  # fmt: skip
-    row = table.row_of(known(table, 0, begins @ e, begins @ always.T, begins @ begins.T))
-    (nats,), (move,) = table.worth(0, *(np.array([part]) for part in row[:2]))
+    begun = known(table, 0, begins @ e, begins @ always.T, begins @ begins.T)
+    slopes, information, _ = table.rows([[begun]])
+    (nats,), (move,) = table.worth(0, slopes, information)
     gained = 0.5 * (h @ np.linalg.solve(H, h) - pull @ np.linalg.solve(alone, pull))
     occam = 0.5 * (np.linalg.slogdet(H)[1] - np.linalg.slogdet(alone)[1] - 2.0 * np.log(0.7))
     if np.isinf(least):
@@ -595,7 +596,7 @@ def table(at: dict[str, float], slope: np.ndarray):
 
 def worths(found: Table, there: Beginning, ends: bool = False) -> list[tuple[float, np.ndarray]]:
     """What a change of each effect there is worth, or its end, and how its numbers move."""
-    rows = [np.array([part]) for part in found.row_of(there)]
+    rows = found.rows([[there]])
     of_form = found.ended(*rows) if ends else rows[:2]
     return [(nats[0], moves[0]) for nats, moves in (found.worth(k, *of_form) for k in range(2))]
 

@@ -36,6 +36,7 @@ from coax_env.model import state as S
 CLIP = 2.0
 """Robust standard deviations at which an innovation is clipped: more is a maneuver; ours."""
 _ROUNDS = 5  # of reweighting
+_SINGULAR = 1e-13  # of the largest singular value of the normal equations: rounding, and thus none
 _SAMPLE_ROWS = 37  # rows between samples of the filter's covariance, prime to all sensors' cycles
 _TRANSIENT_ROWS = 100  # rows that a filter takes to forget its start
 _SEEN = (S.U, S.V, S.W, S.P, S.Q, S.R, S.PHI, S.THETA, S.PSI, S.X, S.Y, S.Z)  # by a pilot
@@ -153,10 +154,11 @@ def clipped_residual(known: np.ndarray, change: np.ndarray) -> np.ndarray:
     X = np.column_stack([X / np.maximum(X.std(axis=0), 1e-12), np.ones(len(X))])
     weight = np.ones(len(X))
     for _ in range(_ROUNDS):
-        solution = np.linalg.lstsq(X * weight[:, None], y * weight, rcond=1e-8)[0]
+        weighted = X * weight[:, None]
+        solution = np.linalg.lstsq(weighted.T @ X, weighted.T @ y, rcond=_SINGULAR)[0]
         rest = y - X @ solution
         std = 1.4826 * float(np.median(np.abs(rest)))
-        weight = np.sqrt(np.minimum(1.0, CLIP * std / np.maximum(np.abs(rest), 1e-300)))
+        weight = np.minimum(1.0, CLIP * std / np.maximum(np.abs(rest), 1e-300))
     result[moved] = np.clip(rest, -CLIP * std, CLIP * std)
     return result
 

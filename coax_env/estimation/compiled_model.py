@@ -153,24 +153,11 @@ def read(model, states, u, p, out):
         model.measure(states[s], u, p, work, out[s])
 
 
-@compiled_when_called(
-    boolean(MODEL, VECTOR, MATRIX, VECTOR, VECTOR, int64, INDICES, VECTOR), makes_arrays=True
-)
-def fly_open_loop(model, dt, u, x, p, first, targets, out):
-    """Predict alone: fly from row `first` with the recorded inputs; read each channel at its own row.
-
-    Args:
-        model: a CompiledModel. dt, u: as in RunData. p: (np,) the model's parameters.
-        x: (nx,) state at `first`; on return the state at the last target.
-        targets: (m,) row at which each channel is read, or -1. out: (m,) readings.
-
-    Returns:
-        False where the flight diverged.
+@compiled()
+def _fly_from(model, dt, u, x, p, first, last, targets, work, x_next, h, out):
+    """`fly_open_loop` from one row to the last target, in arrays that are there; whether it stayed
+    finite.
     """
-    work = np.zeros(model.work_size)
-    x_next = np.zeros(x.size)
-    h = np.zeros(out.size)
-    last = targets.max()
     for k in range(first, last + 1):
         wanted = False
         for i in range(out.size):
@@ -188,3 +175,30 @@ def fly_open_loop(model, dt, u, x, p, first, targets, out):
                 if not abs(x[j]) < 1e4:
                     return False
     return True
+
+
+@compiled_when_called(
+    boolean(MODEL, VECTOR, MATRIX, MATRIX, VECTOR, INDICES, int64[:, ::1], MATRIX),
+    makes_arrays=True,
+)
+def fly_open_loop(model, dt, u, x, p, first, targets, out):
+    """Predict alone: fly from some rows with the recorded inputs; read each channel at its own row.
+
+    Args:
+        model: a CompiledModel. dt, u: as in RunData. p: (np,) the model's parameters.
+        x: (s, nx) states at the rows `first` (s,); on return those at the last targets.
+        targets: (s, m) row at which each channel is read, or -1. out: (s, m) readings.
+
+    Returns:
+        False where a flight diverged.
+    """
+    work = np.zeros(model.work_size)
+    x_next = np.zeros(x.shape[1])
+    h = np.zeros(out.shape[1])
+    finite = True
+    for s in range(x.shape[0]):
+        last = targets[s].max()
+        finite &= _fly_from(
+            model, dt, u, x[s], p, first[s], last, targets[s], work, x_next, h, out[s]
+        )
+    return finite

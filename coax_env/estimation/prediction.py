@@ -157,11 +157,12 @@ def _unmoved(
     engine: Engine, run: RunPass, inputs: np.ndarray, dt: np.ndarray, p: np.ndarray
 ) -> np.ndarray:
     """Readings of the filtered state at every start itself, (s, 18)."""
-    readings = np.full((run.start_rows.size, len(CHANNELS)), np.nan)
-    for row, first in zip(readings, run.start_rows, strict=True):
-        here = np.full(len(CHANNELS), first)
-        x = run.states[first].copy()
-        compiled_model.fly_open_loop(engine.compiled, dt, inputs, x, p, first, here, row)
+    rows = run.start_rows
+    readings = np.full((rows.size, len(CHANNELS)), np.nan)
+    here = np.tile(rows[:, None], len(CHANNELS))
+    compiled_model.fly_open_loop(
+        engine.compiled, dt, inputs, run.states[rows], p, rows, here, readings
+    )
     return readings
 
 
@@ -180,13 +181,12 @@ def _fly_all(
     """
     predicted, decaying = np.full(targets.shape, np.nan), np.full(targets.shape, np.nan)
     finite = True
-    for s, first in enumerate(run.start_rows):
-        for gust, out in ((0.0, predicted), (1.0, decaying)):
-            x = run.states[first].copy()
-            x[engine.model.air] *= gust
-            finite &= compiled_model.fly_open_loop(
-                engine.compiled, dt, inputs, x, p, first, targets[s], out[s]
-            )
+    for gust, out in ((0.0, predicted), (1.0, decaying)):
+        x = run.states[run.start_rows]
+        x[:, engine.model.air] *= gust
+        finite &= compiled_model.fly_open_loop(
+            engine.compiled, dt, inputs, x, p, run.start_rows, targets, out
+        )
     return predicted, decaying, finite
 
 
@@ -270,22 +270,17 @@ def _spread(
     s: int,
 ) -> np.ndarray:
     """Variance by channel of a perfect model's prediction: start s's covariance flown forward."""
-    first = run.start_rows[s]
-    base = np.full(len(CHANNELS), np.nan)
-    moved = np.full(len(CHANNELS), np.nan)
-    x0 = run.states[first].copy()
-    sensitivity = np.zeros((len(CHANNELS), x0.size))
-    x0[engine.model.air] = 0.0
-
-    def fly(x: np.ndarray, out: np.ndarray) -> None:
-        compiled_model.fly_open_loop(engine.compiled, dt, inputs, x, p, first, targets, out)
-
-    fly(x0.copy(), base)
-    for j in range(GUSTS.start):
-        x = x0.copy()
-        x[j] += engine.model.state_scale[j]
-        fly(x, moved)
-        sensitivity[:, j] = (moved - base) / engine.model.state_scale[j]
+    moved_by = engine.model.state_scale[: GUSTS.start]
+    x = np.tile(run.states[run.start_rows[s]], (1 + moved_by.size, 1))
+    x[:, engine.model.air] = 0.0
+    x[1:, : moved_by.size] += np.diag(moved_by)
+    flown = np.full((len(x), len(CHANNELS)), np.nan)
+    first = np.full(len(x), run.start_rows[s])
+    compiled_model.fly_open_loop(
+        engine.compiled, dt, inputs, x, p, first, np.tile(targets, (len(x), 1)), flown
+    )
+    sensitivity = np.zeros((len(CHANNELS), x.shape[1]))
+    sensitivity[:, : moved_by.size] = ((flown[1:] - flown[0]) / moved_by[:, None]).T
     sensitivity[~np.isfinite(sensitivity)] = 0.0
     return np.einsum("ij,jk,ik->i", sensitivity, run.start_covariances[s], sensitivity)
 

@@ -104,20 +104,20 @@ def _flown(
     p = model.vector(model.bare_values)
     inputs = model.inputs(run.record, p)
     states = np.full((rows.size, run.states.shape[1]), np.nan)
-    readings = np.empty(len(CHANNELS))
-    target = np.full(len(CHANNELS), -1, np.int64)
-    x = np.full(run.states.shape[1], np.nan)
+    readings = np.empty((1, len(CHANNELS)))
+    target = np.full((1, len(CHANNELS)), -1, np.int64)
+    x = np.full((1, run.states.shape[1]), np.nan)
     compiled = compiled_model.CompiledModel.of(model)
     for k, row in enumerate(rows):
         if begins[k]:
-            x = run.states[row].copy()
-            x[GUST_FORCE] = 0.0
-            x[GUST_MOMENT] = 0.0
+            x = run.states[[row]]
+            x[:, GUST_FORCE] = 0.0
+            x[:, GUST_MOMENT] = 0.0
         elif np.isfinite(x).all():
-            target[0] = row
+            target[0, 0] = row
             if not compiled_model.fly_open_loop(
-                compiled, dt, inputs, x, p, rows[k - 1], target, readings
+                compiled, dt, inputs, x, p, rows[k - 1 : k], target, readings
             ):  # fmt: skip
                 x = np.full_like(x, np.nan)
-        states[k] = x
+        states[k] = x[0]
     return states

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from coax_env.estimation.run_passes import RunPass
 
@@ -65,13 +65,13 @@ def _judge(parts: Sequence[tuple[str, np.ndarray]]) -> Whiteness:
     worst = None
     for name, e in parts:
         n = e.size
-        rho = np.array([np.sum(e[k:] * e[:-k]) for k in range(1, LAGS + 1)]) / np.sum(e**2)
+        rho = np.array([e[k:] @ e[:-k] for k in range(1, LAGS + 1)]) / (e @ e)
         q = n * (n + 2) * np.sum(rho**2 / (n - np.arange(1, LAGS + 1)))
         predictor = solve_toeplitz(np.append(1.0, rho[:-1]), rho)  # Yule-Walker
         share = float(np.clip(predictor @ rho - LAGS / n, 0.0, 1.0))
-        p = float(chi2.sf(q, LAGS)) * len(parts)
+        p = float(chdtrc(LAGS, q)) * len(parts)
         spread = float(e.std())
-        wide = spread > SPREAD and chi2.sf(n * spread**2, n) * len(parts) < P_VALUE
+        wide = spread > SPREAD and chdtrc(n, n * spread**2) * len(parts) < P_VALUE
         white = not (wide or (p < P_VALUE and share * min(spread, 1.0) ** 2 > SHARE))
         judged = Whiteness(share, min(p, 1.0), spread, name, white)
         if worst is None or (worst.white, -worst.coloured_share) > (white, -share):

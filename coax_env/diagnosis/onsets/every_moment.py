@@ -28,6 +28,8 @@ SPACING = 0.01
 as thrust does in specific force, shows at its own row and is gone 0.02 s beside it; ours."""
 MOST_MOMENTS = 6000
 """On long flights they are farther apart than that; ours, a bound on time."""
+ROWS_AT_ONCE = 64
+"""Moments whose matrices are made at once: some megabytes; ours."""
 SETTLED = 1.0
 """s of a run after which a change in it can be told from its start; ours."""
 
@@ -69,15 +71,13 @@ def scored(state: Changing) -> tuple[Changing, list[Scored]]:
     state = replace(state, fit=fit, quadratic=Quadratic.of(lin, everything, fit.values))
     table = Table.of(state, names)
     every = [
-        (Moment(record.whole, float(record.t[b.row])), table.row_of(b))
+        Moment(record.whole, float(record.t[b.row]))
         for record, of_run in zip(records, found, strict=True)
         for b in of_run
     ]
     if not every:
         return state, []
-    slopes, information, crossed = (
-        np.array(part) for part in zip(*(r for _, r in every), strict=True)
-    )
+    slopes, information, crossed = table.rows(found)
     ended = table.ended(slopes, information, crossed)
     best = []
     for k, (effect, own) in enumerate(names.items()):
@@ -91,8 +91,7 @@ def scored(state: Changing) -> tuple[Changing, list[Scored]]:
                 at = int(np.argmax(nats))
                 total = float(logsumexp(nats)) - math.log(len(every))  # each as likely as any other
                 move = dict(zip(own, moves[at].tolist(), strict=True))
-                moment = every[at][0]
-                of_effect.append(Scored(effect, total, moment, move, ends, total - always))
+                of_effect.append(Scored(effect, total, every[at], move, ends, total - always))
         best += sorted(of_effect, key=lambda s: -s.nats)[:1]
     return state, sorted(best, key=lambda s: -s.nats)
 
@@ -184,20 +183,39 @@ class Table:
             ),
         )  # fmt: skip
 
-    def row_of(self, b: Beginning) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Slope and information of every effect's numbers that move from there on, and information
-        across them and those that always were, what is free beside them projected out: (k,) of all
-        numbers, and the groups' matrices, row by row.
+    def rows(
+        self, found: Sequence[Sequence[Beginning]]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Slope and information of every effect's numbers that move from each row on, and information
+        across them and those that always were, what is free beside them projected out: (n, k) of all
+        numbers, and the groups' matrices (n, p), row by row.
+
+        Args:
+            found: by record.
         """
-        later = self.later[b.record]
-        across = b.across + later[:, self.rest]
+        some = [
+            of_run[k : k + ROWS_AT_ONCE]
+            for of_run in found
+            for k in range(0, len(of_run), ROWS_AT_ONCE)
+        ]
+        slopes, information, crossed = zip(*map(self._some_rows, some), strict=True)
+        return np.concatenate(slopes), np.concatenate(information), np.concatenate(crossed)
+
+    def _some_rows(self, some: Sequence[Beginning]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`rows` of some of one record."""
+        later = self.later[some[0].record]
+        across = np.array([b.across for b in some]) + later[:, self.rest]
         weights = across @ self.inverse
-        slope = b.slope + self.slope_later[b.record] - weights @ self.pull
+        slopes = np.array([b.slope for b in some]) + self.slope_later[some[0].record]
         i, j = self.pairs
-        of_rest, behind = across[i], later[i, j]
-        own = b.own + behind - np.einsum("pr,pr->p", of_rest, weights[j])
-        crossed = b.crossed + behind - np.einsum("pr,pr->p", of_rest, self.always[1][j])
-        return slope, own, crossed
+        of_rest, behind = across[:, i], later[i, j]
+        own = np.array([b.own for b in some]) + behind
+        crossed = np.array([b.crossed for b in some]) + behind
+        return (
+            slopes - weights @ self.pull,
+            own - np.einsum("npr,npr->np", of_rest, weights[:, j]),
+            crossed - np.einsum("npr,pr->np", of_rest, self.always[1][j]),
+        )
 
     @cached_property
     def always(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -217,7 +235,7 @@ class Table:
         from there on.
 
         Args:
-            slopes, information, crossed: `row_of` all rows, stacked.
+            slopes, information, crossed: as of `rows`.
         """
         slope, _, own = self.always
         return slope - slopes, own - crossed - crossed[:, self.swapped] + information
@@ -235,7 +253,7 @@ class Table:
         Where bounds are met the move is cut off there: it is worth that at least.
 
         Args:
-            k: the effect's place. slopes, information: `row_of` all rows, stacked.
+            k: the effect's place. slopes, information: as of `rows`.
         """
         q, c = self.quadratic, self.groups[k]
         first = sum(group.size**2 for group in self.groups[:k])
