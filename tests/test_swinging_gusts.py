@@ -16,6 +16,7 @@ from coax_env import diagnose, load_vehicle
 from coax_env.diagnosis import swings as asking
 from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation import swinging_gusts
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import AXES, GUST_AXES
 from coax_env.estimation.lasting_errors import ErringModel
@@ -240,10 +241,27 @@ def test_a_swing_far_from_its_spectrums_peak_is_fitted_from_there(monkeypatch, p
     problem: Any = SimpleNamespace(
         model=model, row=0.01, engine=SimpleNamespace(filter=lambda values, noise: [])
     )
-    monkeypatch.setattr(asking, "swings", lambda passes, row: [0.8, 0.5, 0.0, peak, 0.0, 0.0])
+    faint = lambda passes, row, least=0.0: [0.8, 0.5 * (least == 0.0), 0.0, peak, 0.0, 0.0]  # noqa: E731
+    monkeypatch.setattr(asking, "swings", faint)
     monkeypatch.setattr(asking, "_fitted_from", lambda problem, fit, found: found)
     found = asking.with_other_swings(problem, Fit((), {}, NOISE))
     assert found == ([0.8, 0.5, 0.0, peak, 0.0, 0.0] if asked else None)
+
+
+@pytest.mark.parametrize(("stands_out", "asked"), [(4.0, False), (6.0, True)])
+def test_a_gust_that_only_fades_swings_where_its_spectrum_says_so_clearly(
+    monkeypatch, stands_out, asked
+):
+    """Beside one that swings already: more than five times the density at the lowest frequency."""
+    model = SwingingModel(PLAIN, (0.8, 0.0, 0.0, 0.0, 0.0, 0.0))
+    problem: Any = SimpleNamespace(
+        model=model, row=0.01, engine=SimpleNamespace(filter=lambda values, noise: [])
+    )
+    spectra = [0.8, 0.5, 0.0, 0.0, 0.0, 0.0], [40.0, stands_out, 1.0, 1.0, 1.0, 1.0]
+    monkeypatch.setattr(swinging_gusts, "_strongest_of_all", lambda passes, row: spectra)
+    monkeypatch.setattr(asking, "_fitted_from", lambda problem, fit, found: found)
+    found = asking.with_other_swings(problem, Fit((), {}, NOISE))
+    assert found == ([0.8, 0.5, 0.0, 0.0, 0.0, 0.0] if asked else None)
 
 
 @pytest.mark.parametrize(("axes", "alone"), [("force_xy", [0.8, 0.9]), ("moment_z", [0.5])])

@@ -180,16 +180,17 @@ def swinging_at(model: HeliModel, frequencies: Sequence[float]) -> HeliModel:
     return SwingingModel(model, frequencies)
 
 
-def swings(passes: Sequence[RunPass], row: float) -> list[float]:
+def swings(passes: Sequence[RunPass], row: float, least: float = STANDS_OUT) -> list[float]:
     """Frequencies [Hz] of the six gusts, 0 of one that only fades, as their spectra show them.
 
     Args:
         passes: of a filter whose gusts only fade. row: seconds between rows.
+        least: times the density at the lowest frequency that a swing's must be.
     """
     frequencies, clear = _strongest_of_all(passes, row)
     if max(clear) < CLEARLY:
         return [0.0] * 6
-    return [f if by > STANDS_OUT else 0.0 for f, by in zip(frequencies, clear, strict=True)]
+    return [f if by > least else 0.0 for f, by in zip(frequencies, clear, strict=True)]
 
 
 def clearest(passes: Sequence[RunPass], row: float) -> str:
