@@ -184,7 +184,7 @@ def swings(passes: Sequence[RunPass], row: float, least: float = STANDS_OUT) -> 
     """Frequencies [Hz] of the six gusts, 0 of one that only fades, as their spectra show them.
 
     Args:
-        passes: of a filter whose gusts only fade. row: seconds between rows.
+        passes: of a filter, whether its gusts swing already or not. row: seconds between rows.
         least: times the density at the lowest frequency that a swing's must be.
     """
     frequencies, clear = _strongest_of_all(passes, row)
