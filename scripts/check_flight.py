@@ -78,6 +78,8 @@ def show(found: "FlightCheck") -> None:
         print("columns not read:", ", ".join(found.unread))
     if found.unseen:
         print("sign not seen by any check:", " ".join(found.unseen))
+    for words in found.oscillating:
+        print("oscillates:", words)
     for waived in found.waived:
         print("waived:", waived)
     for suspicion in found.suspicions:

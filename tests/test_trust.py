@@ -306,9 +306,9 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
     sound = Against(
         channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
-        may_be_none=False, flies_worse=False, alternatives=(), nats=100.0, of_moment=math.inf,
-        shaken=False, poses_alone=False, clock_error=0.0, smoothed=False, errors_left=0.0,
-        beside_terms=(), beside_moved=(),
+        may_be_none=False, flies_worse=False, within_form=False, alternatives=(), nats=100.0,
+        of_moment=math.inf, shaken=False, poses_alone=False, clock_error=0.0, smoothed=False,
+        errors_left=0.0, beside_terms=(), beside_moved=(),
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -431,6 +431,17 @@ def test_what_flies_the_held_out_runs_worse_is_doubted_and_with_one_thing_more_h
     of = known_of(flies_worse=True, may_be_none=none)
     assert without_name({one: of}, SETTINGS) == ({one} if none else set())
     assert any("flies the held-out runs worse" in text for text in doubts(one, {one: of}, SETTINGS))
+
+
+@pytest.mark.parametrize("coloured", [(), ("q",)])
+def test_what_a_form_may_be_wrong_by_at_one_frequency_is_doubted_and_with_one_thing_more_has_no_name(
+    coloured,
+):
+    """A rate damping, 0.2 % of what all explained, beside a heading that swung (**synthetic**)."""
+    one = EFFECTS[0]
+    of = known_of(within_form=True, coloured=coloured)
+    assert without_name({one: of}, SETTINGS) == ({one} if coloured else set())
+    assert any("wrong by 15 %" in text for text in doubts(one, {one: of}, SETTINGS))
 
 
 @pytest.mark.parametrize(

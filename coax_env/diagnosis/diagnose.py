@@ -22,6 +22,8 @@ import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.design import next_maneuver
+from coax_env.design.loop_oscillation import oscillations
+from coax_env.design.loop_oscillation import remark as oscillation_remark
 from coax_env.diagnosis import (
     confounding,
     findings,
@@ -206,7 +208,10 @@ def diagnose(
     worse = set()
     if flies_worse(gain, begun=bool(onsets)):
         worse = likelier_without(problem, fit, quadratic, held)
-    trust = trusts(problem, fit, quadratic, evidence, found, white["after"], onsets, worse)
+    swinging = oscillations(flight.runs)
+    trust = trusts(
+        problem, fit, quadratic, evidence, found, white["after"], onsets, worse, bool(swinging)
+    )
     causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)
@@ -251,6 +256,7 @@ def diagnose(
             *double_counting(flight, vehicle),
             *([vibration_removed(lines)] if lines else []),
             *of_sensors,
+            *([oscillation_remark(swinging)] if swinging else []),
             *remarks(problem, fit, quadratic, {e: found[e] for e in found if trust[e].named}),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
             *held_out_before(gain, causes, flight.run_names),

@@ -4,9 +4,11 @@ What stands at the limit of what is believed and is not determined, or does not 
 or on parts of the flights, stands for something else. Two of these take a name, too: noise left where
 it shows, little evidence there or by poses alone, other noise, parts of the flights, such a one
 beside it, numbers of which none is known to be another than nothing, held-out runs that the model flies
-worse with the causes and that are likelier without it.
+worse with the causes and that are likelier without it, a share of what all causes explain that their
+forms may be wrong by where the control loop oscillates.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -47,6 +49,8 @@ class Against:
             models that do as well make of them.
         flies_worse: whether the model with the causes flies the held-out runs worse than as given, and
             these are likelier without it.
+        within_form: whether the control loop oscillates, and what the causes explain, by forms that are
+            a little wrong, leaves as much.
         alternatives: effects that would do as well.
         nats: its evidence. of_moment: what it is worth that it began or changed when it did; endless
             where it did not. shaken: whether gusts come in single shocks.
@@ -70,6 +74,7 @@ class Against:
     determined: bool
     may_be_none: bool
     flies_worse: bool
+    within_form: bool
     alternatives: tuple[str, ...]
     nats: float
     of_moment: float
@@ -131,7 +136,7 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         beside = any(_shows_beside(effect, of, standing_in))
         parts = of.is_gone_on_parts(chosen)
         seen = (bool(of.coloured), bool(of.falls_at), of.may_be_none, of.flies_worse)
-        return sum((*seen, weak, parts, beside))
+        return sum((*seen, of.within_form, weak, parts, beside))
 
     return {
         effect
@@ -180,6 +185,12 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
     if of.flies_worse:
         worse = "with the causes the model flies the held-out runs worse than as given"
         yield f"{worse}, and they are likelier without it"
+    if of.within_form:
+        share = 100.0 * math.sqrt(chosen.oscillating_form)
+        yield (
+            "the control loop oscillates: at one frequency causes beside it leave as much if their form"
+            f" is wrong by {share:.0f} %"
+        )
     if of.alternatives:
         others = and_list([plain(name) for name in of.alternatives])
         yield f"these flights cannot distinguish it from {others}"

@@ -91,6 +91,7 @@ def trusts(
     white: Mapping[str, Whiteness],
     onsets: Mapping[str, Onset],
     worse: Collection[str],
+    oscillates: bool,
 ) -> dict[str, Trust]:
     """Every active effect judged.
 
@@ -103,6 +104,7 @@ def trusts(
         onsets: of causes that began or changed.
         worse: causes with which the model flies the held-out runs worse, and that these are likelier
             without.
+        oscillates: whether the control loop oscillates through the flight.
     """
     worth = {effect: weighed.nats for effect, weighed in evidence.items()}
     replicated = replications(problem, fit, quadratic, worth)
@@ -112,6 +114,7 @@ def trusts(
     loud = tuple(channel for channel, of in white.items() if of.spread > LOUD)
     elsewhere = sum(not of.white for of in white.values()) / max(len(white), 1)
     acting = acted_on(problem)
+    of_form = problem.settings.oscillating_form * sum(worth.values()) if oscillates else 0.0
     far = moved_far(problem, fit, quadratic)
     known, against = {}, {}
     for effect in fit.active:
@@ -129,6 +132,7 @@ def trusts(
             determined=any(known[effect][name] for name in problem.acting_names(effect)),
             may_be_none=may_be_none(problem, fit, quadratic, effect, evidence[effect].inflation),
             flies_worse=effect in worse,
+            within_form=worth[effect] < of_form,
             alternatives=(*found[effect], *alike_by_poses_alone(problem, effect)),
             nats=worth[effect],
             of_moment=onsets[effect].beside if effect in onsets else math.inf,

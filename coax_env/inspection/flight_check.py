@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from coax_env.consistency.agreement import Agreement, agreement, change_words
+from coax_env.design.loop_oscillation import oscillations, remark
 from coax_env.estimation.flown import flown_parts
 from coax_env.inspection.learnable import EffectCheck, OwnNumber, learnable
 from coax_env.inspection.readings import (
@@ -40,10 +41,10 @@ class FlightCheck:
 
     missing: channels that no run has. repaired: what was done to the data while reading. suspicions: of
     units, signs and sensors, in words. waived: of them, those that the card passes over. unseen:
-    channels
-    whose sign no check could see. effects: of the catalogue, best shown first. undetermined:
-    base parameters that these flights leave open, `directions` along what. not_believed: share of
-    readings that the filter left out. next_step: in words, with a command.
+    channels whose sign no check could see. oscillating: that the control loop oscillates, in words.
+    effects: of the catalogue, best shown first. undetermined: base parameters that these flights leave
+    open, `directions` along what. not_believed: share of readings that the filter left out. next_step:
+    in words, with a command.
     """
 
     flight: str
@@ -56,6 +57,7 @@ class FlightCheck:
     suspicions: tuple[str, ...]
     waived: tuple[str, ...]
     unseen: tuple[str, ...]
+    oscillating: tuple[str, ...]
     effects: tuple[EffectCheck, ...]
     own_numbers: tuple[OwnNumber, ...]
     undetermined: tuple[str, ...]
@@ -108,6 +110,7 @@ def check_flight(
             " read to be believed: is it this vehicle, and are signs and units those of"
             " the form (check_flight --form)?"
         )
+    swinging = oscillations(flight.runs)
     where = str(flight.path or "FLIGHT")
     return FlightCheck(
         flight=where,
@@ -120,6 +123,7 @@ def check_flight(
         suspicions=tuple(suspicions),
         waived=tuple(f"{fault.check}: {fault.words}" for fault in found.waived),
         unseen=found.unseen,
+        oscillating=(remark(swinging),) if swinging else (),
         effects=learned.effects,
         own_numbers=learned.own_numbers,
         undetermined=learned.undetermined,
