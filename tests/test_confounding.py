@@ -8,8 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coax_env.diagnosis import remarks
-from coax_env.diagnosis.confounding import beside_undecided, of_undecided, undecided
+from coax_env.diagnosis import confounding, remarks
+from coax_env.diagnosis.confounding import (
+    beside_undecided,
+    likelier,
+    of_undecided,
+    settled,
+    undecided,
+)
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter import HeliModel
@@ -32,7 +38,11 @@ def fitted_with(slope: float) -> tuple[Problem, Fit, Quadratic]:
     model = HeliModel(load_vehicle("lama400d"))
     problem = Problem(model, None, (free[MASS],), own)  # type: ignore[arg-type]
     lin = Linearised(
-        tuple(STD), COUPLED[None], np.array([[0.0, 0.0, slope]]), np.zeros((1, 3, 2)), np.zeros((4, 3))
+        tuple(STD),
+        COUPLED[None],
+        np.array([[0.0, 0.0, slope]]),
+        np.zeros((1, 3, 2)),
+        np.zeros((4, 3)),
     )
     values = dict.fromkeys(STD, 0.0)
     fit = Fit(("axial_damping",), values, Noise({}))
@@ -53,15 +63,80 @@ def test_an_undecided_effect_is_as_likely_as_its_evidence_and_moves_the_rest_to_
     assert found[0] == "rotor_drag" and found[1][0] == pytest.approx(probability)
     np.testing.assert_allclose(found[1][1], best[:2], atol=1e-12)
     np.testing.assert_allclose(
-        of_undecided(problem, fit, quadratic), probability * np.outer(best[:2], best[:2]), atol=1e-12
+        of_undecided(problem, fit, quadratic),
+        probability * np.outer(best[:2], best[:2]),
+        atol=1e-12,
     )
     inflation = {"axial_damping": Evidence(50.0, 4.0)}
     begun = replace(fit, std_ratio={DAMPING: 1.5})
     ratios = beside_undecided(problem, begun, quadratic, inflation).std_ratio
     variance = np.diag(np.linalg.inv(rest))
-    assert ratios[MASS] == pytest.approx(math.hypot(1.0, best[0] * (probability / variance[0]) ** 0.5))
+    assert ratios[MASS] == pytest.approx(
+        math.hypot(1.0, best[0] * (probability / variance[0]) ** 0.5)
+    )
     moved = best[1] * (probability / variance[1]) ** 0.5 / 2.0  # colour doubles the std
     assert ratios[DAMPING] == pytest.approx(math.hypot(1.5, moved))
+
+
+def occam(effect: str) -> float:
+    """Of a damping or a drag beside the mass, by determinants."""
+    i = list(STD).index(effect)
+    whole = COUPLED + np.diag([std**-2 for std in STD.values()])
+    both = np.linalg.det(whole[np.ix_([0, i], [0, i])])
+    return 0.5 * math.log(both / whole[0, 0] * STD[effect] ** 2)
+
+
+@pytest.mark.parametrize(
+    ("more", "colour", "begun", "exchanged"),
+    [
+        (0.1, 1.0, False, True),
+        (-0.1, 1.0, False, False),
+        (0.1, 4.0, False, True),
+        (9.0, 1.0, True, False),
+    ],
+)
+def test_what_is_likelier_once_refitted_by_over_a_tie_takes_a_causes_place(
+    monkeypatch, more, colour, begun, exchanged
+):
+    """By its evidence, not its fit alone: colour and Occam's factors are in it."""
+    problem, fit, quadratic = fitted_with(0.0)
+    monkeypatch.setattr(Problem, "changes", lambda self, effect: begun)
+    fit = replace(fit, objective=1000.0)
+    evidence = {"axial_damping": Evidence(50.0 * colour, colour)}  # worth 50 nats
+    gain = problem.settings.tie + more - 50.0 * (colour - 1.0) + occam(DRAG) - occam(DAMPING)
+    other = replace(fit.at({DRAG: 1.0}), active=("rotor_drag",), objective=1000.0 - gain)
+    there = likelier(problem, fit, quadratic, evidence, {"axial_damping": {"rotor_drag": other}})
+    assert (there is not None) == exchanged
+    if there is not None:
+        assert there.active == ("rotor_drag",)
+        (move, nats) = there.history[-1]
+        assert move == "axial_damping -> rotor_drag"
+        assert nats == pytest.approx(problem.settings.tie + more)
+    assert likelier(problem, fit, quadratic, evidence, {"axial_damping": {}}) is None
+    small = {"rotor_drag": other.at({DRAG: 0.0})}  # another optimum explained it, not the drag
+    assert likelier(problem, fit, quadratic, evidence, {"axial_damping": small}) is None
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_likelier_alternative_stays_where_it_stands_once_weighed(monkeypatch, kept):
+    problem, fit, quadratic = fitted_with(0.0)
+    other = replace(fit, active=("rotor_drag",))
+    asked = []
+
+    def weighed(problem: Problem, fit: Fit) -> tuple[Any, ...]:
+        asked.append(fit.active)
+        there = fit if fit.active == ("axial_damping",) or kept else replace(fit, active=())
+        return problem, there, quadratic, {}
+
+    engine = SimpleNamespace(filter=lambda values, noise: [])
+    monkeypatch.setattr(confounding, "weighed", weighed)
+    monkeypatch.setattr(confounding, "whiteness", lambda passes, channels: {})
+    monkeypatch.setattr(confounding, "alternatives", lambda *given: {})
+    monkeypatch.setattr(confounding, "likelier", lambda *given: other)
+    monkeypatch.setattr(confounding, "as_named", lambda problem, fit, other: other)
+    there = settled(replace(problem, engine=engine), fit)[1]
+    assert asked == [("axial_damping",), ("rotor_drag",)]
+    assert there.active == (("rotor_drag",) if kept else ("axial_damping",))
 
 
 def test_nothing_is_averaged_over_without_a_cause_nor_what_no_model_has_beside_it():

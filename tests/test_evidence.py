@@ -411,7 +411,7 @@ def test_what_takes_a_causes_place_in_the_end_is_weighed_anew_and_once(monkeypat
 
     monkeypatch.setattr(evidence, "far_swap", far_swap)
     monkeypatch.setattr(
-        evidence, "_as_named", lambda problem, fit, other: replace(fit, active=other.active)
+        evidence, "as_named", lambda problem, fit, other: replace(fit, active=other.active)
     )
     assert named(monkeypatch, tables, "servo_lag", "play") == ("servo_rate", "play")
     assert asked == [("servo_lag", "play")]
@@ -426,7 +426,7 @@ def test_what_is_named_in_the_end_has_its_own_number():
     values = {"servo_lag.time": 0.05, "servo_rate.limit": 10.0, "wind.north": 2.0, "play": 0.02}
     fit = Fit(("servo_lag", "play", "wind"), values, Noise({}))
     there = {"servo_rate.limit": 1.3, "play": 0.03}
-    found = evidence._as_named(problem, fit, Fit(("servo_rate", "play"), there, Noise({})))
+    found = evidence.as_named(problem, fit, Fit(("servo_rate", "play"), there, Noise({})))
     assert found.active == ("servo_rate", "play")
     assert found.values == {
         "servo_lag.time": 0.0, "servo_rate.limit": 1.3, "wind.north": 0.0, "play": 0.02
@@ -480,7 +480,7 @@ def test_what_looks_like_a_late_answer_must_be_worth_more_where_gusts_are_seen_l
     problem = SimpleNamespace(settings=SETTINGS, **{name: name in unseen for name in conditions})
     monkeypatch.setattr(evidence, "inflation", lambda problem, quadratic, active, effect: colour)
     fit = SimpleNamespace(active=(effect,))
-    assert evidence._inflation(problem, fit, None, effect) == factor  # type: ignore[arg-type]
+    assert evidence.inflation_of(problem, fit, None, effect) == factor  # type: ignore[arg-type]
 
 
 def test_where_commands_show_nothing_the_readings_decide(monkeypatch):

@@ -35,7 +35,6 @@ from coax_env.diagnosis import (
 from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
-from coax_env.diagnosis.evidence import weighed
 from coax_env.diagnosis.gain import flies_worse, gain_of, likelier_without
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.input_innovations import engine_as_fitted
@@ -191,14 +190,15 @@ def diagnose(
     state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
     report("weighing the causes against their confounded alternatives")
-    problem, fit, quadratic, evidence = weighed(beside_large_axes(problem, fit), fit)
+    problem, fit, quadratic, evidence, found = confounding.settled(
+        beside_large_axes(problem, fit), fit
+    )
     passes_after = problem.engine.filter(fit.values, fit.noise)
     white = {
         "before": whiteness(passes_before, CHANNELS),
         "after": whiteness(passes_after, CHANNELS),
     }
     onsets = moments_of(problem, fit, quadratic, evidence, state.onsets)
-    found = confounding.alternatives(problem, fit, quadratic, evidence, white["after"])
     fit = confounding.beside_alternatives(problem, fit, quadratic, evidence, found)
     fit = confounding.beside_undecided(problem, fit, quadratic, evidence)
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)

@@ -100,7 +100,7 @@ def weigh(
 
     def one(effect: str) -> Removal:
         held = tuple(problem.file_values(effect))
-        factor = _inflation(problem, fit, quadratic, effect)
+        factor = inflation_of(problem, fit, quadratic, effect)
         rest = noise_fitted(problem, without(problem, fit, quadratic, effect))
         rest = fitted(problem, rest, steps=1, held=held)
         lost = rest.objective - fit.objective
@@ -254,7 +254,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         pruned, quadratic, evidence = prune(first, start)
         swapped = None if exchanged else far_swap(first, pruned, quadratic)
         if swapped is not None:
-            fit, exchanged = _as_named(problem, fit, swapped), True
+            fit, exchanged = as_named(problem, fit, swapped), True
             continue
         if not has_command_gains(wider) or (_feels_gusts(problem) and not pruned.active):
             return first, pruned, quadratic, evidence
@@ -377,15 +377,23 @@ def _only(problem: Problem, fit: Fit, causes: Collection[str]) -> Fit:
     return fit
 
 
-def _as_named(problem: Problem, fit: Fit, other: Fit) -> Fit:
-    """The fit with the causes of another one, those that it does not have at their numbers there."""
+def as_named(problem: Problem, fit: Fit, other: Fit) -> Fit:
+    """The fit with the causes of another one, those that it does not have at their numbers there.
+
+    Args:
+        problem, fit: before anything was weighed. other: with the causes.
+    """
     rest = _only(problem, fit, other.active)
     new = [f.name for e in other.active if e not in fit.active for f in problem.own[e]]
     return replace(rest.at({name: other.values[name] for name in new}), active=other.active)
 
 
-def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:
-    """What colour, and commands for what the filter does not see, make of a cause's variance."""
+def inflation_of(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:
+    """What colour, and commands for what the filter does not see, make of a cause's variance.
+
+    Args:
+        problem, fit: with the cause. quadratic: with its numbers. effect: the cause.
+    """
     colour = inflation(problem, quadratic, fit.active, effect)
     unseen = problem.settings.unseen_inflation
     if effect not in WEAK_OR_LATE:
@@ -399,7 +407,7 @@ def _inflation(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) ->
 
 def _worth(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:
     """Nats of a cause by the quadratic, colour and slow rows allowed for."""
-    factor = _inflation(problem, fit, quadratic, effect)
+    factor = inflation_of(problem, fit, quadratic, effect)
     return loss(problem, quadratic, fit.active, effect, factor)
 
 
