@@ -10,6 +10,7 @@ import pytest
 
 from coax_env.diagnosis import confounding, remarks
 from coax_env.diagnosis.confounding import (
+    LIKELIER,
     beside_undecided,
     likelier,
     of_undecided,
@@ -95,7 +96,7 @@ def occam(effect: str) -> float:
         (9.0, 1.0, True, False),
     ],
 )
-def test_what_is_likelier_once_refitted_by_over_a_tie_takes_a_causes_place(
+def test_what_is_likelier_once_refitted_takes_a_causes_place(
     monkeypatch, more, colour, begun, exchanged
 ):
     """By its evidence, not its fit alone: colour and Occam's factors are in it."""
@@ -103,7 +104,7 @@ def test_what_is_likelier_once_refitted_by_over_a_tie_takes_a_causes_place(
     monkeypatch.setattr(Problem, "changes", lambda self, effect: begun)
     fit = replace(fit, objective=1000.0)
     evidence = {"axial_damping": Evidence(50.0 * colour, colour)}  # worth 50 nats
-    gain = problem.settings.tie + more - 50.0 * (colour - 1.0) + occam(DRAG) - occam(DAMPING)
+    gain = LIKELIER + more - 50.0 * (colour - 1.0) + occam(DRAG) - occam(DAMPING)
     other = replace(fit.at({DRAG: 1.0}), active=("rotor_drag",), objective=1000.0 - gain)
     there = likelier(problem, fit, quadratic, evidence, {"axial_damping": {"rotor_drag": other}})
     assert (there is not None) == exchanged
@@ -111,7 +112,7 @@ def test_what_is_likelier_once_refitted_by_over_a_tie_takes_a_causes_place(
         assert there.active == ("rotor_drag",)
         (move, nats) = there.history[-1]
         assert move == "axial_damping -> rotor_drag"
-        assert nats == pytest.approx(problem.settings.tie + more)
+        assert nats == pytest.approx(LIKELIER + more)
     assert likelier(problem, fit, quadratic, evidence, {"axial_damping": {}}) is None
     small = {"rotor_drag": other.at({DRAG: 0.0})}  # another optimum explained it, not the drag
     assert likelier(problem, fit, quadratic, evidence, {"axial_damping": small}) is None

@@ -225,19 +225,30 @@ def far_swap(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
         quadratic: linearised at the fit.
     """
     for old, new in _far_pairs(problem, fit):
-        active = tuple(new if e == old else e for e in fit.active)
-        trial = replace(without(problem, fit, quadratic, old), active=active)
-        for _ in range(FAR_TURNS):
-            trial = fitted(problem, _likeliest(problem, trial, new))
-            if not trial.objective < fit.objective + BEHIND * problem.settings.tie:
-                break
-        else:
-            trial = converged(problem, trial)
+        trial = from_afar(problem, fit, quadratic, old, new)
         gained = fit.objective - trial.objective
         if gained > problem.settings.tie and is_large(problem, new, trial.values):
             problem.report(f"{new} explains it better than {old}, by {gained:.1f} nats in the end")
             return trial.noted(f"{old} -> {new}", gained)
     return None
+
+
+def from_afar(problem: Problem, fit: Fit, quadratic: Quadratic, old: str, new: str) -> Fit:
+    """The fit with one effect in another's place, begun at its likeliest size.
+
+    It converges unless it stays far behind.
+
+    Args:
+        problem, fit: what may be free, and where. quadratic: linearised at the fit.
+        old: an active effect. new: one with one number, that is not active.
+    """
+    active = tuple(new if e == old else e for e in fit.active)
+    trial = replace(without(problem, fit, quadratic, old), active=active)
+    for _ in range(FAR_TURNS):
+        trial = fitted(problem, _likeliest(problem, trial, new))
+        if not trial.objective < fit.objective + BEHIND * problem.settings.tie:
+            return trial
+    return converged(problem, trial)
 
 
 def _far_pairs(problem: Problem, fit: Fit) -> list[tuple[str, str]]:
