@@ -18,6 +18,7 @@ import pytest
 from injector_air import Air
 from injector_craft import COAX
 from study import arms, one_flight
+from study.plan import RICH
 
 from coax_env import diagnose
 from coax_env.diagnosis import evidence
@@ -209,7 +210,7 @@ def test_a_strong_cause_beside_brief_gusts_and_a_drift_is_alone_and_at_its_size(
     trims = {"trim_thrust": 8.45e-4, "trim_torque": 9.06e-4}
     air = Air("markov", 0.194, 0.00581, 0.00291, memory=(1.99, 0.0526), **trims)
     hidden = {"spin_up_reaction": {"gain": 0.858}}
-    injector.fly(tmp_path, hidden, gusts=air, seed=139619247, craft=COAX, card_noise=None,
+    injector.fly(tmp_path, hidden, gusts=air, seed=139619247, runs=RICH, craft=COAX, card_noise=None,
                  longest=14.0)  # fmt: skip
     (cause,) = diagnose(tmp_path).findings["causes"]
     assert cause["effect"] == "spin_up_reaction"

@@ -80,23 +80,26 @@ TRACKED = Sensors(NOISE | POSE, formats=dict.fromkeys(("h", "pn", "pe"), "%.5f")
 ON_AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "heading_turn")
 FAST = ("lon_3211", "lat_3211", "forward_run", "side_run", "heading_turn", "yaw_3211")
 
+SHORT = 9.0  # s of each run, where that shows the effect
 HIDDEN = {
-    "late attitude": ({"attitude_delay": {}}, "full", ON_AXES),
-    "gyro scale": ({"gyro_scale": {}}, "full", ON_AXES),
-    "compass": ({"magnetic_field": {}}, "full", ON_AXES),
-    "markers' axes, gyros aboard": ({"frame_yaw": {}}, "tracked", ON_AXES),
-    "markers beside the centre of gravity": ({"marker_offset": {}}, "pose", ON_AXES),
-    "tether": ({"position_spring": {}}, "tracked", FAST),
-    "upper blow-back": ({"upper_blowback": {}}, "full", FAST),
+    "late attitude": ({"attitude_delay": {}}, "full", ON_AXES, SHORT),
+    "gyro scale": ({"gyro_scale": {}}, "full", ON_AXES, SHORT),
+    "compass": ({"magnetic_field": {}}, "full", ON_AXES, SHORT),
+    "markers' axes, gyros aboard": ({"frame_yaw": {}}, "tracked", ON_AXES, 14.0),
+    "markers beside the centre of gravity": ({"marker_offset": {}}, "pose", ON_AXES, SHORT),
+    "tether": ({"position_spring": {}}, "tracked", FAST, 20.0),
+    "upper blow-back": ({"upper_blowback": {}}, "full", FAST, SHORT),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", HIDDEN)
 def test_a_sensor_or_body_effect_is_named_alone(tmp_path, monkeypatch, case):
-    hidden, sensors, runs = HIDDEN[case]
+    hidden, sensors, runs, longest = HIDDEN[case]
     monkeypatch.setitem(injector.SENSORS, "tracked", TRACKED)
-    folder = injector.fly(tmp_path / "f", hidden, sensors=sensors, runs=runs, seed=21)
+    folder = injector.fly(
+        tmp_path / "f", hidden, sensors=sensors, runs=runs, longest=longest, seed=21
+    )
     truth = truth_of(folder)
     (folder / "truth.json").unlink()
     check_causes(diagnose(folder, hold_out=[]).findings, *truth)
@@ -105,7 +108,8 @@ def test_a_sensor_or_body_effect_is_named_alone(tmp_path, monkeypatch, case):
 @pytest.mark.slow
 def test_the_bodys_own_gyroscopic_moment_misleads_nobody(tmp_path):
     """Every real body has it; flown gently it does not show, and no other effect is blamed."""
-    folder = injector.fly(tmp_path / "f", {"gyroscopic_coupling": {}}, runs=FAST, seed=21)
+    hidden = {"gyroscopic_coupling": {}}
+    folder = injector.fly(tmp_path / "f", hidden, runs=FAST, longest=SHORT, seed=21)
     (folder / "truth.json").unlink()
     assert diagnose(folder, hold_out=[]).findings["verdict"] == "consistent"
 
@@ -114,7 +118,7 @@ def test_the_bodys_own_gyroscopic_moment_misleads_nobody(tmp_path):
 def test_turned_markers_are_named_or_among_the_alternatives(tmp_path):
     """A pose alone hardly tells turned markers from a turned swash plate, and then says so."""
     folder = injector.fly(
-        tmp_path / "f", {"frame_yaw": {}}, sensors="pose", runs=ON_AXES, seed=22
+        tmp_path / "f", {"frame_yaw": {}}, sensors="pose", runs=ON_AXES, longest=SHORT, seed=22
     )
     (folder / "truth.json").unlink()
     findings = diagnose(folder, hold_out=[]).findings

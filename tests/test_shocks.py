@@ -89,7 +89,7 @@ def test_gusts_at_their_floor_are_none() -> None:
     ("arm", "kind", "number"),
     [
         ("one_minus_cosine", "clean", 0),  # a rate damping without strengths
-        ("heavy_tails", "three", 0),
+        ("heavy_tails", "two", 0),
     ],
 )
 def test_with_strengths_nothing_is_sure_that_is_not_there(arm, kind, number, tmp_path):
