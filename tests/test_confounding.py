@@ -116,6 +116,9 @@ def test_what_is_likelier_once_refitted_takes_a_causes_place(
     assert likelier(problem, fit, quadratic, evidence, {"axial_damping": {}}) is None
     small = {"rotor_drag": other.at({DRAG: 0.0})}  # another optimum explained it, not the drag
     assert likelier(problem, fit, quadratic, evidence, {"axial_damping": small}) is None
+    monkeypatch.setattr(confounding, "LATE_SERVO", ("axial_damping", "rotor_drag"))
+    late = {"axial_damping": {"rotor_drag": other}}  # moves.far_swap exchanges these
+    assert likelier(problem, fit, quadratic, evidence, late) is None
 
 
 @pytest.mark.parametrize("kept", [True, False])

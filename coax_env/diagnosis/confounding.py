@@ -18,7 +18,7 @@ from coax_env.diagnosis.evidence import (
 )
 from coax_env.diagnosis.fits import converged, fitted
 from coax_env.diagnosis.moves import from_afar
-from coax_env.diagnosis.problem import SERVO_FORMS, Fit, Problem, exclusive_with
+from coax_env.diagnosis.problem import LATE_SERVO, SERVO_FORMS, Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import cost, is_large, score, swap
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter
@@ -32,9 +32,8 @@ NEAR_TIES = 3.0
 """Ties by the quadratic within which an alternative is refitted; ours."""
 TWIN_STEPS = 6
 """Gauss-Newton steps from a lag to a delay of nothing, which is far; ours."""
-LIKELIER = 2.0
-"""nats by which an alternative must be worth more to take a cause's place: a Gauss-Newton step that
-gains less is not taken either; ours."""
+LIKELIER = 4.0
+"""nats by which an alternative must be worth more to take a cause's place: odds of 55 to 1; ours."""
 UNCONVERGED = 2.0
 """Times what may be between them within which a twin's noise is fitted, too; ours."""
 
@@ -149,7 +148,9 @@ def likelier(
 
     The search exchanges by the quadratic, which does not reach from a large number of one form to that
     of another: a thrust exponent of 4.4 usual sizes stood for a dynamic inflow that is true and was 14
-    nats likelier once refitted (**synthetic**).
+    nats likelier once refitted (**synthetic**). What makes a servo late has an exchange of its own
+    (moves.far_swap), whose fits converge: by 2.9 nats a limited rate took the place of a lag where a
+    delay was true.
 
     Args:
         problem, fit: with the causes. quadratic: linearised at the fit, the candidates in it.
@@ -166,7 +167,7 @@ def likelier(
         for effect, others in found.items()
         if not problem.changes(effect)
         for name, other in others.items()
-        if is_large(problem, name, other.values)
+        if is_large(problem, name, other.values) and not {effect, name} <= set(LATE_SERVO)
     ]
     gain, effect, name, other = max(options, key=lambda o: o[0], default=(0.0, "", "", fit))
     if gain <= LIKELIER:
