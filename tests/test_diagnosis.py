@@ -21,6 +21,7 @@ from shared_flights import shared_flight
 import coax_env
 from coax_env import diagnose, identify, load_vehicle, read_flight, replay
 from coax_env.design.candidates import candidates
+from coax_env.design.loop_oscillation import Oscillation, remark
 from coax_env.diagnosis.corrected_vehicle import with_held_out
 from coax_env.diagnosis.diagnose import Diagnosis
 from coax_env.diagnosis.fits import at_optimum, converged, fitted, linearise, noise_fitted, start
@@ -517,6 +518,14 @@ def test_an_excluded_effect_is_not_named(tmp_path):
     assert "gyro_bias" not in say_what_was_found(forbidden)
     for cause in forbidden["causes"]:
         assert "gyro_bias" not in cause["confusable_with"]
+
+
+@pytest.mark.slow
+def test_where_the_control_loop_oscillates_it_is_said(tmp_path, monkeypatch):
+    folder = injector.fly(tmp_path / "flight", {}, runs=["lon_3211"], seed=22)
+    swings = (Oscillation("yaw", 6.5, 3.7),)
+    monkeypatch.setattr("coax_env.diagnosis.diagnose.oscillations", lambda runs: swings)
+    assert remark(swings) in diagnose(folder, hold_out=[], exclude=FEW).remarks
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from coax_env.consistency.agreement import agreement
+from coax_env.design.loop_oscillation import Oscillation, remark
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.errors import InputError
 from coax_env.estimation.state_space import Noise
@@ -175,6 +176,7 @@ def test_look_alikes_of_a_hover():
 
 
 def test_the_next_step_is_a_command():
+    assert checked("hover", "lon_3211").oscillating == ()
     assert checked("hover", "lon_3211").next_step.startswith("scripts/diagnose.py FLIGHT")
     assert "scripts/check_flight.py F again" in _next_step("F", "V", True, ())
     assert "scripts/plan_flight.py --vehicle V" in _next_step("F", "V", False, ())
@@ -245,6 +247,8 @@ def test_the_script_says_it_in_tables(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         "sys.argv", ["check_flight.py", str(folder), "--out", str(tmp_path / "out")]
     )
+    swings = (Oscillation("yaw", 6.5, 3.7),)
+    monkeypatch.setattr("coax_env.inspection.flight_check.oscillations", lambda runs: swings)
     script.main()
     said = capsys.readouterr().out
     written = json.loads((tmp_path / "out" / "check.json").read_text())
@@ -252,4 +256,5 @@ def test_the_script_says_it_in_tables(tmp_path, monkeypatch, capsys):
     assert {e["effect"] for e in written["effects"]} >= {"wind", "motor_lag"}
     for effect in written["effects"]:
         assert f"\n{effect['effect']} " in said and effect["verdict"] in said
+    assert [remark(swings)] == written["oscillating"] and f"oscillates: {remark(swings)}" in said
     assert "not measured: pn pe v" in said
