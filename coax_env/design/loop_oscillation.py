@@ -142,7 +142,7 @@ def _rate(run: "Run", axis: str, dt: float) -> tuple[np.ndarray, np.ndarray] | N
     gyro, angle = AXES[axis]
     for channel in (gyro, angle):
         read = np.isfinite(run.measured[channel]) if channel in run.measured else np.zeros(0, bool)
-        if np.count_nonzero(read) < 2.0 * WINDOW * SLOWEST / FASTEST:
+        if np.count_nonzero(read) < LEAST_TIME * SLOWEST / FASTEST:  # five a period of the slowest
             continue
         at, y = run.t[read], run.measured[channel][read]
         t = np.arange(at[0], at[-1], dt)
