@@ -28,7 +28,11 @@ from coax_env.diagnosis.model_check import (
     model_check,
 )
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.remarks import held_out_before, one_step_against_a_second
+from coax_env.diagnosis.remarks import (
+    answered_gusts,
+    held_out_before,
+    one_step_against_a_second,
+)
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
@@ -140,6 +144,15 @@ def test_a_better_likelihood_with_a_worse_second_is_said(better, low, said):
     assert bool(texts) == said
     assert not said or ("50 nats" in texts[0] and "heading" in texts[0])
     assert one_step_against_a_second(None, [], [], SETTINGS) == []
+
+
+@pytest.mark.parametrize(("persistence", "said"), [(0.40, True), (0.50, False), (None, False)])
+def test_where_nothing_moves_predicts_better_beyond_chance_it_is_said(persistence, said):
+    entry: Mapping[str, Any] = {"persistence": persistence, "after": 0.54, "ci95": [0.45, 0.64]}
+    other = {"persistence": 0.1, "after": 0.2, "ci95": [None, None]}
+    texts = answered_gusts({"channels": {"psi": entry, "h": other}})
+    assert ["heading" in text and "height" not in text for text in texts] == [True] * said
+    assert answered_gusts(None) == []
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,7 @@ from coax_env.diagnosis.onsets.moment import moments_of
 from coax_env.diagnosis.onsets.search import beside_onsets, with_onsets
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import (
+    answered_gusts,
     held_out_before,
     one_step_against_a_second,
     remarks,
@@ -259,6 +260,7 @@ def diagnose(
             *([oscillation_remark(swinging)] if swinging else []),
             *remarks(problem, fit, quadratic, {e: found[e] for e in found if trust[e].named}),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
+            *answered_gusts(gain),
             *held_out_before(gain, causes, flight.run_names),
             *check.remarks,
         ),

@@ -95,6 +95,31 @@ def one_step_against_a_second(
     ]
 
 
+def answered_gusts(gain: Mapping[str, Any] | None) -> list[str]:
+    """That nothing moves predicts some channels better than the corrected model, beyond chance.
+
+    On a real heading no model whose rotors turn it the right way does better
+    (scripts/study/heading_bound.py).
+
+    Args:
+        gain: of the corrected model on the held-out runs.
+    """
+    better = [
+        channel_name(c)
+        for c, e in (gain["channels"] if gain else {}).items()
+        if e["persistence"] is not None
+        and e["ci95"][0] is not None
+        and e["persistence"] < e["ci95"][0]
+    ]
+    if not better:
+        return []
+    return [
+        f"that nothing moves predicts {and_list(better)} better a second ahead than the corrected"
+        " model: commands that answer gusts say the opposite of what they do, or the model is wrong"
+        " there; a maneuver flown without such answers would tell"
+    ]
+
+
 def held_out_before(
     gain: Mapping[str, Any] | None, causes: Sequence[Mapping[str, Any]], runs: Sequence[str]
 ) -> list[str]:
