@@ -99,12 +99,12 @@ def occam(effect: str) -> float:
 def test_what_is_likelier_once_refitted_takes_a_causes_place(
     monkeypatch, more, colour, begun, exchanged
 ):
-    """By its evidence, not its fit alone: colour and Occam's factors are in it."""
+    """By its evidence, not its fit alone: colour, no less than of what goes, and Occam's factors."""
     problem, fit, quadratic = fitted_with(0.0)
     monkeypatch.setattr(Problem, "changes", lambda self, effect: begun)
     fit = replace(fit, objective=1000.0)
     evidence = {"axial_damping": Evidence(50.0 * colour, colour)}  # worth 50 nats
-    gain = LIKELIER + more - 50.0 * (colour - 1.0) + occam(DRAG) - occam(DAMPING)
+    gain = colour * (LIKELIER + more) + occam(DRAG) - occam(DAMPING)
     other = replace(fit.at({DRAG: 1.0}), active=("rotor_drag",), objective=1000.0 - gain)
     there = likelier(problem, fit, quadratic, evidence, {"axial_damping": {"rotor_drag": other}})
     assert (there is not None) == exchanged

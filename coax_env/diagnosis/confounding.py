@@ -150,7 +150,7 @@ def likelier(
     of another: a thrust exponent of 4.4 usual sizes stood for a dynamic inflow that is true and was 14
     nats likelier once refitted (**synthetic**). What makes a servo late has an exchange of its own
     (moves.far_swap), whose fits converge: by 2.9 nats a limited rate took the place of a lag where a
-    delay was true.
+    delay was true. Colour is never less of what comes than of what goes: it is read where that is.
 
     Args:
         problem, fit: with the causes. quadratic: linearised at the fit, the candidates in it.
@@ -159,8 +159,9 @@ def likelier(
     now = cost(problem, fit, quadratic)
 
     def gained(effect: str, name: str, other: Fit) -> float:
-        lost = evidence[effect].lost + now - cost(problem, other, quadratic)
-        return lost / inflation_of(problem, other, quadratic, name) - evidence[effect].nats
+        own = evidence[effect]
+        colour = max(own.inflation, inflation_of(problem, other, quadratic, name))
+        return (own.lost + now - cost(problem, other, quadratic)) / colour - own.nats
 
     options = [
         (gained(effect, name, other), effect, name, other)
