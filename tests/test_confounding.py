@@ -121,6 +121,21 @@ def test_what_is_likelier_once_refitted_takes_a_causes_place(
     assert likelier(problem, fit, quadratic, evidence, late) is None
 
 
+@pytest.mark.parametrize("begins", [(), ("thrust_exponent",), ("dynamic_inflow",)])
+def test_what_begins_in_flight_has_no_alternative_from_afar(monkeypatch, begins):
+    """It has a size before and one after; that of an inflow would be looked for as one."""
+    names = ("thrust_exponent.excess", "dynamic_inflow.time")
+    own = {n.partition(".")[0]: (FreeParameter(n, 0.0, 1.0),) for n in names}
+    model = HeliModel(load_vehicle("lama400d"))
+    problem = Problem(model, None, (), own)  # type: ignore[arg-type]
+    fit = Fit(("thrust_exponent",), dict.fromkeys(names, 0.0), Noise({}), objective=0.0)
+    monkeypatch.setattr(Problem, "changes", lambda self, effect: effect in begins)
+    monkeypatch.setattr(confounding, "_near", lambda *given: [])
+    monkeypatch.setattr(confounding, "from_afar", lambda *given: fit)
+    found = confounding._of_one(problem, fit, None, "thrust_exponent", 1.0, 50.0)  # type: ignore[arg-type]
+    assert list(found) == ([] if begins else ["dynamic_inflow"])
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_likelier_alternative_stays_where_it_stands_once_weighed(monkeypatch, kept):
     problem, fit, quadratic = fitted_with(0.0)
@@ -138,7 +153,7 @@ def test_a_likelier_alternative_stays_where_it_stands_once_weighed(monkeypatch, 
     monkeypatch.setattr(confounding, "alternatives", lambda *given: {})
     monkeypatch.setattr(confounding, "likelier", lambda *given: other)
     monkeypatch.setattr(confounding, "as_named", lambda problem, fit, other: other)
-    there = settled(replace(problem, engine=engine), fit)[1]
+    there = settled(replace(problem, engine=engine), fit).fit
     assert asked == [("axial_damping",), ("rotor_drag",)]
     assert there.active == (("rotor_drag",) if kept else ("axial_damping",))
 

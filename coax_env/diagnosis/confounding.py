@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import expit
@@ -21,6 +22,7 @@ from coax_env.diagnosis.moves import from_afar
 from coax_env.diagnosis.problem import LATE_SERVO, SERVO_FORMS, Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import cost, is_large, score, swap
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import Whiteness, whiteness
 from coax_env.logs.flight import Flight
@@ -51,8 +53,15 @@ Alternatives = Mapping[str, Mapping[str, Fit]]
 """Cause -> its confounded alternatives -> the fit with each in the cause's place."""
 
 
-Settled = tuple[Problem, Fit, Quadratic, dict[str, Evidence], dict[str, dict[str, Fit]]]
-"""What `evidence.weighed` has of the causes, and their alternatives."""
+class Settled(NamedTuple):
+    """What `evidence.weighed` has of the causes, the passes with them, and their alternatives."""
+
+    problem: Problem
+    fit: Fit
+    quadratic: Quadratic
+    evidence: dict[str, Evidence]
+    passes: list[RunPass]
+    found: dict[str, dict[str, Fit]]
 
 
 def alike_by_poses_alone(problem: Problem, effect: str) -> list[str]:
@@ -124,17 +133,18 @@ def settled(problem: Problem, fit: Fit) -> Settled:
 
     def at(fit: Fit) -> Settled:
         own, there, quadratic, evidence = weighed(problem, fit)
-        white = whiteness(own.engine.filter(there.values, there.noise), CHANNELS)
+        passes = own.engine.filter(there.values, there.noise)
+        white = whiteness(passes, CHANNELS)
         found = alternatives(own, there, quadratic, evidence, white)
-        return own, there, quadratic, evidence, found
+        return Settled(own, there, quadratic, evidence, passes, found)
 
     first = at(fit)
-    other = likelier(*first)
+    other = likelier(first.problem, first.fit, first.quadratic, first.evidence, first.found)
     if other is None:
         return first
     second = at(as_named(problem, fit, other))
     # what is not there in the end explained nothing: another optimum did
-    return second if set(second[1].active) == set(other.active) else first
+    return second if set(second.fit.active) == set(other.active) else first
 
 
 def likelier(
@@ -285,6 +295,8 @@ def _of_one(
     # a lag is far from a delay of nothing: the quadratic does not reach there, and both may be there
     absent = set(problem.candidates) - set(found) - set(fit.active)
     for other in sorted(FAR.get(effect, frozenset()) & absent):
+        if problem.changes(effect) or problem.changes(other):
+            continue  # it has two sizes, and no likeliest one
         trial = from_afar(problem, fit, quadratic, effect, other)
         if trial.objective - fit.objective < tie:
             found[other] = trial

@@ -191,10 +191,9 @@ def diagnose(
     state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
     report("weighing the causes against their confounded alternatives")
-    problem, fit, quadratic, evidence, found = confounding.settled(
+    problem, fit, quadratic, evidence, passes_after, found = confounding.settled(
         beside_large_axes(problem, fit), fit
     )
-    passes_after = problem.engine.filter(fit.values, fit.noise)
     white = {
         "before": whiteness(passes_before, CHANNELS),
         "after": whiteness(passes_after, CHANNELS),
