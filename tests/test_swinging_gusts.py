@@ -200,17 +200,19 @@ def test_a_gust_that_only_fades_has_none():
 
 
 @pytest.mark.parametrize(
-    ("peak", "alone", "gain", "used"),
+    ("peak", "times", "alone", "gain", "used"),
     [
-        (0.8, 60.0, 100.0, True),
-        (0.0, 60.0, 100.0, False),  # no swings
-        (0.8, 5.0, 100.0, False),  # none where they are clearest
-        (0.8, 60.0, 10.0, False),  # not worth the threshold
+        (0.8, 2.1, 60.0, 100.0, True),
+        (0.0, 2.1, 60.0, 100.0, False),  # no swings
+        (0.8, 1.9, 60.0, 100.0, False),  # hardly more than the least that gusts may be
+        (0.8, 2.1, 5.0, 100.0, False),  # none where they are clearest
+        (0.8, 2.1, 60.0, 10.0, False),  # not worth the threshold
     ],
 )
-def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, peak, alone, gain, used):
-    """The fits are stand-ins, which gain at once what they may."""
-    fit = Fit((), {}, NOISE, objective=500.0)
+def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, peak, times, alone, gain, used):
+    """The fits are stand-ins, which gain at once what they may; gusts are so many times their floor."""
+    floor = {"force_z": NOISE.level("force_z") / times}
+    fit = Fit((), {}, replace(NOISE, floor=floor), objective=500.0)
     gained = lambda problem, fit: replace(fit, objective=500.0 - gain)  # noqa: E731
     monkeypatch.setattr(asking, "swings", lambda passes, row: [peak] * 6)
     monkeypatch.setattr(asking, "clearest", lambda passes, row: "force_z")

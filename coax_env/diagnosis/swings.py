@@ -2,12 +2,12 @@
 
 Asked after a search, of white innovations too: poses are too coarse to be coloured by a swing, and it
 makes false names all the same. Spectra of the filter's own gusts show where each may swing
-(estimation/swinging_gusts.py). Spectra peak by chance, too: where the clearest group of axes gains no
-more than a tie by swinging alone, nothing else is asked. From there frequencies, noise levels and
-numbers are fitted in turns, frequencies by the likelihood itself, since they change the filter's gains.
-Gusts that swing have no fast part, so that white noise is asked for once more. What a model lacks may
-look like a swing as well: after a search with them nothing may be coloured, or none is used
-(searched.py).
+(estimation/swinging_gusts.py). Spectra peak by chance, too: where the clearest group of axes is hardly
+felt, or gains no more than a tie by swinging alone, nothing else is asked. From there frequencies,
+noise levels and numbers are fitted in turns, frequencies by the likelihood itself, since they change
+the filter's gains. Gusts that swing have no fast part, so that white noise is asked for once more.
+What a model lacks may look like a swing as well: after a search with them nothing may be coloured, or
+none is used (searched.py).
 """
 
 import math
@@ -42,6 +42,9 @@ FAR = 1.7
 fitted once more: a peak is up to 0.1 Hz off; ours."""
 SLOWEST = 0.05
 """Hz: slower, no run shows a swing of; ours."""
+FELT = 2.0
+"""Times its floor that the level of a group's gusts must be for a swing of it to be asked; ours. In
+still air all are at it, and what a filter makes of nothing has peaks, too."""
 
 
 def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] | None:
@@ -52,9 +55,10 @@ def with_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, float]] 
     """
     passes = problem.engine.filter(fit.values, fit.noise)
     frequencies = swings(passes, problem.row)
-    if not any(frequencies):
+    axes = clearest(passes, problem.row)
+    if not any(frequencies) or not _is_felt(fit.noise, axes):
         return None
-    alone = _gained_by(problem, fit, frequencies, clearest(passes, problem.row))
+    alone = _gained_by(problem, fit, frequencies, axes)
     if alone < problem.settings.tie:
         return None
     return _fitted_from(problem, fit, frequencies)
@@ -76,6 +80,11 @@ def with_other_swings(problem: Problem, fit: Fit) -> tuple[Problem, dict[str, fl
     if not is_new and max(apart, default=0.0) < math.log(FAR):
         return None
     return _fitted_from(problem, fit, found)
+
+
+def _is_felt(noise: Noise, axes: str) -> bool:
+    """Whether the gusts of a group of axes are more than the least that there may be."""
+    return noise.level(axes) > FELT * noise.floor.get(axes, 0.0)
 
 
 def _fitted_from(
