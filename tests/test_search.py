@@ -67,6 +67,8 @@ def moves(monkeypatch):
     monkeypatch.setattr(module, "threshold", lambda problem, q, active: SETTINGS.evidence)
     monkeypatch.setattr(module, "swaps", lambda *given: iter(()))
     monkeypatch.setattr(module, "trials", lambda *given: ([], []))
+    monkeypatch.setattr(module, "runners_up", lambda *given: {})
+    monkeypatch.setattr(module, "exchanged", lambda *given: None)
     monkeypatch.setattr(module, "scores", lambda p, fit, q, banned: [
         c for c in (given["scores"].pop(0) if given["scores"] else []) if c.effect not in banned
     ])  # fmt: skip

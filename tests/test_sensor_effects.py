@@ -85,7 +85,7 @@ HIDDEN = {
     "late attitude": ({"attitude_delay": {}}, "full", ON_AXES, SHORT),
     "gyro scale": ({"gyro_scale": {}}, "full", ON_AXES, SHORT),
     "compass": ({"magnetic_field": {}}, "full", ON_AXES, SHORT),
-    "markers' axes, gyros aboard": ({"frame_yaw": {}}, "tracked", ON_AXES, 14.0),
+    "markers' axes, gyros aboard": ({"frame_yaw": {}}, "tracked", ON_AXES, SHORT),
     "markers beside the centre of gravity": ({"marker_offset": {}}, "pose", ON_AXES, SHORT),
     "tether": ({"position_spring": {}}, "tracked", FAST, 20.0),
     "upper blow-back": ({"upper_blowback": {}}, "full", FAST, SHORT),

@@ -40,6 +40,7 @@ from coax_env.diagnosis.problem import (
     Fit,
     Problem,
 )
+from coax_env.diagnosis.runners_up import RunnersUp, exchanged, runners_up
 from coax_env.diagnosis.scores import Score, loss, most_gains, scores, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
@@ -88,6 +89,7 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
         if not complete:
             moved = moved or _steadier(problem, fit, memory)
             moved = moved or _swap(problem, fit, quadratic, memory)
+            moved = moved or _exchanged(problem, fit, quadratic, memory)
             moved = moved or _trial(problem, fit, quadratic, candidates, memory)
             moved = moved or _with_late_rotors(problem, fit, quadratic, memory)
             moved = moved or with_latent_noise(problem, fit)
@@ -160,6 +162,8 @@ class _Memory:
     banned: effects dropped since an addition last held. tried: sets of effects that were fitted.
     steadied: sets of effects beside which steadier noise was asked for. briefed: and brief gusts.
     rotored: beside which rotors that follow late were tried.
+    behind: effects that were added -> their runners-up. exchanged: sets of effects in which these were
+        tried.
     drops: how often each effect was dropped. failures: additions in a row that did not hold.
     most: effects that were active together and held.
     """
@@ -169,6 +173,8 @@ class _Memory:
     steadied: set[tuple[str, ...]] = field(default_factory=set)
     briefed: set[tuple[str, ...]] = field(default_factory=set)
     rotored: set[tuple[str, ...]] = field(default_factory=set)
+    behind: dict[str, RunnersUp] = field(default_factory=dict)
+    exchanged: set[tuple[str, ...]] = field(default_factory=set)
     drops: Counter[str] = field(default_factory=Counter)
     failures: int = 0
     most: int = 0
@@ -195,6 +201,8 @@ def _forward(
     if memory.failures >= problem.settings.most_failures:
         return None
     moved = add(problem, fit, passes, quadratic, strong)
+    if moved:
+        memory.behind[strong[0].effect] = runners_up(problem, fit, quadratic, strong)
     if moved and len(moved.active) > memory.most + 1:  # the addition before this one held
         memory.most, memory.failures = len(moved.active) - 1, 0
         memory.banned = {e for e, count in memory.drops.items() if count > 1}
@@ -231,6 +239,18 @@ def _in_brief_gusts(
 
 def _swap(problem: Problem, fit: Fit, quadratic: Quadratic, memory: _Memory) -> Fit | None:
     return _first_accepted(problem, fit, swaps(problem, fit, quadratic, memory.tried), memory)
+
+
+def _exchanged(problem: Problem, fit: Fit, quadratic: Quadratic, memory: _Memory) -> Fit | None:
+    """With the runner-up of an effect in its place; the other way round is not tried again."""
+    if fit.active in memory.exchanged:
+        return None
+    memory.exchanged.add(fit.active)
+    for effect in fit.active:
+        moved = exchanged(problem, fit, quadratic, effect, memory.behind.get(effect, {}))
+        if moved:
+            return moved
+    return None
 
 
 def _trial(
