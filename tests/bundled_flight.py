@@ -1,5 +1,6 @@
 """The flight that the package brings along, or some of its runs, as a folder to be changed."""
 
+import json
 import shutil
 from functools import cache
 from pathlib import Path
@@ -14,6 +15,19 @@ BUNDLED = Path(coax_env.__file__).parent / "logs" / "flights" / "windy"
 def bundled() -> Flight:
     """As read: once, for all tests of a process."""
     return read_flight(BUNDLED)
+
+
+def what_it_hides() -> tuple[list[str], dict[str, float]]:
+    """Names of its effects, and every number of theirs by the catalogue's names."""
+    planted = json.loads((BUNDLED / "truth.json").read_text())
+    values = planted["values"]
+    gyro = dict(zip("xyz", values["gyro_bias"], strict=True))
+    return planted["hidden"], {
+        "rotor_drag.coefficient": values["kdrag"],
+        "wind.north": values["wn"], "wind.east": values["we"],
+        "motor_lag.upper": values["motor_tau"], "motor_lag.lower": values["motor_tau"],
+        **{f"gyro_bias.{axis}": bias for axis, bias in gyro.items()},
+    }  # fmt: skip
 
 
 def copied(folder: Path, *runs: str, sound: Path = BUNDLED) -> Path:

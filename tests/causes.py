@@ -65,6 +65,13 @@ def check_causes(
     )  # fmt: skip
 
 
+def check_all_sure(findings: Mapping[str, Any]) -> None:
+    """No true name is doubted; a flight outside the calibrated class is said to be so, and why."""
+    assert {c["effect"]: c["doubts"] for c in findings["causes"] if c["trust"] != "sure"} == {}
+    in_class = findings["class"]["calibrated"] is not None
+    assert (findings["false_alarm_rate"] is not None) == in_class == (not findings["class"]["why"])
+
+
 def truth_of(folder: Path) -> tuple[list[str], dict[str, float]]:
     """What the injector hid in a flight: effects, and all their numbers in the catalogue's form."""
     truth = json.loads((folder / "truth.json").read_text())

@@ -383,7 +383,7 @@ def test_scripts_design_and_evaluate(tmp_path):
             [sys.executable, SCRIPTS / name, *words], capture_output=True, text=True, cwd=tmp_path
         )
 
-    made = call("design_lqr.py", "--out", "design")
+    made = call("design_lqr.py", "--vehicles", "2", "--out", "design")
     assert made.returncode == 0, made.stderr
     assert "disk margin" in made.stdout
     assert "<html" in (tmp_path / "design" / "report.html").read_text(encoding="utf-8")

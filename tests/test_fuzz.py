@@ -47,7 +47,7 @@ def test_a_spoilt_file_is_read_or_refused(name, tmp_path, changes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
-@some(1500)
+@some(800)
 @given(changes=CHANGES)
 def test_many_spoilt_files_are_read_or_refused(name, tmp_path, changes):
     try_changes(name, tmp_path, changes)

@@ -259,7 +259,7 @@ def test_quick_tests_without_end_are_a_catch_and_slow_ones_are_none(
     root, _ = toy
     endless = f"import pytest, time\n\n{mark}def test_endless():\n    time.sleep(60)\n"
     (root / "tests/test_toy.py").write_text(endless)
-    monkeypatch.setattr(trial, "LIMIT", 10.0)  # an interpreter starts in less
+    monkeypatch.setattr(trial, "LIMIT", 6.0)  # an interpreter starts in less
     (mutation, *_) = draw.all_sites(root)
     assert trial.Tree(root, tmp_path / "job").try_out(mutation, rest=False)["caught"] == caught
 

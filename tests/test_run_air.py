@@ -186,7 +186,9 @@ def test_it_must_be_worth_its_numbers_beside_the_threshold(monkeypatch, factors,
 def test_nothing_is_named_where_runs_are_flown_on_several_days(tmp_path):
     """By poses alone, gusts of a quarter to twice the strength and other memories. **Synthetic**."""
     air = Air("days", force=0.18, moment_xy=0.0055, moment_z=0.0028, memory=(0.07, 1.1))
-    injector.fly(tmp_path, {}, gusts=air, sensors="pose", seed=12, runs=RICH, longest=14.0, craft=COAX)
+    injector.fly(
+        tmp_path, {}, gusts=air, sensors="pose", seed=12, runs=RICH, longest=10.0, craft=COAX
+    )
     found = diagnose(tmp_path)
     assert found.findings["causes"] == []
     assert any(line.startswith("each run has air of its own") for line in found.remarks)
