@@ -117,7 +117,7 @@ def test_what_is_likelier_once_refitted_takes_a_causes_place(
     small = {"rotor_drag": other.at({DRAG: 0.0})}  # another optimum explained it, not the drag
     assert likelier(problem, fit, quadratic, evidence, {"axial_damping": small}) is None
     monkeypatch.setattr(confounding, "LATE_SERVO", ("axial_damping", "rotor_drag"))
-    late = {"axial_damping": {"rotor_drag": other}}  # moves.far_swap exchanges these
+    late = {"axial_damping": {"rotor_drag": other}}  # from_afar.far_swap exchanges these
     assert likelier(problem, fit, quadratic, evidence, late) is None
 
 
@@ -131,7 +131,7 @@ def test_what_begins_in_flight_has_no_alternative_from_afar(monkeypatch, begins)
     fit = Fit(("thrust_exponent",), dict.fromkeys(names, 0.0), Noise({}), objective=0.0)
     monkeypatch.setattr(Problem, "changes", lambda self, effect: effect in begins)
     monkeypatch.setattr(confounding, "_near", lambda *given: [])
-    monkeypatch.setattr(confounding, "from_afar", lambda *given: fit)
+    monkeypatch.setattr(confounding, "in_place_of", lambda *given: fit)
     found = confounding._of_one(problem, fit, None, "thrust_exponent", 1.0, 50.0)  # type: ignore[arg-type]
     assert list(found) == ([] if begins else ["dynamic_inflow"])
 

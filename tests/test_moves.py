@@ -5,7 +5,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-import injector
 import numpy as np
 import pytest
 
@@ -13,16 +12,13 @@ from coax_env import load_vehicle
 from coax_env.diagnosis import black_box as black_box_module
 from coax_env.diagnosis import confounding, corrected_vehicle, moves
 from coax_env.diagnosis.black_box import PRIOR_WIDTHS, black_box
-from coax_env.diagnosis.fits import converged, fitted, quadratic_at, start
 from coax_env.diagnosis.moves import Proposal
-from coax_env.diagnosis.problem import LATE_ROTORS, LATE_SERVO, Fit, Problem
+from coax_env.diagnosis.problem import LATE_ROTORS, Fit, Problem
 from coax_env.diagnosis.scores import Score
 from coax_env.diagnosis.settings import SETTINGS
-from coax_env.estimation.helicopter import HeliModel, record_of
-from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
-from coax_env.logs.flight import read_flight
 from coax_env.model.generic_terms import AXES, TERMS
 
 MODEL = HeliModel(load_vehicle("lama400d"))
@@ -41,102 +37,6 @@ OCCAM = SimpleNamespace(occam=lambda own, rest: 3.0)
 FIT = Fit(
     ("gyro_bias", "wind"), {f.name: f.value for f in PROBLEM.parameters}, NOISE, objective=500.0
 )
-
-
-# --- what makes a servo late --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("had", "candidates", "tried"),
-    [
-        ("servo_lag", ("servo_rate", "servo_delay"), ["servo_rate"]),
-        ("servo_rate", ("servo_lag", "servo_delay"), ["servo_lag", "servo_delay"]),
-        ("servo_lag", ("servo_delay",), []),
-        ("wind", ("servo_lag", "servo_rate"), []),
-    ],
-)
-def test_what_makes_a_servo_late_is_fitted_in_the_place_of_what_else_does(
-    monkeypatch, had, candidates, tried
-):
-    """From its likeliest size, and taken where it is likelier by more than a tie and large."""
-    peak = {"servo_rate": 2.2, "servo_lag": 0.03, "servo_delay": 0.011}
-
-    def likelihood(values: dict[str, float], noise: Noise) -> float:
-        sizes = {e: values[f.name] for e in tried for f in own.own[e]}
-        return -sum(math.log(x / peak[e]) ** 2 for e, x in sizes.items() if x > 0.0)
-
-    own = problem(had, *candidates)
-    engine: Any = SimpleNamespace(threads=1, records=[], log_likelihood=likelihood)
-    own = replace(own, engine=engine)
-    begun: list[tuple[str, dict[str, float]]] = []
-    gained = 0.0
-
-    def without(problem: Problem, fit: Fit, quadratic: object, old: str) -> Fit:
-        return replace(fit, active=fit.rest(old))
-
-    def fitted(problem: Problem, fit: Fit) -> Fit:
-        (new,) = fit.active
-        begun.append((new, {f.name: fit.values[f.name] for f in own.own[new]}))
-        return replace(fit, objective=500.0 - gained)
-
-    for name, stand_in in (("without", without), ("fitted", fitted)):
-        monkeypatch.setattr(moves, name, stand_in)
-    monkeypatch.setattr(moves, "converged", lambda problem, fit: fit)
-    fit = replace(FIT, active=(had,), values={f.name: f.value for f in own.parameters})
-    quadratic: Any = None
-    assert moves.far_swap(own, fit, quadratic) is None
-    assert list(dict.fromkeys(e for e, _ in begun)) == tried
-    for e, values in begun:
-        assert list(values.values()) == [pytest.approx(peak[e], rel=0.03)]
-    gained = SETTINGS.tie + 0.1
-    found = moves.far_swap(own, fit, quadratic)
-    assert (found.active if found else ()) == tuple(tried[:1])
-    begun.clear()
-    with monkeypatch.context() as patch:
-        patch.setattr(Problem, "changes", lambda problem, effect: True)
-        assert moves.far_swap(own, fit, quadratic) is None and not begun, "it has two sizes"
-    monkeypatch.setattr(moves, "is_large", lambda *given: False)
-    assert moves.far_swap(own, fit, quadratic) is None
-
-
-def test_no_delay_stands_in_a_limited_rates_place_beside_a_lag():
-    """One servo has a lag or a delay; either may stand for the rate where it is alone."""
-    own = problem(*LATE_SERVO)
-    fit = replace(FIT, active=("servo_lag", "servo_rate"))
-    assert moves._far_pairs(own, fit) == []
-    alone = replace(FIT, active=("servo_rate",))
-    assert [new for _, new in moves._far_pairs(own, alone)] == ["servo_lag", "servo_delay"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("hidden", "named"),
-    [
-        ({"servo_rate": {"limit": 1.33}}, "servo_lag"),
-        ({"servo_lag": {"time": 0.06}}, "servo_rate"),
-        ({"servo_lag": {"time": 0.06}}, "servo_lag"),
-    ],
-)
-def test_a_limited_rate_and_a_lag_are_told_apart_in_gusts(tmp_path, hidden, named):
-    """A servo of each kind, beside play, named as the other: what it is takes its place."""
-    effects = hidden | {"servo_play": {"width": 0.02}}
-    folder = injector.fly(
-        tmp_path / "f", effects, gusts=True, runs=("lon_3211", "lat_3211", "forward_run"), seed=4
-    )
-    flight = read_flight(folder)
-    model = HeliModel(load_vehicle("lama400d"))
-    made = Problem.of(model, [record_of(run) for run in flight.runs], (*LATE_SERVO, "servo_play"))
-    fit = start(made, starting_noise(flight, model.vehicle))
-    usual = {f.name: f.value + f.probe for e in (named, "servo_play") for f in made.own[e]}
-    fit = replace(fit.at(usual), active=(named, "servo_play"))
-    fit, quadratic = quadratic_at(made, converged(made, fitted(made, fit)))
-    found = moves.far_swap(made, fit, quadratic)
-    (true,) = hidden
-    assert (found is None) == (named == true)
-    if found is not None:
-        assert found.active == (true, "servo_play")
-        ((number, size),) = hidden[true].items()
-        assert found.values[f"{true}.{number}"] == pytest.approx(size, rel=0.15)
 
 
 # --- rotors that nobody sees --------------------------------------------------------------------------

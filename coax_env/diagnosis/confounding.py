@@ -18,7 +18,7 @@ from coax_env.diagnosis.evidence import (
     weighed,
 )
 from coax_env.diagnosis.fits import converged, fitted
-from coax_env.diagnosis.moves import from_afar
+from coax_env.diagnosis.from_afar import FAR, in_place_of
 from coax_env.diagnosis.problem import LATE_SERVO, SERVO_FORMS, Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import cost, is_large, score, swap
 from coax_env.estimation.quadratic import Quadratic
@@ -38,11 +38,6 @@ LIKELIER = 4.0
 """nats by which an alternative must be worth more to take a cause's place: odds of 55 to 1; ours."""
 UNCONVERGED = 2.0
 """Times what may be between them within which a twin's noise is fitted, too; ours."""
-
-FAR: Mapping[str, frozenset[str]] = {"thrust_exponent": frozenset({"dynamic_inflow"})}
-"""Alternatives that no slope shows from where they are not: thrust that answers quick changes of speed
-by more than slow ones. An inflow follows late by any time, and how far thrust overshoots hardly depends
-on it: of six **synthetic** inflows of 0.1 to 0.24 s four were an exponent of 4 to 5 usual sizes."""
 
 LATE = frozenset({"command_delay", "pose_delay"})
 """By poses alone one lateness: what was commanded is seen so much later. The likelihood prefers one
@@ -156,11 +151,12 @@ def likelier(
 ) -> Fit | None:
     """The fit with an alternative in a cause's place that is worth more than it, if any is.
 
-    The search exchanges by the quadratic, which does not reach from a large number of one form to that
-    of another: a thrust exponent of 4.4 usual sizes stood for a dynamic inflow that is true and was 14
-    nats likelier once refitted (**synthetic**). What makes a servo late has an exchange of its own
-    (moves.far_swap), whose fits converge: by 2.9 nats a limited rate took the place of a lag where a
-    delay was true. Colour is never less of what comes than of what goes: it is read where that is.
+    The search exchanges by the quadratic, which does not reach from a large number of one form to
+    that of another: a thrust exponent of 4.4 usual sizes stood for a dynamic inflow that is true and
+    was 14 nats likelier once refitted (**synthetic**). What makes a servo late has an exchange of its
+    own (from_afar.far_swap), whose fits converge: by 2.9 nats a limited rate took the place of a lag
+    where a delay was true. Colour is never less of what comes than of what goes: it is read where
+    that is.
 
     Args:
         problem, fit: with the causes. quadratic: linearised at the fit, the candidates in it.
@@ -297,7 +293,7 @@ def _of_one(
     for other in sorted(FAR.get(effect, frozenset()) & absent):
         if problem.changes(effect) or problem.changes(other):
             continue  # it has two sizes, and no likeliest one
-        trial = from_afar(problem, fit, quadratic, effect, other)
+        trial = in_place_of(problem, fit, quadratic, effect, other)
         if trial.objective - fit.objective < tie:
             found[other] = trial
     for twin in sorted(exclusive_with(effect) & absent):

@@ -37,8 +37,9 @@ from coax_env.diagnosis.fits import (
     with_latent_noise,
     without,
 )
+from coax_env.diagnosis.from_afar import far_swap
 from coax_env.diagnosis.input_innovations import has_command_gains, with_command_gains
-from coax_env.diagnosis.moves import TOO_SMALL, dropped_in_brief_gusts, far_swap
+from coax_env.diagnosis.moves import TOO_SMALL, dropped_in_brief_gusts
 from coax_env.diagnosis.problem import (
     OWN_WEAK_OR_LATE,
     PURE_DELAYS,

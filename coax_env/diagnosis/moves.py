@@ -4,8 +4,6 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from scipy.optimize import minimize_scalar
-
 from coax_env.diagnosis.fits import (
     at_optimum,
     brief_memories,
@@ -18,10 +16,10 @@ from coax_env.diagnosis.fits import (
     with_latent_noise,
     without,
 )
+from coax_env.diagnosis.from_afar import BEHIND, STEPS, TURNS, likeliest
 from coax_env.diagnosis.problem import (
     COMMAND_DELAY,
     LATE_ROTORS,
-    LATE_SERVO,
     SERVO_FORMS,
     SERVO_RATE,
     Fit,
@@ -44,16 +42,6 @@ from coax_env.plain_words import and_list
 
 BRIEF_TURNS = 2
 """Of values and noise from brief gusts, before drifts and white noise are asked for; ours."""
-REACH = 4.0
-"""Times its usual size, and that part of it, between which a number is looked for; ours."""
-WITHIN = 0.02
-"""Of its logarithm, to which it is; ours."""
-FAR_TURNS = 2
-"""Of its likeliest size and all other numbers; ours."""
-FAR_STEPS = 6
-"""Gauss-Newton steps of a fit that begins far from where the search stands; ours."""
-BEHIND = 5.0
-"""Ties by which it may be less likely then, before noise levels have converged; ours."""
 TOO_SMALL = "too small to matter in prediction"
 
 
@@ -123,7 +111,7 @@ def add(
     if fixed:  # takes the base parameter's place: the same model, not a better one
         moved = at_optimum(problem, fit, quadratic, active, fixed)
     elif effect == SERVO_RATE and not problem.changes(effect):
-        moved = _likeliest(problem, replace(fit, active=active), effect)
+        moved = likeliest(problem, replace(fit, active=active), effect)
     else:
         moved = stepped(problem, replace(fit, active=active), passes, quadratic)
     return moved.noted(f"+ {effect}", nats)
@@ -214,74 +202,6 @@ def swaps(
         yield Proposal(f"{old} -> {new}", new, begin, 0.0, problem.settings.tie, words)
 
 
-def far_swap(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
-    """What makes a servo late in the place of what else does (LATE_SERVO), from its likeliest size.
-
-    That is looked for first: the slope in a limited rate is that of the few moments at the limit, and
-    Gauss-Newton's steps end at 1.07 rad/s on the way from 1 to 1.33 (**synthetic**).
-
-    Args:
-        problem, fit: what may be free, and where; converged.
-        quadratic: linearised at the fit.
-    """
-    for old, new in _far_pairs(problem, fit):
-        trial = from_afar(problem, fit, quadratic, old, new)
-        gained = fit.objective - trial.objective
-        if gained > problem.settings.tie and is_large(problem, new, trial.values):
-            problem.report(f"{new} explains it better than {old}, by {gained:.1f} nats in the end")
-            return trial.noted(f"{old} -> {new}", gained)
-    return None
-
-
-def from_afar(problem: Problem, fit: Fit, quadratic: Quadratic, old: str, new: str) -> Fit:
-    """The fit with one effect in another's place, begun at its likeliest size.
-
-    It converges unless it stays far behind.
-
-    Args:
-        problem, fit: what may be free, and where. quadratic: linearised at the fit.
-        old: an active effect. new: one with one number, that is not active.
-    """
-    active = tuple(new if e == old else e for e in fit.active)
-    trial = replace(without(problem, fit, quadratic, old), active=active)
-    for _ in range(FAR_TURNS):
-        trial = fitted(problem, _likeliest(problem, trial, new))
-        if not trial.objective < fit.objective + BEHIND * problem.settings.tie:
-            return trial
-    return converged(problem, trial)
-
-
-def _far_pairs(problem: Problem, fit: Fit) -> list[tuple[str, str]]:
-    """What makes a servo late, and what may stand in its place; lag and delay are near each other."""
-    return [
-        (old, new)
-        for old in fit.active
-        if old in LATE_SERVO and not problem.changes(old)
-        for new in LATE_SERVO
-        if SERVO_RATE in (old, new) and new in problem.candidates
-        if new not in fit.active and not problem.changes(new)
-        if not exclusive_with(new) & set(fit.rest(old))
-    ]
-
-
-def _likeliest(problem: Problem, fit: Fit, effect: str) -> Fit:
-    """The fit at the likeliest size of an effect's one number, all else held."""
-    (number,) = problem.own[effect]
-
-    def at(logarithm: float) -> Fit:
-        return fit.at({number.name: math.exp(logarithm)})
-
-    def cost(logarithm: float) -> float:
-        return -problem.engine.log_likelihood(at(logarithm).values, fit.noise)
-
-    usual = number.value + number.probe
-    found = minimize_scalar(
-        cost, bounds=(math.log(usual / REACH), math.log(usual * REACH)), method="bounded",
-        options={"xatol": WITHIN},
-    )  # fmt: skip
-    return at(float(found.x))
-
-
 # --- rotors that nobody sees --------------------------------------------------------------------------
 
 
@@ -299,8 +219,8 @@ def late_rotors(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
     now = cost(problem, fit, quadratic)
     best, least = None, now - problem.settings.tie
     for begin in _with_late_rotors(problem, fit):
-        trial = fitted(problem, begin, FAR_STEPS)
-        for _ in range(FAR_TURNS):
+        trial = fitted(problem, begin, STEPS)
+        for _ in range(TURNS):
             trial = fitted(problem, noise_fitted(problem, trial))
         if not trial.objective < fit.objective + BEHIND * problem.settings.tie:
             continue

@@ -22,6 +22,7 @@ from coax_env.diagnosis.fits import (
     stepped,
     with_latent_noise,
 )
+from coax_env.diagnosis.from_afar import RunnersUp, exchanged, runners_up
 from coax_env.diagnosis.moves import (
     Proposal,
     accepted,
@@ -40,7 +41,6 @@ from coax_env.diagnosis.problem import (
     Fit,
     Problem,
 )
-from coax_env.diagnosis.runners_up import RunnersUp, exchanged, runners_up
 from coax_env.diagnosis.scores import Score, loss, most_gains, scores, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
