@@ -36,7 +36,7 @@ def problem(monkeypatch) -> Any:
     said: list[str] = []
     made = SimpleNamespace(
         settings=SETTINGS, own=OWN, candidates=tuple(OWN), report=said.append, said=said, ends={},
-        asked=[], large=True, worth=2.0 * FAR_OFF,
+        asked=[], large=True, occam={}, worth=2.0 * FAR_OFF,
         file_values=lambda effect: {}, off_values=lambda effect: {NUMBERS[effect]: 0.0},
     )  # fmt: skip
 
@@ -48,6 +48,12 @@ def problem(monkeypatch) -> Any:
     monkeypatch.setattr(from_afar, "noise_fitted", lambda problem, fit: fit)
     monkeypatch.setattr(from_afar, "converged", lambda problem, fit: fit)
     monkeypatch.setattr(from_afar, "is_large", lambda problem, effect, values: made.large)
+    monkeypatch.setattr(from_afar, "quadratic_at", lambda problem, fit: (fit, None))
+    monkeypatch.setattr(
+        from_afar,
+        "cost",
+        lambda problem, fit, q: fit.objective + made.occam.get(fit.active[-1], 0.0),
+    )
     monkeypatch.setattr(from_afar, "loss", lambda problem, q, active, effect, inflation: made.worth)
     return made
 
@@ -72,16 +78,17 @@ def test_those_that_explain_half_as_much_as_the_first_are_kept_with_their_number
 
 
 @pytest.mark.parametrize(
-    ("end", "worth", "large", "taken"),
+    ("end", "occam", "worth", "large", "taken"),
     [
-        (93.0, 2.0 * FAR_OFF, True, True),
-        (95.0, 2.0 * FAR_OFF, True, False),  # a tie is 6
-        (93.0, 0.9 * FAR_OFF, True, False),  # the quadratic reaches that far
-        (93.0, 2.0 * FAR_OFF, False, False),
+        (91.0, 2.0, 2.0 * FAR_OFF, True, True),
+        (91.0, 4.0, 2.0 * FAR_OFF, True, False),  # a tie is 6
+        (91.0, 2.0, 0.9 * FAR_OFF, True, False),  # the quadratic reaches that far
+        (91.0, 2.0, 2.0 * FAR_OFF, False, False),
     ],
 )
-def test_the_likelier_one_takes_its_place(problem, end, worth, large, taken):
-    problem.ends = {(DRAG, MARKERS): end}
+def test_the_likelier_one_takes_its_place(problem, end, occam, worth, large, taken):
+    """By its evidence: what has more numbers pays for them."""
+    problem.ends, problem.occam = {(DRAG, MARKERS): end}, {MARKERS: occam}
     problem.worth, problem.large = worth, large
     others = {MARKERS: {NUMBERS[MARKERS]: 0.14}}
     found = exchanged(problem, fit_of(DRAG, PLATE), None, PLATE, others)

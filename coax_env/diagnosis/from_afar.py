@@ -19,9 +19,16 @@ from dataclasses import replace
 
 from scipy.optimize import minimize_scalar
 
-from coax_env.diagnosis.fits import at_optimum, converged, fitted, noise_fitted, without
+from coax_env.diagnosis.fits import (
+    at_optimum,
+    converged,
+    fitted,
+    noise_fitted,
+    quadratic_at,
+    without,
+)
 from coax_env.diagnosis.problem import LATE_SERVO, SERVO_RATE, Fit, Problem, exclusive_with
-from coax_env.diagnosis.scores import Score, is_large, loss
+from coax_env.diagnosis.scores import Score, cost, is_large, loss
 from coax_env.estimation.quadratic import Quadratic
 
 REACH = 4.0
@@ -58,7 +65,8 @@ def far_swap(problem: Problem, fit: Fit, quadratic: Quadratic) -> Fit | None:
         quadratic: linearised at the fit.
     """
     for old, new in _late_pairs(problem, fit):
-        taken = _taken(problem, fit, in_place_of(problem, fit, quadratic, old, new), old, new)
+        trial = in_place_of(problem, fit, quadratic, old, new)
+        taken = _taken(problem, trial, fit.objective - trial.objective, old, new)
         if taken is not None:
             return taken
     return None
@@ -85,7 +93,7 @@ def runners_up(
 def exchanged(
     problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, others: RunnersUp
 ) -> Fit | None:
-    """The fit with one of its runners-up in an effect's place, where that is likelier in the end.
+    """The fit with one of its runners-up in an effect's place, where that has more evidence in the end.
 
     Args:
         problem, fit: what may be free, and where; fitted. quadratic: linearised at the fit.
@@ -100,7 +108,9 @@ def exchanged(
             continue
         begun = replace(fit.at({**gone, **numbers}), active=_with_instead(fit, effect, other))
         trial = _to_the_end(problem, fit, begun, lambda trial: _in_own_noise(problem, trial))
-        taken = _taken(problem, fit, trial, effect, other)
+        trial, there = quadratic_at(problem, trial)
+        gained = cost(problem, fit, quadratic) - cost(problem, trial, there)
+        taken = _taken(problem, trial, gained, effect, other)
         if taken is not None:
             return taken
     return None
@@ -172,9 +182,8 @@ def _to_the_end(problem: Problem, fit: Fit, trial: Fit, turn: Callable[[Fit], Fi
     return converged(problem, trial)
 
 
-def _taken(problem: Problem, fit: Fit, trial: Fit, old: str, new: str) -> Fit | None:
-    """The trial, where it is likelier than the fit by more than a tie and what came matters."""
-    gained = fit.objective - trial.objective
+def _taken(problem: Problem, trial: Fit, gained: float, old: str, new: str) -> Fit | None:
+    """The trial, where it gains more than a tie and what came matters."""
     if not gained > problem.settings.tie or not is_large(problem, new, trial.values):
         return None
     problem.report(f"{new} explains it better than {old}, by {gained:.1f} nats in the end")
