@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bundled_flight import bundled
-from shared_flights import read
+from shared_flights import read, with_rows
 from study import pairs
 
 from coax_env.comparison import search
@@ -334,11 +334,4 @@ def test_halves_of_a_real_flight_are_the_same():
 
 def _half(run: Run, late: int) -> Run:
     """The first half of a run, or the second."""
-    rows = (run.t >= 0.5 * (run.t[0] + run.t[-1])) == bool(late)
-    return replace(
-        run,
-        t=run.t[rows],
-        command=run.command[rows],
-        measured={c: values[rows] for c, values in run.measured.items()},
-        battery=None if run.battery is None else run.battery[rows],
-    )
+    return with_rows(run, (run.t >= 0.5 * (run.t[0] + run.t[-1])) == bool(late))
