@@ -445,6 +445,19 @@ def test_what_a_form_may_be_wrong_by_at_one_frequency_is_doubted_and_with_one_th
 
 
 @pytest.mark.parametrize(
+    ("of_moment", "shaken", "falls", "named"),
+    [(26.0, True, True, False), (26.0, True, False, True), (26.0, False, True, True),
+     (43.0, True, True, True), (math.inf, True, True, True)],
+)  # fmt: skip
+def test_a_change_that_a_shock_may_have_made_has_no_name_with_one_thing_more(
+    of_moment, shaken, falls, named
+):
+    """A hub stiffness that ended, and did not hold under other noise (**synthetic**, clean)."""
+    of = known_of(of_moment=of_moment, shaken=shaken, falls_at=("half of all",) * falls)
+    assert without_name({"hub_stiffness": of}, SETTINGS) == (set() if named else {"hub_stiffness"})
+
+
+@pytest.mark.parametrize(
     ("away", "ratio", "inflation", "none"),
     [(2.1, 1.0, 1.0, False), (1.9, 1.0, 1.0, True), (3.0, 2.0, 1.0, True), (3.0, 1.0, 4.0, True),
      (5.0, 2.0, 1.0, False)],
