@@ -29,6 +29,7 @@ from coax_env.diagnosis import (
     findings,
     onboard_filter,
     sensor_low_pass,
+    slow_commands,
     unlisted,
     vibration,
 )
@@ -180,13 +181,14 @@ def diagnose(
     problem = Problem.of(model, used, candidates, settings, report)
     problem = replace(problem, of_onboard_filter=circular)
     clock = clock_of(flight.runs)
-    first = searched(problem, noise, clock)
+    first = slow_commands.likelier_on_lines(searched(problem, noise, clock))
     if first.low_passes:
         unasked = set(candidates) - set(first.problem.candidates)
         of_sensors.append(sensor_low_pass.remark(first.low_passes, unasked))
     problem, bare, refitted = first.problem, first.bare, first.refitted
     held = records_before(held, CHANNELS, first.low_passes)
     held = with_clock_error(held, problem.clock_error)
+    held = slow_commands.on_straight_lines(held) if first.on_lines else held
     passes_before = problem.engine.filter(bare.values, bare.noise)
     state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
@@ -201,6 +203,8 @@ def diagnose(
     onsets = moments_of(problem, fit, quadratic, evidence, state.onsets)
     fit = confounding.beside_alternatives(problem, fit, quadratic, evidence, found)
     fit = confounding.beside_undecided(problem, fit, quadratic, evidence)
+    if not onsets and not first.on_lines:
+        fit = slow_commands.beside_straight_lines(problem, fit, quadratic, evidence)
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     replays, gain = _gain(problem, (bare, refitted, fit), held, sensors, ceiling)
@@ -257,6 +261,7 @@ def diagnose(
             *([vibration_removed(lines)] if lines else []),
             *of_sensors,
             *([oscillation_remark(swinging)] if swinging else []),
+            *([slow_commands.REMARK] if first.on_lines else []),
             *remarks(problem, fit, quadratic, {e: found[e] for e in found if trust[e].named}),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
             *answered_gusts(gain),

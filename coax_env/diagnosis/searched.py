@@ -110,6 +110,7 @@ class Searched:
     coarse: whether readings were taken to be no finer than LEAST_READING_STD.
     changing: with what began or changed in flight, where that has been asked already.
     low_passes: what some channels' readings were taken back through.
+    on_lines: whether commands are on straight lines between slow rows.
     air_asked: whether it has been asked if runs have air of their own.
     """
 
@@ -121,6 +122,7 @@ class Searched:
     coarse: bool = False
     changing: Changing | None = None
     low_passes: Mapping[str, LowPass] = field(default_factory=dict)
+    on_lines: bool = False
     air_asked: bool = False
 
     @property

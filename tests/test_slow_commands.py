@@ -1,0 +1,106 @@
+"""Commands between slow rows: held, or on straight lines, and what that makes of the numbers."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coax_env.diagnosis import slow_commands as module
+from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.searched import Searched
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.diagnosis.slow_commands import (
+    beside_straight_lines,
+    likelier_on_lines,
+    on_straight_lines,
+)
+from coax_env.estimation.state_space import Noise, Record
+
+LAG = "motor_lag"
+
+
+def ramp(rows: int = 5) -> Record:
+    """Commands that rise by 1, 2, 3 and 4 a row."""
+    command = np.outer(np.arange(rows), [1.0, 2.0, 3.0, 4.0])
+    return Record("a", 0.04 * np.arange(rows), command, np.zeros((rows, 1)))
+
+
+def problem_of(slow: bool = True) -> Any:
+    said: list[str] = []
+    engine = SimpleNamespace(records=[ramp()])
+    made = SimpleNamespace(
+        engine=engine, has_slow_rows=slow, settings=SETTINGS, report=said.append, said=said, at=None
+    )
+
+    def with_records(records: Any) -> Any:
+        other = SimpleNamespace(**vars(made))
+        other.engine = SimpleNamespace(records=records)
+        return other
+
+    made.with_records = with_records
+    return made
+
+
+def fit_of(*active: str, objective: float = 100.0) -> Fit:
+    return Fit(active, {}, Noise({}), objective=objective)
+
+
+def test_a_rows_command_is_the_mean_of_the_line_to_the_next():
+    """Of a ramp that of its middle; the last row's has no next. Readings and times stay."""
+    sound = ramp()
+    (found,) = on_straight_lines([sound])
+    np.testing.assert_allclose(
+        found.command[:-1], np.outer(np.arange(4) + 0.5, [1.0, 2.0, 3.0, 4.0])
+    )
+    np.testing.assert_array_equal(found.command[-1], sound.command[-1])
+    assert found.t is sound.t and found.z is sound.z
+    np.testing.assert_array_equal(sound.command, ramp().command, "the log itself stays")
+
+
+@pytest.mark.parametrize(
+    ("slow", "active", "changing", "end", "taken"),
+    [
+        (True, (LAG,), None, 93.0, True),
+        (True, (LAG,), None, 95.0, False),  # a tie is 6
+        (True, (), None, 50.0, False),  # there is no cause that commands may have hidden
+        (True, (LAG,), object(), 50.0, False),  # something changed in flight
+        (False, (LAG,), None, 50.0, False),
+    ],
+)
+def test_straight_lines_stand_where_they_are_likelier_beside_a_cause(
+    monkeypatch, slow, active, changing, end, taken
+):
+    monkeypatch.setattr(module, "fitted", lambda problem, fit, steps: fit)
+    monkeypatch.setattr(
+        module, "converged", lambda problem, fit: fit_of(*fit.active, objective=end)
+    )
+    monkeypatch.setattr(module, "quadratic_at", lambda problem, fit: (fit, "there"))
+    problem, fit = problem_of(slow), fit_of(*active)
+    before: Any = Searched(problem, fit, fit, fit, None, changing=changing)  # type: ignore[arg-type]
+    found = likelier_on_lines(before)
+    assert found.on_lines == taken
+    if taken:
+        np.testing.assert_allclose(found.problem.engine.records[0].command[0], [0.5, 1.0, 1.5, 2.0])
+        assert (found.fit.active, found.fit.objective) == (active, end)
+        assert found.quadratic == "there" and found.bare is fit
+        assert problem.said == ["commands on straight lines between slow rows: 7.0 nats"]
+    else:
+        assert found is before
+
+
+def test_where_commands_are_held_the_other_fit_is_in_the_std(monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "fitted", lambda problem, fit, steps: fit)
+    monkeypatch.setattr(
+        module, "converged", lambda problem, fit: fit_of(*fit.active, objective=7.0)
+    )
+    monkeypatch.setattr(module, "as_far_apart", lambda *given: asked.append(given) or given[1])
+    quadratic: Any = None
+    fit = fit_of(LAG)
+    assert beside_straight_lines(problem_of(), fit, quadratic, {}) is fit
+    ((_, _, _, _, other),) = asked
+    assert other.objective == 7.0
+    for problem, same in ((problem_of(slow=False), fit), (problem_of(), fit_of())):
+        assert beside_straight_lines(problem, same, quadratic, {}) is same
+    assert len(asked) == 1
