@@ -37,7 +37,7 @@ def problem(monkeypatch) -> Any:
     made = SimpleNamespace(
         settings=SETTINGS, own=OWN, candidates=tuple(OWN), report=said.append, said=said, ends={},
         asked=[], large=True, occam={}, worth=2.0 * FAR_OFF,
-        file_values=lambda effect: {}, off_values=lambda effect: {NUMBERS[effect]: 0.0},
+        changes=lambda effect: effect in made.changing, changing=(), file_values=lambda effect: {}, off_values=lambda effect: {NUMBERS[effect]: 0.0},
     )  # fmt: skip
 
     def fitted(problem: Any, fit: Fit, *steps: int) -> Fit:
@@ -107,7 +107,10 @@ def test_the_likelier_one_takes_its_place(problem, end, occam, worth, large, tak
 def test_what_is_in_the_model_by_now_or_cannot_be_beside_it_is_not_asked(problem):
     others = {MARKERS: {NUMBERS[MARKERS]: 0.14}}
     assert exchanged(problem, fit_of(MARKERS, PLATE), None, PLATE, others) is None
-    problem.candidates = (PLATE, DRAG)
+    for changing in ((PLATE,), (MARKERS,)):
+        problem.changing = changing
+        assert exchanged(problem, fit_of(PLATE), None, PLATE, others) is None
+    problem.changing, problem.candidates = (), (PLATE, DRAG)
     assert exchanged(problem, fit_of(PLATE), None, PLATE, others) is None
     assert problem.asked == []
 

@@ -99,12 +99,13 @@ def exchanged(
         problem, fit: what may be free, and where; fitted. quadratic: linearised at the fit.
         effect: an active one. others: its runners-up.
     """
-    if loss(problem, quadratic, fit.active, effect, 1.0) < FAR_OFF:
-        return None
+    if problem.changes(effect) or loss(problem, quadratic, fit.active, effect, 1.0) < FAR_OFF:
+        return None  # what changes in flight has a size before and one after
     gone = problem.off_values(effect) | problem.file_values(effect)
     for other, numbers in others.items():
         rest = set(fit.rest(effect))
-        if other in rest or other not in problem.candidates or exclusive_with(other) & rest:
+        absent = other in problem.candidates and other not in rest
+        if not absent or problem.changes(other) or exclusive_with(other) & rest:
             continue
         begun = replace(fit.at({**gone, **numbers}), active=_with_instead(fit, effect, other))
         trial = _to_the_end(problem, fit, begun, lambda trial: _in_own_noise(problem, trial))
