@@ -36,8 +36,9 @@ def problem(monkeypatch) -> Any:
     said: list[str] = []
     made = SimpleNamespace(
         settings=SETTINGS, own=OWN, candidates=tuple(OWN), report=said.append, said=said, ends={},
-        asked=[], large=True, occam={}, worth=2.0 * FAR_OFF,
-        changes=lambda effect: effect in made.changing, changing=(), file_values=lambda effect: {}, off_values=lambda effect: {NUMBERS[effect]: 0.0},
+        asked=[], large=True, occam={}, worth=2.0 * FAR_OFF, changing=(),
+        changes=lambda effect: effect in made.changing, file_values=lambda effect: {},
+        off_values=lambda effect: {NUMBERS[effect]: 0.0},
     )  # fmt: skip
 
     def fitted(problem: Any, fit: Fit, *steps: int) -> Fit:
