@@ -508,11 +508,7 @@ def test_a_short_gap_is_bridged_and_a_short_part_is_left_out():
 
     def without(*gone: range) -> Flight:
         rows = [k for k in range(run.t.size) if not any(k in g for g in gone)]
-        shorter = replace(
-            run, t=run.t[rows], command=run.command[rows],
-            measured={c: v[rows] for c, v in run.measured.items()},
-        )  # fmt: skip
-        return parts(replace(sound(), runs=(shorter,)))
+        return parts(replace(sound(), runs=(run.of_rows(np.array(rows)),)))
 
     assert len(without(range(400, 420)).runs) == 1
     cut = without(range(400, 450), range(600, 650))
@@ -526,17 +522,8 @@ def test_parts_are_held_out_and_flown_again_as_one_run():
     halves = []
     for run in flight.runs:
         for rows, name in ((slice(0, 500), run.name), (slice(560, 1200), f"{run.name} (2)")):
-            halves.append(
-                replace(
-                    run,
-                    name=name,
-                    part_of=run.name,
-                    t=run.t[rows],
-                    command=run.command[rows],
-                    measured={c: v[rows] for c, v in run.measured.items()},
-                    began=float(run.t[0]),
-                )
-            )
+            part = run.of_rows(rows)
+            halves.append(replace(part, name=name, part_of=run.name, began=float(run.t[0])))
     cut = replace(flight, runs=tuple(halves))
     model, records = HeliModel(vehicle), [record_of(run) for run in cut.runs]
     noise = starting_noise(cut, vehicle)
@@ -555,10 +542,7 @@ def test_a_start_before_a_gap_is_no_full_horizon():
     """What is compared at the horizon's end is measured there, within 0.15 s."""
     run = sound().run("lon_doublet")
     rows = np.r_[0:500, 520:1200]
-    gapped = replace(
-        run, t=run.t[rows], command=run.command[rows],
-        measured={c: v[rows] for c, v in run.measured.items()},
-    )  # fmt: skip
+    gapped = run.of_rows(rows)
     vehicle = load_vehicle("lama400d")
     model = HeliModel(vehicle)
     noise = starting_noise(replace(sound(), runs=(gapped,)), vehicle)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bundled_flight import bundled
-from shared_flights import read, with_rows
+from shared_flights import read
 from study import pairs
 
 from coax_env.comparison import search
@@ -334,4 +334,4 @@ def test_halves_of_a_real_flight_are_the_same():
 
 def _half(run: Run, late: int) -> Run:
     """The first half of a run, or the second."""
-    return with_rows(run, (run.t >= 0.5 * (run.t[0] + run.t[-1])) == bool(late))
+    return run.of_rows((run.t >= 0.5 * (run.t[0] + run.t[-1])) == bool(late))

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from bundled_flight import bundled
-from shared_flights import read, with_rows
+from shared_flights import read
 
 from coax_env.comparison.two_logs.before import Before
 from coax_env.comparison.two_logs.changes import changes, first_difference
@@ -237,4 +237,4 @@ def test_edits_of_real_logs(name, runs, since):
 
 def _begun(log: Flight, seconds: float) -> Flight:
     """The first seconds of every run."""
-    return replace(log, runs=tuple(with_rows(r, r.t < r.t[0] + seconds) for r in log.runs))
+    return replace(log, runs=tuple(r.of_rows(r.t < r.t[0] + seconds) for r in log.runs))

@@ -280,8 +280,8 @@ def _of_one(
     tie = min(chosen.tie * inflation, max(0.5 * lost, chosen.tie))
 
     def refit(other: str, move: np.ndarray, steps: int) -> Fit:
-        active = tuple(other if e == effect else e for e in fit.active)
-        return fitted(problem, replace(fit.at(quadratic.moved(move)), active=active), steps)
+        begun = replace(fit.at(quadratic.moved(move)), active=fit.instead(effect, other))
+        return fitted(problem, begun, steps)
 
     found = {}
     for other, move in _near(problem, fit, quadratic, effect, NEAR_TIES * tie):

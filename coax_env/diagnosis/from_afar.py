@@ -107,7 +107,7 @@ def exchanged(
         absent = other in problem.candidates and other not in rest
         if not absent or problem.changes(other) or exclusive_with(other) & rest:
             continue
-        begun = replace(fit.at({**gone, **numbers}), active=_with_instead(fit, effect, other))
+        begun = replace(fit.at({**gone, **numbers}), active=fit.instead(effect, other))
         trial = _to_the_end(problem, fit, begun, lambda trial: _in_own_noise(problem, trial))
         trial, there = quadratic_at(problem, trial)
         gained = cost(problem, fit, quadratic) - cost(problem, trial, there)
@@ -125,7 +125,7 @@ def in_place_of(problem: Problem, fit: Fit, quadratic: Quadratic, old: str, new:
         old: an active effect. new: one with one number, that is not active.
     """
     begun = without(problem, fit, quadratic, old)
-    begun = replace(begun, active=_with_instead(fit, old, new))
+    begun = replace(begun, active=fit.instead(old, new))
     return _to_the_end(
         problem, fit, begun, lambda trial: fitted(problem, likeliest(problem, trial, new))
     )
@@ -164,10 +164,6 @@ def _late_pairs(problem: Problem, fit: Fit) -> list[tuple[str, str]]:
         if new not in fit.active and not problem.changes(new)
         if not exclusive_with(new) & set(fit.rest(old))
     ]
-
-
-def _with_instead(fit: Fit, old: str, new: str) -> tuple[str, ...]:
-    return tuple(new if e == old else e for e in fit.active)
 
 
 def _in_own_noise(problem: Problem, fit: Fit) -> Fit:

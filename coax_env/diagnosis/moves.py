@@ -191,7 +191,7 @@ def swaps(
     """
     better = []
     for change, old, new, move in exchanges(problem, quadratic, fit.active, fit.active):
-        active = tuple(new if e == old else e for e in fit.active)
+        active = fit.instead(old, new)
         if active not in tried:
             better.append((change, old, new, active, move))
     for _, old, new, active, move in sorted(better, key=lambda c: c[0])[

@@ -358,3 +358,7 @@ class Fit:
     def rest(self, effect: str) -> tuple[str, ...]:
         """The active effects but for one."""
         return tuple(e for e in self.active if e != effect)
+
+    def instead(self, old: str, new: str) -> tuple[str, ...]:
+        """The active effects with another one in the place of one."""
+        return tuple(new if e == old else e for e in self.active)

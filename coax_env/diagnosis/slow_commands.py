@@ -14,13 +14,11 @@ from dataclasses import replace
 
 from coax_env.diagnosis.evidence import Evidence, as_far_apart
 from coax_env.diagnosis.fits import converged, fitted, quadratic_at
+from coax_env.diagnosis.from_afar import STEPS
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.searched import Searched
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
-
-STEPS = 6
-"""Gauss-Newton steps to the numbers that belong to other commands; ours."""
 
 REMARK = (
     "commands between the rows are taken to be on straight lines from each to the next, which beside"
@@ -48,23 +46,13 @@ def likelier_on_lines(found: Searched) -> Searched:
     problem, fit = found.problem, found.fit
     if not problem.has_slow_rows or not fit.active or found.changing is not None:
         return found
-    lines = problem.with_records(on_straight_lines(problem.engine.records))
-    other = refitted(lines, fit)
+    lines, other = _on_lines(problem, fit)
     gained = fit.objective - other.objective
     if not gained > problem.settings.tie:
         return found
     problem.report(f"commands on straight lines between slow rows: {gained:.1f} nats")
     other, quadratic = quadratic_at(lines, other)
     return replace(found, problem=lines, fit=other, quadratic=quadratic, on_lines=True)
-
-
-def refitted(problem: Problem, fit: Fit) -> Fit:
-    """The fit of the same effects to other commands.
-
-    Args:
-        problem: with these. fit: where to begin.
-    """
-    return converged(problem, fitted(problem, fit, STEPS))
 
 
 def beside_straight_lines(
@@ -78,5 +66,11 @@ def beside_straight_lines(
     """
     if not problem.has_slow_rows or not fit.active:
         return fit
+    _, other = _on_lines(problem, fit)
+    return as_far_apart(problem, fit, quadratic, evidence, other)
+
+
+def _on_lines(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """The problem with commands on straight lines, and the fit of the same effects to it."""
     lines = problem.with_records(on_straight_lines(problem.engine.records))
-    return as_far_apart(problem, fit, quadratic, evidence, refitted(lines, fit))
+    return lines, converged(lines, fitted(lines, fit, STEPS))

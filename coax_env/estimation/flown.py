@@ -147,16 +147,7 @@ def _free_name(name: str, taken: set[str]) -> str:
 
 
 def _part(run: Run, rows: np.ndarray, name: str) -> Run:
-    return replace(
-        run,
-        name=name,
-        t=run.t[rows],
-        command=run.command[rows],
-        measured={c: values[rows] for c, values in run.measured.items()},
-        part_of=run.whole,
-        began=run.beginning,
-        battery=None if run.battery is None else run.battery[rows],
-    )
+    return replace(run.of_rows(rows), name=name, part_of=run.whole, began=run.beginning)
 
 
 def longest_believed(t: np.ndarray) -> float:

@@ -136,6 +136,16 @@ class Run:
         """Time from the first row to the last [s]."""
         return float(self.t[-1] - self.t[0])
 
+    def of_rows(self, rows: np.ndarray | slice) -> "Run":
+        """The run of some of its rows alone: a slice, their places, or (n,) true where one stays."""
+        return replace(
+            self,
+            t=self.t[rows],
+            command=self.command[rows],
+            measured={channel: values[rows] for channel, values in self.measured.items()},
+            battery=None if self.battery is None else self.battery[rows],
+        )
+
 
 @dataclass(frozen=True)
 class Flight:

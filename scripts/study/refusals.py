@@ -75,14 +75,7 @@ def parts_of(flight: Flight) -> Iterator[tuple[str, Flight]]:
 def half_of(run: Run, half: int) -> Run:
     """The first or the second half of a run's rows."""
     middle = len(run.t) // 2
-    rows = slice(middle) if half == 0 else slice(middle, None)
-    return replace(
-        run,
-        t=run.t[rows],
-        command=run.command[rows],
-        measured={channel: y[rows] for channel, y in run.measured.items()},
-        battery=None if run.battery is None else run.battery[rows],
-    )
+    return run.of_rows(slice(middle) if half == 0 else slice(middle, None))
 
 
 def table_text(rows: Sequence[dict[str, Any]], command: str) -> str:
