@@ -1,13 +1,12 @@
 """Which maneuver separates descriptions that these flights cannot: designed, not looked up.
 
 A maneuver's worth is the smallest distance (discrimination.py) over all pairs of descriptions, each
-member taken as the truth once, and the winner has the largest. Every maneuver is first flown with
-every description and is left out where it leaves the safe envelope.
+member taken as the truth once, and the winner has the largest. What wins was flown with every
+description and stays inside the safe envelope with each; one that is seen to leave it is left out.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,7 @@ from coax_env.design.discrimination import ROW, Alternative, distance
 from coax_env.errors import InputError
 from coax_env.estimation.state_space import Noise
 from coax_env.simulation.maneuvers import Maneuver
-from coax_env.simulation.simulate import Track, fly
+from coax_env.simulation.simulate import fly
 
 MOST_ALTERNATIVES = 4
 
@@ -25,8 +24,8 @@ MOST_ALTERNATIVES = 4
 class Proposal:
     """A maneuver inside the envelope.
 
-    nats: evidence it is expected to bring for the pair it separates least; where more than two are
-    confounded and it cannot win, a bound from above.
+    nats: evidence it is expected to bring for the pair it separates least; a bound from above where a
+    maneuver before it is better.
     """
 
     maneuver: Maneuver
@@ -70,53 +69,43 @@ def design(
     refused = []
     best = -math.inf
     for plan in candidates() if maneuvers is None else maneuvers:
-        flown, why = _fly_each(chosen, plan, envelope)
+        nats, why = _worth(chosen, plan, noise, rates, envelope, best)
         if why:
             refused.append((plan, why))
             continue
-        nats = _smallest(chosen, flown, noise, rates, best)
         best = max(best, nats)
         ranked.append(Proposal(plan, nats))
     ranked.sort(key=lambda p: -p.nats)
     return Design(chosen, tuple(ranked), tuple(refused))
 
 
-def _fly_each(
-    alternatives: Sequence[Alternative], plan: Maneuver, envelope: Envelope
-) -> tuple[list[Track], str]:
-    """The maneuver flown with every description, or why it must not be."""
-    flown = []
-    for alternative in alternatives:
-        try:
-            flown.append(fly(alternative.vehicle, plan, dt=ROW))
-        except InputError as error:
-            return [], str(error)
-        why = envelope.breach(flown[-1])
-        if why:
-            return [], f"{why} with {alternative.name}"
-    return flown, ""
-
-
-def _smallest(
+def _worth(
     alternatives: Sequence[Alternative],
-    flown: Sequence[Track],
+    plan: Maneuver,
     noise: Noise,
     rates: Mapping[str, float],
+    envelope: Envelope,
     enough: float,
-) -> float:
-    """Smallest distance over pairs and directions; a pair below `enough` ends the comparison."""
+) -> tuple[float, str]:
+    """Smallest distance [nats] over pairs and directions, and why the maneuver must not be flown.
 
-    def from_truth(truth: int) -> float:
-        least = math.inf
-        for i, other in enumerate(alternatives):
-            if i != truth:
-                least = min(least, distance(flown[truth], other, noise, rates))
+    A distance below `enough` ends the comparison: the maneuver cannot win.
+    """
+    least = math.inf
+    for truth in alternatives:
+        try:
+            flown = fly(truth.vehicle, plan, dt=ROW)
+        except InputError as error:
+            return least, str(error)
+        why = envelope.breach(flown)
+        if why:
+            return least, f"{why} with {truth.name}"
+        for other in alternatives:
+            if other is not truth:
+                least = min(least, distance(flown, other, noise, rates))
                 if least < enough:
-                    break
-        return least
-
-    with ThreadPoolExecutor(2) as pool:
-        return min(pool.map(from_truth, range(len(alternatives))))
+                    return least, ""
+    return least, ""
 
 
 def advise(result: Design | None, evidence: float) -> dict[str, Any] | None:

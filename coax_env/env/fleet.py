@@ -48,6 +48,7 @@ SIMD_VARIANT_FROM = 128
 6 to 15 s to compile, as long as 100 of them fly ten minutes each one by one."""
 
 _fly_rows = looked_up_once(flight_loop.fly_rows)
+_restart_rows = looked_up_once(flight_loop.restart_rows)
 _disturb_rows = looked_up_once(flight_loop.disturb_rows)
 _pay_waypoints = looked_up_once(flight_loop.pay_waypoints)
 _move_targets = looked_up_once(flight_loop.move_targets)
@@ -206,6 +207,7 @@ class Fleet:
             states: paper or full states to start from, (count, 16 or 29); random when None.
             observations: where to put the rows' observations, (count, n_observed).
         """
+        which = np.ascontiguousarray(which, dtype=np.bool_)
         self._draw(which)
         if states is not None:
             x = np.zeros((self.count, N_FULL))
@@ -234,9 +236,7 @@ class Fleet:
         self, first: int, last: int, which: np.ndarray, keep_state: bool, observations: np.ndarray
     ) -> None:
         heli, world, mission = self.helicopters, self.world, self.mission
-        flight_loop.restart_rows(
-            first, last, which, keep_state, self.x, heli, world, mission, observations
-        )
+        _restart_rows(first, last, which, keep_state, self.x, heli, world, mission, observations)
         if self.task.shows_target:
             flight_loop.observe_targets(first, last, which, heli, mission, observations)
 

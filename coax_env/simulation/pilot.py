@@ -79,7 +79,7 @@ class Pilot:
         error[S.PSI] = wrap_angle(state[S.PSI] - self.trim_state[S.PSI] - reference[3])
         error[S.Z] = state[S.Z] + reference[0]
         error[PLACE] = 0.0
-        error[:N_STATES] = np.clip(error[:N_STATES], -_REACH, _REACH)
+        error[:N_STATES] = error[:N_STATES].clip(-_REACH, _REACH)
         correction = -self.gain @ error
         if self.tremor:
             keep = math.exp(-dt / TREMOR_MEMORY)
