@@ -182,8 +182,8 @@ def test_a_refit_that_loses_too_little_need_not_converge(monkeypatch):
         evidence, "converged", lambda problem, fit, held: turns.append(fit.active) or fit
     )
     problem: Any = SimpleNamespace(
-        settings=SETTINGS, file_values=lambda effect: {}, reads_seldom=False, unlike_gusts=False,
-        smoothed=False, sees_poses_alone=False,
+        settings=SETTINGS, file_values=lambda effect: {}, answers_unseen=False,
+        sees_poses_alone=False,
         for_each=lambda one, which: {e: one(e) for e in which},
     )  # fmt: skip
     found = evidence.weigh(problem, fit, None, fit.active, THRESHOLD)  # type: ignore[arg-type]
@@ -466,6 +466,7 @@ def test_gyros_and_accelerometers_feel_gusts_in_time_but_between_slow_rows(aboar
     [
         ("motor_lag", {}, 2.0, 2.0),
         ("motor_lag", {"reads_seldom"}, 2.0, 6.0),
+        ("motor_lag", {"unlike_gusts"}, 2.0, 6.0),
         ("motor_lag", {"smoothed", "sees_poses_alone"}, 2.0, 6.0),
         ("motor_lag", {"sees_poses_alone"}, 1.0, 3.0),
         ("motor_lag", {"sees_poses_alone"}, 8.0, 8.0),  # poses fine enough to show it are coloured
@@ -479,6 +480,7 @@ def test_what_looks_like_a_late_answer_must_be_worth_more_where_gusts_are_seen_l
 ):
     conditions = ("reads_seldom", "unlike_gusts", "smoothed", "sees_poses_alone")
     problem = SimpleNamespace(settings=SETTINGS, **{name: name in unseen for name in conditions})
+    problem.answers_unseen = Problem.answers_unseen.fget(problem)  # type: ignore[attr-defined]
     monkeypatch.setattr(evidence, "inflation", lambda problem, quadratic, active, effect: colour)
     fit = SimpleNamespace(active=(effect,))
     assert evidence.inflation_of(problem, fit, None, effect) == factor  # type: ignore[arg-type]

@@ -189,7 +189,7 @@ def test_evidence_is_what_a_refit_without_it_loses_over_the_inflation(
         evidence, "converged", lambda problem, fit, held: replace(fit, objective=999.0 + lost)
     )
     problem = SimpleNamespace(
-        reads_seldom=False, sees_poses_alone=False, unlike_gusts=False, smoothed=False,
+        sees_poses_alone=False, answers_unseen=False,
         settings=SETTINGS, file_values=lambda effect: {},
         for_each=lambda work, of: {e: work(e) for e in of},
     )  # fmt: skip

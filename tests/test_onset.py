@@ -932,7 +932,7 @@ def weighed(form: str, inflation: float):
     names = ["gyro_bias.x", *([] if form == "begins" else [of_part("gyro_bias.x", BEFORE)])]
     problem = SimpleNamespace(
         engine=engine, model=SimpleNamespace(channels=("p", "q")), settings=SETTINGS, seconds=100.0,
-        sees_poses_alone=False, acting_names=lambda effect: names,
+        sees_poses_alone=False, answers_unseen=False, acting_names=lambda effect: names,
         free_names=lambda active: ["mass", *names],
     )  # fmt: skip
     extra = names if form == "ends" else names[-1:]
@@ -1046,14 +1046,18 @@ def scores(**worth: tuple[float, float]) -> list[every_moment.Scored]:
 
 def test_what_a_constant_cause_does_as_well_is_not_worth_a_fit():
     found = scores(wind=(7.1, 3.1), servo_lag=(6.9, 6.9), cg_offset=(60.0, 2.9))
-    problem: Any = SimpleNamespace(settings=SETTINGS, sees_poses_alone=False)
+    problem: Any = SimpleNamespace(settings=SETTINGS, sees_poses_alone=False, answers_unseen=False)
     assert [s.effect for s in search._standing(problem, found)] == ["wind"]
 
 
-def test_by_poses_alone_a_late_answer_must_be_worth_more_from_some_moment_on():
-    """Three times as much, a constant delay too; what is no answer to a command as much as else."""
+@pytest.mark.parametrize("poses", [True, False])
+def test_a_late_answer_must_be_worth_more_from_some_moment_on_where_answers_are_unseen(poses):
+    """Three times as much by poses alone, or where commands answer what the filter does not see; a
+    constant delay too; what is no answer to a command as much as else."""
     found = scores(wind=(7.1, 7.1), command_delay=(20.0, 20.0), motor_lag=(22.0, 22.0))
-    problem: Any = SimpleNamespace(settings=SETTINGS, sees_poses_alone=True)
+    problem: Any = SimpleNamespace(
+        settings=SETTINGS, sees_poses_alone=poses, answers_unseen=not poses
+    )
     assert [s.effect for s in search._standing(problem, found)] == ["wind", "motor_lag"]
     state: Any = SimpleNamespace(problem=problem, fit=SimpleNamespace(active=("servo_lag",)))
     assert search._least(state, "command_delay") == 3.0 * SETTINGS.evidence
@@ -1071,7 +1075,7 @@ def test_what_commands_explain_is_not_worth_a_fit(monkeypatch, gains):
     monkeypatch.setattr(search, "linearise", lambda p, fit: (fit, [], None))
     monkeypatch.setattr(search, "scored", lambda state: (state, with_gains))
     fit = Fit((), {}, NOISE_OF_ALL)
-    problem = SimpleNamespace(settings=SETTINGS, sees_poses_alone=False)
+    problem = SimpleNamespace(settings=SETTINGS, sees_poses_alone=False, answers_unseen=False)
     problem.of_candidates = lambda names: problem
     steady = Changing(problem, fit, None, {})  # type: ignore[arg-type]
     kept = search._beside_commands(steady, found)
@@ -1088,7 +1092,10 @@ def test_what_drifts_explain_as_well_is_not_worth_a_fit(monkeypatch, drifts, kep
     beside = scores(wind=(21.0, 5.5), servo_lag=(4.7, 4.7), cg_offset=(9.0, 2.0))
     fit = Fit((), {}, Noise({"trim_force_z": 0.01}), objective=100.0)
     problem = SimpleNamespace(
-        settings=SETTINGS, sees_poses_alone=False, of_candidates=lambda names: problem
+        settings=SETTINGS,
+        sees_poses_alone=False,
+        answers_unseen=False,
+        of_candidates=lambda names: problem,
     )
     state = Changing(problem, fit, None, {})  # type: ignore[arg-type]
     calm = replace(fit, noise=Noise({"trim_force_z": 1e-6}), objective=100.0 + drifts)

@@ -815,3 +815,43 @@ def test_low_passes_are_fitted_once_more_beside_errors_that_last(
         assert best.low_passes == passes
         assert best.problem.records == ("then", passes) and best.problem.smoothed
         assert ("thrust_exponent" in best.problem.candidates) == ("ax" not in passes)
+
+
+@pytest.mark.parametrize(
+    ("behind", "as_logged", "lost", "taken"),
+    [
+        (True, False, 10.0, "as logged"),
+        (True, False, 90.0, "behind"),
+        (True, True, 10.0, "behind"),  # something is amiss either way
+        (False, False, 10.0, "behind"),
+    ],
+)
+def test_gusts_that_are_known_may_leave_nothing_of_a_low_pass(
+    monkeypatch, behind, as_logged, lost, taken
+):
+    """Asked where inertial sensors stay coloured behind it, whatever gusts are."""
+    coloured = {"behind": behind, "as logged": as_logged}
+    worth = {"behind": 50.0, "as logged": lost}
+    noise = Noise({}, {"phi": 0.1})
+
+    def one(name: str, passes: Any) -> Searched:
+        fit = Fit((), {}, noise)
+        problem = SimpleNamespace(name=name, report=lambda text: None)
+        return Searched(problem, fit, fit, fit, None, low_passes=passes)  # type: ignore[arg-type]
+
+    first = one("as logged", {})
+    monkeypatch.setattr(searched, "_rotors_first", lambda problem, noise: (first, noise))
+    monkeypatch.setattr(
+        searched, "_is_coloured",
+        lambda found, channels: "ax" in channels and coloured[found.problem.name],
+    )  # fmt: skip
+    monkeypatch.setattr(searched, "_with_clock_errors", lambda first, noise: first)
+    monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: one("behind", HAD))
+    monkeypatch.setattr(searched, "_with_errors", lambda found, noise, clock: (found, noise))
+    monkeypatch.setattr(
+        searched, "_in_unrest", lambda best, noise, clock, erring: replace(best, low_passes={})
+    )
+    monkeypatch.setattr(searched, "_lost", lambda problem, found: worth[found.problem.name])
+    found = searched.searched(first.problem, noise, {})
+    assert found.problem.name == taken  # type: ignore[attr-defined]
+    assert found.low_passes == (HAD if taken == "behind" else {})

@@ -399,7 +399,7 @@ def inflation_of(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) 
     unseen = problem.settings.unseen_inflation
     if effect not in WEAK_OR_LATE:
         return colour
-    if problem.reads_seldom or problem.unlike_gusts or problem.smoothed:
+    if problem.answers_unseen:
         return colour * unseen
     # what poses show late colours them, where they are fine enough to show it
     slack = problem.sees_poses_alone and effect not in PURE_DELAYS

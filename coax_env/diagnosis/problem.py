@@ -254,6 +254,12 @@ class Problem:
         """Whether commands may answer what no reading but a rotor's speed has shown by then."""
         return self.between_readings > self.settings.slow_rows
 
+    @property
+    def answers_unseen(self) -> bool:
+        """Whether commands may answer what the filter has not seen by then: readings that are seldom,
+        gusts that are not as it has them, what is left of a sensor's low-pass."""
+        return self.reads_seldom or self.unlike_gusts or self.smoothed
+
     def is_hidden_by_gains(self, effect: str) -> bool:
         """Whether an effect's slope with the filter's gains held says little of what it is worth.
 
