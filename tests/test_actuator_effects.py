@@ -479,5 +479,5 @@ IN_THE_INJECTOR = {
 @pytest.mark.parametrize("case", IN_THE_INJECTOR)
 def test_what_the_injector_hides_is_found_and_nothing_else(tmp_path, case):
     runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "climb_descend", "heading_turn")
-    folder = injector.fly(tmp_path / "flight", IN_THE_INJECTOR[case], runs=runs, seed=21, longest=12.0)
+    folder = injector.fly(tmp_path / "flight", IN_THE_INJECTOR[case], runs=runs, seed=21, longest=9.0)
     check_causes(diagnose(folder, hold_out=[]).findings, *truth_of(folder))

@@ -132,7 +132,7 @@ def coax(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[...,
 def test_it_works_where_there_is_no_checkout(coax):
     """One test: apart, two workers would each compile the kernel for an environment of its own."""
     the_verbs_work(coax)
-    vehicles_flight_and_policy_have_come(coax)
+    data_files_have_come(coax)
     what_is_missing_is_named_with_its_extra(coax)
     the_readmes_lines_run(coax)
 
@@ -155,22 +155,24 @@ def the_verbs_work(coax: Callable[..., Done]) -> None:
     assert len(coax("fly", code=2).stderr.splitlines()) == 1
     coax("simulate", "--maneuver", "lon_3211,heave_3211", "--out", "my")
     assert "next: coax diagnose" in coax("check_flight", "my/flight").stdout
-    coax("identify", "my/flight", "--method", "paper", "--out", "steps")  # reads published.toml
 
 
-def vehicles_flight_and_policy_have_come(coax: Callable[..., Done]) -> None:
+def data_files_have_come(coax: Callable[..., Done]) -> None:
     found = coax(
         text="import json, coax_env; from pathlib import Path\n"
         "from coax_env.model.vehicle_file import shipped_vehicles\n"
+        "from coax_env.identification.two_step.published import table_viii\n"
         "from controllers.loading import make_controller\n"
         "here = Path(coax_env.__file__).parent\n"
         "flight = coax_env.read_flight(here / 'logs' / 'flights' / 'windy')\n"
         "print(json.dumps([str(here), len(flight.runs), list(shipped_vehicles()),"
-        " make_controller('ppo').kind]))"
+        " len(table_viii()), make_controller('ppo').kind]))"
     )
-    here, runs, vehicles, kind = json.loads(found.stdout)
+    here, runs, vehicles, printed, kind = json.loads(found.stdout)
     assert not Path(here).is_relative_to(ROOT) and "site-packages" in here
-    assert (runs, kind) == (12, "ppo") and {"lama400d", "skybotix_coax"} <= set(vehicles)
+    assert (runs, printed, kind) == (12, 3, "ppo") and {"lama400d", "skybotix_coax"} <= set(
+        vehicles
+    )
 
 
 def what_is_missing_is_named_with_its_extra(coax: Callable[..., Done]) -> None:
