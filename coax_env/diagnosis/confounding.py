@@ -200,8 +200,9 @@ def beside_alternatives(
         evidence: of the causes. found: their alternatives.
     """
     for effect, others in found.items():
+        rest = [n for n in problem.free_names(fit.active) if n.partition(".")[0] != effect]
         for other in others.values():
-            fit = as_far_apart(problem, fit, quadratic, evidence, other, but=effect)
+            fit = as_far_apart(problem, fit, quadratic, evidence, other, rest)
     return fit
 
 

@@ -24,6 +24,10 @@ class Settings:
     nats at most; true ones that should show 51 to 196. In gusts with a frequency, taken for gusts that
     fade: a play or a lag of the servos on 5 of 8 clean flights, 23 to 41 nats. And times that the
     variance of the vehicle's own such numbers is larger (evidence.beside_unseen_answers)."""
+    change_evidence: float = 28.0
+    """nats that a cause must be worth to have a name where that it began, ended or changed in flight is
+    worth less than `sure_evidence`: any effect could have, at any moment. Measured: three of some 600
+    clean flights had such a cause, of 18, 26 and 27."""
     tie: float = 6.0
     """nats within which alternatives are confounded: odds of 400 to 1, ours."""
     form_share: float = 0.1
