@@ -12,9 +12,6 @@ from coax_env import read_flight
 from coax_env.diagnosis import input_innovations
 from coax_env.diagnosis.fits import converged, fitted, linearise, start
 from coax_env.diagnosis.input_innovations import (
-    _gains,
-    _innovations,
-    clipped_residual,
     has_command_gains,
     with_command_gains,
     with_input_innovations,
@@ -24,6 +21,7 @@ from coax_env.estimation import compiled_model
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
+from coax_env.estimation.input_innovations import clipped_residual, command_gains, innovations
 from coax_env.estimation.prediction import replay_runs
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.model import parameters as P
@@ -86,7 +84,7 @@ def test_a_pilot_sees_ahead_and_to_the_right_whatever_his_heading():
     states[:, 12] = heading
     states[:, 13] = np.cos(heading) * ahead - np.sin(heading) * right
     states[:, 14] = np.sin(heading) * ahead + np.cos(heading) * right
-    (e,) = _innovations([made_pass(u, states, np.zeros((1, N_FULL, N_FULL)))])
+    (e,) = innovations([made_pass(u, states, np.zeros((1, N_FULL, N_FULL)))])
     assert e.shape == (900, 4) and not e[:2].any()
     for j in range(4):
         quiet = np.abs(planted[:, j]) < 0.015
@@ -100,9 +98,9 @@ def test_runs_are_regressed_together_and_each_gets_its_own_back():
     for n, level in ((400, 5.0), (300, -2.0)):
         u = level + 0.05 * np.cumsum(rng.standard_normal((n, 4)), axis=0)
         parts.append(made_pass(u, rng.standard_normal((n, N_FULL)), np.zeros((1, N_FULL, N_FULL))))
-    both = _innovations(parts)
+    both = innovations(parts)
     assert [e.shape for e in both] == [(400, 4), (300, 4)]
-    swapped = _innovations(parts[::-1])
+    swapped = innovations(parts[::-1])
     np.testing.assert_allclose(both[0], swapped[1], atol=1e-9)
     np.testing.assert_allclose(both[1], swapped[0], atol=1e-9)
 
@@ -114,7 +112,7 @@ def test_a_gain_s_prior_is_what_the_filter_does_not_know_over_what_commands_show
     covariances = np.array([0.5, 1.5])[:, None, None] * np.diag(std**2)  # of mean 1
     e = rng.standard_normal((4000, 4)) * [1.0, 2.0, 0.01, 0.03]
     run = made_pass(np.zeros((4000, 4)), np.zeros((4000, N_FULL)), covariances)
-    gains = {f.name: f for f in _gains([run], [e])}
+    gains = {f.name: f for f in command_gains([run], [e])}
     assert list(gains) == list(P.COMMAND_GAINS) and all(f.value == 0.0 for f in gains.values())
     tilt, rotors = math.sqrt(0.5 * (0.01**2 + 0.03**2)), math.sqrt(5.0)
     for name, states, commands in (
@@ -126,7 +124,7 @@ def test_a_gain_s_prior_is_what_the_filter_does_not_know_over_what_commands_show
         assert gains[f"command_gain.{name}"].std == pytest.approx(expected, rel=0.05), name
     tied = e.copy()
     tied[:, 1] = tied[:, 0]  # the rotors are only moved together
-    names = [f.name for f in _gains([run], [tied])]
+    names = [f.name for f in command_gains([run], [tied])]
     assert not any(n.endswith(("rate_z", "moment_z")) for n in names) and len(names) == 5
 
 
@@ -143,9 +141,9 @@ def test_gains_are_fitted_where_that_is_worth_more_than_a_tie(monkeypatch, falle
         asked.append((dict(fit.values), tolerance))
         return replace(fit, objective=300.0 - fallen)
 
-    monkeypatch.setattr(input_innovations, "_passes", lambda engine, fit: [])
-    monkeypatch.setattr(input_innovations, "_innovations", lambda passes: [])
-    monkeypatch.setattr(input_innovations, "_gains", lambda passes, found: gains)
+    monkeypatch.setattr(input_innovations, "sampled_passes", lambda engine, values, noise: [])
+    monkeypatch.setattr(input_innovations, "innovations", lambda passes: [])
+    monkeypatch.setattr(input_innovations, "command_gains", lambda passes, found: gains)
     monkeypatch.setattr(input_innovations, "fitted", fitted)
     made = Problem(HeliModel(LAMA), Engine(HeliModel(LAMA), []), (), {})
     fit = Fit((), {"mass": 0.8, first: 0.2}, Noise({}), objective=300.0)

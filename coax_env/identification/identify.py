@@ -32,6 +32,7 @@ from coax_env.estimation.state_space import Noise
 from coax_env.identification.maximum_likelihood import (
     OwnNumbers,
     RunEstimate,
+    beside_commands,
     each_run,
     free_parameters,
     own_numbers,
@@ -188,7 +189,10 @@ def _by_maximum_likelihood(
     quadratic = Quadratic.of(lin, found.free, values)
     names = [f.name for f in found.free]
     inflation = np.array([quadratic.variance_inflation([name], names) for name in names])
-    after = _identified_vehicle(vehicle, found, inflation, median_step(engine.records), flight)
+    report("fitting the numbers where the commands show the gusts, too")
+    apart = beside_commands(engine, found, values, report)
+    dt = median_step(engine.records)
+    after = _identified_vehicle(vehicle, found, inflation, apart, dt, flight)
     report("flying the runs open loop")
     again = Engine(model, [record_of(run) for run in held.runs])
     return Identification(
@@ -208,11 +212,23 @@ def _by_maximum_likelihood(
 
 
 def _identified_vehicle(
-    vehicle: Vehicle, found: OwnNumbers, inflation: np.ndarray, dt: float, flight: Flight
+    vehicle: Vehicle,
+    found: OwnNumbers,
+    inflation: np.ndarray,
+    apart: np.ndarray,
+    dt: float,
+    flight: Flight,
 ) -> Vehicle:
-    """The vehicle with what was found, its covariance inflated; `dt` seconds between rows."""
+    """The vehicle with what was found.
+
+    Args:
+        vehicle: as given. found: its numbers. flight: where they are from.
+        inflation: of their variances, by coloured innovations, (k,).
+        apart: how far another likelihood has each, which is in its std, (k,).
+        dt: seconds between rows.
+    """
     covariance = found.estimate.covariance * np.sqrt(np.outer(inflation, inflation))
-    stds = np.sqrt(np.diag(covariance)).tolist()
+    stds = np.hypot(np.sqrt(np.diag(covariance)), apart).tolist()
     where = flight.path.name if flight.path else "flight"
     after = fitted_vehicle(
         vehicle,
