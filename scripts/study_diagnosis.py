@@ -69,15 +69,6 @@ def planned(options: Any) -> list[PlannedFlight]:
     return plan.plan(options.clean, options.effects, options.seed, runs, options.many)
 
 
-def arm_names(text: str) -> list[str]:
-    """Names of arms, by commas, or "all"."""
-    names = list(arms.ARMS) if text == "all" else [name for name in text.split(",") if name]
-    unknown = sorted(set(names) - set(arms.ARMS))
-    if unknown:
-        raise InputError(f"no arm {unknown[0]!r}: there are {', '.join(arms.ARMS)}")
-    return names
-
-
 def parse() -> Any:
     """The command line."""
     parser = command_line.parser("study_diagnosis", __doc__, seed=True)
@@ -117,7 +108,7 @@ def parse() -> Any:
     parser.add_argument("--no-baselines", action="store_true", help="the package alone")
     command_line.add_workers(parser, "flights", -1)
     options = parser.parse_args()
-    options.arms = arm_names(options.arms)
+    options.arms = arms.named(options.arms)
     if options.quick:
         options.clean, options.effects = QUICK["clean"], QUICK["effects"]
     counts = (options.clean, options.effects, options.many)

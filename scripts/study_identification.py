@@ -1,13 +1,23 @@
-"""Do the identification's 95 % intervals hold the truth? Simulated flights in gusts, counted."""
+"""Do the identification's 95 % intervals hold the truth? Simulated flights in gusts, counted.
+
+With --arms, flights of the diagnosis' study instead: by other code, in closed loop, the file right.
+"""
 
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import command_line
-from study import judge
-from study.coverage import METHODS, fly_and_identify
+from study import arms, judge
+from study.coverage import (
+    ALL_ARMS,
+    METHODS,
+    READINGS_ALONE,
+    fly_and_identify,
+    identify_in_arm,
+)
 from tqdm import tqdm
 
 from coax_env.errors import InputError
@@ -19,37 +29,50 @@ def main() -> None:
     parser = command_line.parser("study_identification", __doc__, seed=True)
     parser.add_argument("--flights", type=int, default=200, help="default: %(default)s")
     parser.add_argument("--peer", action="store_true", help="AeroID on the same doublets, too")
+    parser.add_argument(
+        "--arms", default="", metavar="ARM,ARM|all",
+        help="--flights clean flights of each of these arms, numbers that they determine",
+    )  # fmt: skip
     command_line.add_workers(parser, "flights", -1)
     options = parser.parse_args()
     if options.flights < 1:
         raise InputError("a study needs at least one flight")
+    names = arms.named(options.arms)
     make_folder(options.out)
-    numbers = [1000 * options.seed + k for k in range(options.flights)]
-    waiting = [n for n in numbers if not path_of(options.out, n).exists()]
-    work = partial(fly_and_identify, peer=options.peer)
+    pieces: list[Any] = [
+        (name, k, options.seed) for name in names for k in range(options.flights)
+    ] or [1000 * options.seed + k for k in range(options.flights)]
+    waiting = [piece for piece in pieces if not path_of(options.out, piece).exists()]
+    work: Any = identify_in_arm if names else partial(fly_and_identify, peer=options.peer)
     results = each(work, waiting, options.jobs, options.backend)
-    done = len(numbers) - len(waiting)
+    done = len(pieces) - len(waiting)
     try:
-        for number, row in tqdm(results, "study", len(numbers), initial=done, unit="flight"):
-            write_json(path_of(options.out, number), row)
+        for piece, row in tqdm(results, "study", len(pieces), initial=done, unit="flight"):
+            write_json(path_of(options.out, piece), row)
     finally:
-        stored = [path_of(options.out, n) for n in numbers]
-        text = table([json.loads(path.read_text()) for path in stored if path.exists()])
+        stored = [path_of(options.out, piece) for piece in pieces]
+        rows = [json.loads(path.read_text()) for path in stored if path.exists()]
+        text = table(rows, (*names, ALL_ARMS, READINGS_ALONE) if names else METHODS)
         write_text(options.out / "table.md", text)
     print(text)
 
 
-def path_of(folder: Path, number: int) -> Path:
-    """File of a flight's result."""
+def path_of(folder: Path, piece: int | tuple[str, int, int]) -> Path:
+    """File of a flight's result: by its number, or by arm, number and seed."""
     (folder / "flights").mkdir(exist_ok=True)
-    return folder / "flights" / f"{number:06d}.json"
+    name = f"{piece:06d}" if isinstance(piece, int) else "{}-{:04d}-{}".format(*piece)
+    return folder / "flights" / f"{name}.json"
 
 
-def table(rows: list[dict[str, list[dict[str, Any]]]]) -> str:
-    """Share of intervals that hold the truth, by method, with Wilson's interval, and by name."""
+def table(rows: list[dict[str, list[dict[str, Any]]]], methods: Sequence[str]) -> str:
+    """Share of intervals that hold the truth, by method, with Wilson's interval, and by name.
+
+    Args:
+        rows: of each flight, its intervals by method. methods: in order.
+    """
     header = ["| intervals | hold the truth | of | Wilson 95 % |", "|---|---|---|---|"]
     lines = [f"{len(rows)} flights", "", *header]
-    for method in METHODS:
+    for method in methods:
         every = [i for row in rows for i in row.get(method, ())]
         if not every:
             continue

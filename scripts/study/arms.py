@@ -14,6 +14,7 @@ from injector import PILOTS
 from injector_air import GUSTS, GUSTY, STILL, Air
 from injector_sensors import MIXED, MIXED_POSES, kit
 
+from coax_env.errors import InputError
 from study.plan import ALONE, FOREIGN, RICH, PlannedFlight, several, sizes_of
 
 T = TypeVar("T")
@@ -154,6 +155,19 @@ def counts(arm: Arm, clean: int, effects: int) -> dict[str, int]:
         return {"outside": clean + effects}
     more = effects // 6
     return {"clean": clean, "one": effects - 2 * more, "two": more, "three": more}
+
+
+def named(text: str) -> list[str]:
+    """Names of arms, by commas, or "all".
+
+    Args:
+        text: as typed.
+    """
+    names = list(ARMS) if text == "all" else [name for name in text.split(",") if name]
+    unknown = sorted(set(names) - set(ARMS))
+    if unknown:
+        raise InputError(f"no arm {unknown[0]!r}: there are {', '.join(ARMS)}")
+    return names
 
 
 def planned(name: str, kind: str, number: int, seed: int) -> PlannedFlight:

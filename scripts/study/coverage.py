@@ -4,8 +4,14 @@
 with its gyroscopic term, against what the vehicle's equations give. "ml": a vehicle drawn from the
 file's spread, maneuvers with a pilot, in gusts; the file's numbers under their priors. "AeroID": the
 nearest open tool's output-error fit of PEER on the doublet's rates, and ours on the same readings.
+In an arm (arms.py): a clean flight by other code, in closed loop, with the file right; numbers that it
+determines.
 """
 
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +24,8 @@ from coax_env.logs.flight import Flight
 from coax_env.model.layout import COMMANDS, STATES
 from coax_env.model.vehicle import Vehicle
 from coax_env.simulation.simulate import Gusts
+from study import arms
+from study.one_flight import hide
 
 METHODS = ("tls", "ls", "ml", "ml on p, q", "AeroID on p, q")
 GUSTS = Gusts()
@@ -25,6 +33,9 @@ ML_RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
 LEVEL = 0.95
 PEER = ("inertia_xx", "inertia_yy", "swash_to_flap", "flap_time_constant")
 Z = 1.959964
+ALL_ARMS, READINGS_ALONE = "all arms", "all arms, by the readings alone"
+DETERMINED = 0.5
+"""Share of its prior's std within which the readings alone determine a number; ours."""
 
 
 def fly_and_identify(
@@ -57,6 +68,33 @@ def fly_and_identify(
         values, std = output_error(flight, file)
         result["AeroID on p, q"] = [_about(n, values[n], std[n], file) for n in PEER]
     return result
+
+
+def identify_in_arm(piece: tuple[str, int, int]) -> dict[str, list[dict[str, Any]]]:
+    """The intervals of one clean flight of an arm, by its name and twice together: as they are stated,
+    and without what commands show of the gusts.
+
+    None where the vehicle is not as its file says: what its numbers are in our model is not known.
+
+    Args:
+        piece: the arm's name, the flight's number, the study's seed.
+    """
+    os.environ["COAX_THREADS"] = "1"  # the study's workers share the cores
+    arm, number, seed = piece
+    planned = arms.planned(arm, "clean", number, seed)
+    if planned.craft == "spread":
+        return {}
+    with tempfile.TemporaryDirectory(prefix="coax-study-") as folder:
+        hide(planned, Path(folder) / "flight")
+        found = identify(Path(folder) / "flight")
+    alone = found.estimate.std
+    shown = [n for n in found.fitted if alone[n] < DETERMINED * found.before[n].std]
+
+    def intervals(std: Mapping[str, float]) -> list[dict[str, Any]]:
+        return [_about(n, found.after[n].value, std[n], found.before) for n in shown]
+
+    stated = intervals({n: found.after[n].std for n in shown})
+    return {arm: stated, ALL_ARMS: stated, READINGS_ALONE: intervals(alone)}
 
 
 def output_error(flight: Flight, file: Vehicle) -> tuple[dict[str, float], dict[str, float]]:
