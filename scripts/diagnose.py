@@ -266,6 +266,8 @@ def summary(result: "Diagnosis") -> str:
             f"gain on {', '.join(gain['held_out'])}: {gain['error_removed_percent']:.0f} % of the "
             f"{gain['horizon_s']:g} s prediction error removed{interval}"
         )
+        if round(gain["error_removed_percent"]) < 0:
+            lines.append("  (it is larger with them in the model)")
         if gain["persistence_percent"] is not None:
             lines.append(f"  (that nothing moves: {gain['persistence_percent']:.0f} %)")
     following = findings["next_maneuver"]

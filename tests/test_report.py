@@ -535,6 +535,16 @@ def test_synthetic_flights_are_called_so():
     assert "synthetic" not in Outline(report.diagnosis_page(real)).text
 
 
+def test_where_the_model_flies_worse_the_error_is_larger():
+    """Not "-16 % of the error is gone"."""
+    result = diagnosis()
+    result.findings["gain"] |= {"error_removed_percent": -16.2, "ci95": [-37.0, 1.0]}
+    text = Outline(report.diagnosis_page(result)).text
+    assert "the error of a 1 s prediction is 16 % larger on runs held out of the fit" in text
+    assert "On runs that it has not seen the error is 16 % larger (−37 to 1)." in text
+    assert "error is gone" not in text
+
+
 def test_angles_are_read_in_degrees_and_a_spin_is_called_so():
     result = diagnosis()
     channels = result.findings["gain"]["channels"]

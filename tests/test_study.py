@@ -25,6 +25,7 @@ from study import (
     arms,
     baselines,
     classes,
+    coverage,
     judge,
     one_flight,
     plan,
@@ -823,3 +824,15 @@ def test_two_workers_do_what_one_does(backend: str) -> None:
     for row in rows.values():
         assert "error" not in row, row["error"]
         assert row["methods"]["coax"] == rows["still-0000"]["methods"]["coax"], "the same seed"
+
+
+@pytest.mark.slow
+def test_identification_is_counted_by_arm_as_stated_and_by_the_readings_alone():
+    """What commands show can only widen an interval; where the file is not the truth nothing counts."""
+    found = coverage.identify_in_arm(("camera", 0, 771))
+    assert set(found) == {"camera", coverage.ALL_ARMS, coverage.READINGS_ALONE}
+    assert found["camera"] == found[coverage.ALL_ARMS] and found["camera"]
+    for stated, alone in zip(found["camera"], found[coverage.READINGS_ALONE], strict=True):
+        assert stated["name"] == alone["name"] and stated["truth"] == alone["truth"]
+        assert stated["low"] < alone["low"] and alone["high"] < stated["high"]
+    assert coverage.identify_in_arm(("spread_vehicles", 0, 771)) == {}

@@ -109,11 +109,13 @@ def lead(findings: Findings) -> list[str]:
     if findings["verdict"] == "consistent":
         sentences.append("The residual is sensor noise and gusts: no effect is worth adding.")
     if gain and findings["causes"]:
-        sentences.append(
-            f"With them in the model, **{whole_percent(gain['error_removed_percent'])}** of the "
-            f"error of a {seconds(gain['horizon_s'])} prediction is gone on runs held out of the "
-            f"fit ({and_list(list(gain['held_out']))})."
-        )
+        removed = gain["error_removed_percent"]
+        error = f"the error of a {seconds(gain['horizon_s'])} prediction is"
+        change = f"**{whole_percent(removed)}** of {error} gone"
+        if removed is not None and round(removed) < 0:
+            change = f"{error} **{whole_percent(-removed)}** larger"
+        runs = and_list(list(gain["held_out"]))
+        sentences.append(f"With them in the model, {change} on runs held out of the fit ({runs}).")
     elif not gain:
         sentences.append("No run was held out, so how well this predicts is not known.")
     alternatives = sorted({name for c in findings["causes"] for name in c["confusable_with"]})

@@ -83,7 +83,10 @@ def _gain(gain: Mapping[str, Any] | None) -> str:
         return "**Gain.** Not measured: no run was held out."
     removed, nothing = gain["error_removed_percent"], gain["persistence_percent"]
     low, high = gain["ci95"]
-    text = f"**Gain.** On runs that it has not seen {whole_percent(removed)} of the error is gone"
+    change = f"{whole_percent(removed)} of the error is gone"
+    if round(removed) < 0:
+        change = f"the error is {whole_percent(-removed)} larger"
+    text = f"**Gain.** On runs that it has not seen {change}"
     text += f" ({low:.0f} to {high:.0f})." if low is not None else "."
     if low is not None and low <= 0.0:
         text += " The interval holds zero."
