@@ -70,6 +70,7 @@ def test_numbers_are_unsure_where_the_pilot_flies_the_gusts_out(tmp_path):
         off = {n: abs(result.after[n].value - result.before[n].value) for n in result.fitted}
         assert all(off[n] < 2.0 * result.after[n].std for n in off)
         assert any(result.after[n].std < 0.5 * result.before[n].std for n in off)
+        assert any("the commands answer gusts" in remark for remark in result.remarks)
         worst.append(max(off[n] / result.estimate.std[n] for n in off))
     assert min(worst) > 2.0
 

@@ -43,6 +43,7 @@ from coax_env.logs.fast_rows import decimated
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
+from coax_env.plain_words import and_list, plain
 from coax_env.progress import Progress, reporter, shows_progress
 
 METHODS = ("ml", "paper")
@@ -204,7 +205,7 @@ def _by_maximum_likelihood(
         found.noise,
         replay_runs(again, model.bare_values, first),
         replay_runs(again, values, found.noise),
-        (*known, *([found.remark] if found.remark else [])),
+        (*known, *([found.remark] if found.remark else []), *_answered_gusts(found, apart)),
         *left_open(found.free, found.estimate.covariance),
         each_run(engine, found.free, lin, values, inflation),
         found.widened,
@@ -240,6 +241,20 @@ def _identified_vehicle(
         flight,
     )
     return replace(after, description=f"{vehicle.description}; identified from {where}")
+
+
+def _answered_gusts(found: OwnNumbers, apart: np.ndarray) -> list[str]:
+    """What is to be said of numbers that are elsewhere where the commands show the gusts, by more than
+    the readings alone leave them."""
+    std = found.estimate.std
+    moved = [f.name for f, far in zip(found.free, apart, strict=True) if abs(far) > std[f.name]]
+    if not moved:
+        return []
+    names = and_list([plain(name) for name in moved])
+    return [
+        f"the commands answer gusts: where they show these, {names} would be elsewhere by more than"
+        " the readings alone leave open; how far is a part of the std"
+    ]
 
 
 def _split(flight: Flight, hold_out: Collection[str]) -> tuple[Flight, Flight]:
