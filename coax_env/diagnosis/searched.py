@@ -19,7 +19,9 @@ Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) i
 what was before it. This comes next: errors that last would take a part of it up. Where errors of
 readings last (sensor_errors.py) it is done again with these in it; where inertial sensors stay coloured
 behind a low-pass, without it too, and that stands if it is likelier and has no name more: errors of
-every memory at once look like a low-pass. Low-passes are then fitted once more.
+every memory at once look like a low-pass. Low-passes are then fitted once more. Where inertial sensors
+stay coloured in the end, with gusts as they are, readings as logged are asked in these gusts too: a
+swing looks like a low-pass.
 
 Where runs have air of their own (run_air.py) it is done again in that: after the first search, since
 noise of one level makes many names, and once more here.
