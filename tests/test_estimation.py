@@ -202,6 +202,24 @@ def test_records_add_up():
     assert whole.log_likelihood(TRUTH, NOISE, which=[2]) == pytest.approx(parts[2])
 
 
+@pytest.mark.parametrize("threads", [2, 3])
+def test_runs_worked_on_side_by_side_are_those_worked_on_one_by_one(threads):
+    """To the last bit, whichever thread took which run, over and over."""
+    records = [swing(seed, n=n) for seed, n in enumerate((700, 90, 400, 1100, 20))]
+    free = [prior("stiffness", 1.0), prior("damping", 0.3)]
+    alone = Engine(Pendulum(), records, threads=1)
+    _, lin = alone.linearise(TRUTH, NOISE, free)
+    score = alone.noise_score(TRUTH, NOISE)
+    for _ in range(5):
+        beside = Engine(Pendulum(), records, threads=threads)
+        _, other = beside.linearise(TRUTH, NOISE, free)
+        np.testing.assert_array_equal(other.information, lin.information)
+        np.testing.assert_array_equal(other.slope, lin.slope)
+        again = beside.noise_score(TRUTH, NOISE)
+        np.testing.assert_array_equal(again.in_noise, score.in_noise)
+        assert again.log_likelihood == score.log_likelihood
+
+
 def test_the_clock_may_start_anywhere():
     """A log that begins in the middle of a flight: same likelihood, slopes and blocks."""
     record = with_holes(swing(4), 0.2, 6)
