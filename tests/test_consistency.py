@@ -99,6 +99,7 @@ ERRORS: Mapping[str, tuple[str, str]] = {
     "swash in deg": in_unit("deg", "delta_lon", "delta_lat"),
     "rotors in rev/s": in_unit("rev/s", "rpm_upper_cmd", "rpm_lower_cmd"),
     "a rotor in rad/s": in_unit("rad/s", "rpm_upper_cmd"),
+    "a measured rotor in rad/s": in_unit("rad/s", "rpm_upper"),
     "rotors swapped": swapped(*ROTORS),
     "rotor commands swapped": swapped(ROTORS[0]),
     "gyros swapped": swapped(("p", "q")),
@@ -214,6 +215,7 @@ FAULTS_OF_MACHINES = {
     "gyro bias": {"gyro_bias": {"x": 0.15, "y": -0.15, "z": 0.15}},
     "weak swash": {"swash_gain": -0.5},
     "slow motors and servos": {"motor_lag": {"upper": 0.3, "lower": 0.3}, "servo_lag": 0.1},
+    "soft motors": {"motor_droop": {"upper": 0.84, "lower": 0.4}},
     "late poses": {"pose_delay": 0.15},
     "wind on a draggy rotor": {"wind": {"north": 3.0, "east": -3.0}, "rotor_drag": 7e-4},
     "bent sensors": {

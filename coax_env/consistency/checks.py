@@ -61,6 +61,7 @@ GRAVITIES = (9.7, 9.9)
 DENSITIES = (0.6, 1.5)
 """From 6 km of altitude to a cold day at the sea [kg/m3]."""
 
+ROTOR_SPEEDS = ("rpm_upper", "rpm_lower")
 PULSES = (800.0, 2200.0)
 """Widths of a servo's pulse [us]."""
 RANGED = (*ROTOR_COMMANDS, *SWASH_COMMANDS, *LARGEST, "az", "h", BATTERY)
@@ -166,7 +167,8 @@ class Checker:
         """What the checks say of the log as it is."""
         each = tuple(c for known in self._known for c in known)
         swaps = self._swapped(self.rows, self._known)
-        return self._without_waived([*self._faults(each, self._ranges), *swaps], each)
+        faults = self._faults(self.rows, each, self._ranges)
+        return self._without_waived([*faults, *swaps], each)
 
     def after(
         self, change: Callable[[Signals], Signals], changed: frozenset[str], swaps: bool = False
@@ -182,7 +184,7 @@ class Checker:
         known = self._anew(rows, changed)
         each = tuple(c for few in known for c in few)
         beyond = {c: _range_fault(c, rows, self.machine) for c in changed & self._ranges.keys()}
-        faults = self._faults(each, self._ranges | beyond)
+        faults = self._faults(rows, each, self._ranges | beyond)
         if swaps:
             faults += self._swapped(rows, known)
         return self._without_waived(faults, each)
@@ -204,13 +206,13 @@ class Checker:
         ]
 
     def _faults(
-        self, each: Sequence[Coefficient], ranges: Mapping[str, Fault | None]
+        self, rows: EvenRows, each: Sequence[Coefficient], ranges: Mapping[str, Fault | None]
     ) -> list[Fault]:
         felt = {"vn": "ax", "ve": "ay", "pn": "ax", "pe": "ay"}
         faults = [
             fault
             for c in each
-            if (fault := _fault_of(c, felt.get(c.left, c.left) in self.channels))
+            if (fault := _fault_of(c, felt.get(c.left, c.left) in self.channels, rows))
         ]
         return [*faults, *filter(None, ranges.values())]
 
@@ -223,7 +225,7 @@ class Checker:
             alone = relations(frozenset(rows.signals), rows.edges)
             each = [c for one in alone for c in coefficients(one, rows, self.machine)]
             against = [c for c in each if _speaks_against_a_run(c)]
-            faults = [f for c in against if (f := _fault_of(c, True))]
+            faults = [f for c in against if (f := _fault_of(c, True, rows))]
             ranges = (_range_fault(c, rows, self.machine) for c in RANGED)
             for fault in (*faults, *filter(None, ranges)):
                 words = f"in run {name} {fault.words}"
@@ -292,7 +294,7 @@ def _agreement(c: Coefficient) -> float:
     return c.share if fits else 0.0
 
 
-def _fault_of(c: Coefficient, gusts_felt: bool) -> Fault | None:
+def _fault_of(c: Coefficient, gusts_felt: bool, rows: EvenRows) -> Fault | None:
     channels = frozenset((c.left, *({c.part} & {*LOG_UNITS})))
     if c.left in ("vn", "ve", "pn", "pe") and c.part in ("phi", "theta", "ax", "ay"):
         channels |= {"psi"}
@@ -307,6 +309,8 @@ def _fault_of(c: Coefficient, gusts_felt: bool) -> Fault | None:
         and -c.share > LEAST_SHARE
     ):
         return Fault(c.check, f"{c.left} goes {measured} times as {c.part} says", channels)
+    if _are_at_one_level(c, rows):
+        return None
     most = MOST if c.exact else MOST_OF_A_MACHINE
     if c.value - CLEAR_OF * c.std > most and c.share > LEAST_SHARE:
         return Fault(c.check, f"{c.left} goes {measured} times as far as {c.part} says", channels)
@@ -319,6 +323,18 @@ def _fault_of(c: Coefficient, gusts_felt: bool) -> Fault | None:
     ):
         return Fault(c.check, f"{c.left} goes {measured} times as far as {c.part} says", channels)
     return None
+
+
+def _are_at_one_level(c: Coefficient, rows: EvenRows) -> bool:
+    """Whether a rotor turns about as fast as it is told to, however far it follows: no unit does that.
+
+    One of a soft motor, which goes 0.155 times as far about the speed of hover, was refused as though
+    it were in rad/s (**synthetic**).
+    """
+    if c.left not in ROTOR_SPEEDS:
+        return False
+    turns, told = (float(np.median(_all(rows, name))) for name in (c.left, c.part))
+    return 1.0 / MOST < turns / told < MOST if told > 0.0 else False
 
 
 # --- ranges ---------------------------------------------------------------------------------------
