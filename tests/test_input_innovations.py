@@ -142,8 +142,7 @@ def test_gains_are_fitted_where_that_is_worth_more_than_a_tie(monkeypatch, falle
         return replace(fit, objective=300.0 - fallen)
 
     monkeypatch.setattr(input_innovations, "sampled_passes", lambda engine, values, noise: [])
-    monkeypatch.setattr(input_innovations, "innovations", lambda passes: [])
-    monkeypatch.setattr(input_innovations, "command_gains", lambda passes, found: gains)
+    monkeypatch.setattr(input_innovations, "shown_by_commands", lambda engine, passes: ([], gains))
     monkeypatch.setattr(input_innovations, "fitted", fitted)
     made = Problem(HeliModel(LAMA), Engine(HeliModel(LAMA), []), (), {})
     fit = Fit((), {"mass": 0.8, first: 0.2}, Noise({}), objective=300.0)

@@ -11,9 +11,9 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.shocks import engine_of
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.input_innovations import (
-    command_gains,
     innovations,
     sampled_passes,
+    shown_by_commands,
     with_innovations,
 )
 from coax_env.estimation.state_space import Record
@@ -38,9 +38,8 @@ def with_command_gains(problem: Problem, fit: Fit, coloured: bool = False) -> tu
     passes = sampled_passes(problem.engine, fit.values, fit.noise)
     if not coloured and not is_white(passes, problem.model.channels):
         return problem, fit
-    found = innovations(passes)
-    wider = problem.with_records(with_innovations(problem.engine.records, found))
-    wider = wider.with_free(command_gains(passes, found))
+    records, gains = shown_by_commands(problem.engine, passes)
+    wider = problem.with_records(records).with_free(gains)
     tie = problem.settings.tie
     trial = fitted(wider, fit.at({n: fit.values.get(n, 0.0) for n in P.COMMAND_GAINS}),
                    tolerance=0.5 * tie)  # fmt: skip

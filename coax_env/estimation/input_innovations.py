@@ -49,6 +49,18 @@ _LIFT = np.array([[1.0, 1.0, 0.0, 0.0]])
 _TAKEN = (_TILTS, _TILTS, _TILTS, _TURN, _TURN, _LIFT, _LIFT)
 
 
+def shown_by_commands(
+    engine: Engine, passes: Sequence[RunPass]
+) -> tuple[list[Record], list[FreeParameter]]:
+    """The engine's records with the input innovations in them, and the gains with their priors.
+
+    Args:
+        engine: model and records. passes: of it, with samples of the covariance (`sampled_passes`).
+    """
+    found = innovations(passes)
+    return with_innovations(engine.records, found), command_gains(passes, found)
+
+
 def with_innovations(records: Sequence[Record], found: Sequence[np.ndarray]) -> list[Record]:
     """Records with the input innovations of each, (n, 4), in them."""
     return [replace(r, input_innovations=e) for r, e in zip(records, found, strict=True)]

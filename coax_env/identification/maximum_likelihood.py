@@ -21,12 +21,7 @@ from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine, Estimate
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import fitted_levels
-from coax_env.estimation.input_innovations import (
-    command_gains,
-    innovations,
-    sampled_passes,
-    with_innovations,
-)
+from coax_env.estimation.input_innovations import sampled_passes, shown_by_commands
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.quadratic import Linearised
 from coax_env.estimation.state_space import FreeParameter, Noise
@@ -187,10 +182,8 @@ def beside_commands(
         found: the fit by the readings alone. values: of all parameters there.
         progress: called with a line of text.
     """
-    passes = sampled_passes(engine, values, found.noise)
-    shown = innovations(passes)
-    gains = command_gains(passes, shown)
-    joint = Engine(engine.model, with_innovations(engine.records, shown), engine.threads)
+    records, gains = shown_by_commands(engine, sampled_passes(engine, values, found.noise))
+    joint = Engine(engine.model, records, engine.threads)
     begun = {**values, **{f.name: f.value for f in gains}}
     there = joint.fit([*found.free, *gains], begun, found.noise, STEPS, TOLERANCE, progress)
     return np.array([there.values[f.name] - values[f.name] for f in found.free])
