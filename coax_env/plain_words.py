@@ -135,6 +135,17 @@ def whole_percent(value: float | None) -> str:
     return "–" if value is None else f"{round(value) + 0:d} %".replace("-", "−")
 
 
+def error_change(removed: float | None, error: str = "the error", mark: str = "") -> str:
+    """``71 % of the error is gone``; below zero, ``the error is 16 % larger``.
+
+    Args:
+        removed: share of it [%]. error: what it is the error of. mark: about the number.
+    """
+    if removed is not None and round(removed) < 0:
+        return f"{error} is {mark}{whole_percent(-removed)}{mark} larger"
+    return f"{mark}{whole_percent(removed)}{mark} of {error} is gone"
+
+
 def bounds(value: float, half: float, unit: str, signed: bool = False) -> str:
     """``+9.0 % (8.5 to 9.6)``: a number with its interval, to the last place that the interval fixes.
 

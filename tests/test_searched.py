@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from coax_env import load_vehicle
 from coax_env.diagnosis import fits, searched
-from coax_env.diagnosis.problem import ROTOR_SPEEDS, Fit
+from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.searched import Searched
 from coax_env.diagnosis.sensor_errors import LastingErrors
 from coax_env.diagnosis.sensor_low_pass import hidden_behind
@@ -20,7 +20,7 @@ from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LE
 from coax_env.estimation.low_pass import LowPass
 from coax_env.estimation.rotor_jitter import with_jitter
 from coax_env.estimation.state_space import Noise, Record
-from coax_env.model.layout import ACCELEROMETERS, GYROS, RPM_PER_RAD_S
+from coax_env.model.layout import ACCELEROMETERS, GYROS, ROTOR_SPEEDS, RPM_PER_RAD_S
 
 
 @pytest.fixture(autouse=True)

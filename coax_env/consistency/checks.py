@@ -15,7 +15,7 @@ from coax_env.consistency.relations import (
     relations,
 )
 from coax_env.logs.units import BATTERY, LOG_UNITS, ROTOR_COMMANDS, SWASH_COMMANDS
-from coax_env.model.layout import CHANNELS
+from coax_env.model.layout import CHANNELS, ROTOR_SPEEDS
 
 # --- when a coefficient speaks, all ours --------------------------------------------------------
 
@@ -61,7 +61,6 @@ GRAVITIES = (9.7, 9.9)
 DENSITIES = (0.6, 1.5)
 """From 6 km of altitude to a cold day at the sea [kg/m3]."""
 
-ROTOR_SPEEDS = ("rpm_upper", "rpm_lower")
 PULSES = (800.0, 2200.0)
 """Widths of a servo's pulse [us]."""
 RANGED = (*ROTOR_COMMANDS, *SWASH_COMMANDS, *LARGEST, "az", "h", BATTERY)
@@ -266,7 +265,7 @@ def _speaks_against_a_run(c: Coefficient) -> bool:
 
 PAIRS = (
     ("p", "q"), ("phi", "theta"), ("ax", "ay"), ("vn", "ve"), ("pn", "pe"),
-    ("delta_lon", "delta_lat"), ("rpm_upper_cmd", "rpm_lower_cmd"), ("rpm_upper", "rpm_lower"),
+    ("delta_lon", "delta_lat"), ROTOR_COMMANDS, ROTOR_SPEEDS,
 )  # fmt: skip
 """Columns that may have been taken for each other."""
 SWAP_GAIN, SWAP_LEFT = 0.7, 0.5
@@ -299,7 +298,7 @@ def _fault_of(c: Coefficient, gusts_felt: bool, rows: EvenRows) -> Fault | None:
     if c.left in ("vn", "ve", "pn", "pe") and c.part in ("phi", "theta", "ax", "ay"):
         channels |= {"psi"}
     if c.part == "rotors":
-        channels = frozenset((c.left, "rpm_upper_cmd", "rpm_lower_cmd", "rpm_upper", "rpm_lower"))
+        channels = frozenset((c.left, *ROTOR_COMMANDS, *ROTOR_SPEEDS))
     measured = f"{c.value:.3g} +- {c.std:.2g}"
     opposite = LEAST_OPPOSITE if gusts_felt else LEAST_OPPOSITE_UNFELT
     if (

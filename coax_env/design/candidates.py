@@ -4,7 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from coax_env.design.discrimination import ROW
+from coax_env.errors import InputError
 from coax_env.model.layout import VELOCITY
+from coax_env.model.vehicle import Vehicle
 from coax_env.simulation.maneuvers import (
     DEGREE,
     Maneuver,
@@ -15,7 +18,7 @@ from coax_env.simulation.maneuvers import (
     steps_3211,
     track,
 )
-from coax_env.simulation.simulate import Track
+from coax_env.simulation.simulate import Track, fly
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,23 @@ class Envelope:
         if away > self.room:
             return f"goes {away:.0f} m away"
         return ""
+
+
+def flown_inside(
+    vehicle: Vehicle, plan: Maneuver, envelope: Envelope, with_whom: str = ""
+) -> tuple[Track | None, str]:
+    """The maneuver flown with a vehicle, or why it must not be.
+
+    Args:
+        vehicle: what flies. plan: the maneuver. envelope: that it must not leave.
+        with_whom: what the vehicle is, behind the reason for which it leaves it.
+    """
+    try:
+        flown = fly(vehicle, plan, dt=ROW)
+    except InputError as error:
+        return None, str(error)
+    why = envelope.breach(flown)
+    return (None, why + with_whom) if why else (flown, "")
 
 
 def candidates() -> tuple[Maneuver, ...]:

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from coax_env.design.candidates import Envelope, candidates
-from coax_env.design.discrimination import ROW, expected_information
+from coax_env.design.candidates import Envelope, candidates, flown_inside
+from coax_env.design.discrimination import expected_information
 from coax_env.design.flight_card import asked_csv, instruction
 from coax_env.errors import InputError
 from coax_env.estimation.helicopter import HeliModel
@@ -38,7 +38,7 @@ from coax_env.model.vehicle_file import load_vehicle
 from coax_env.progress import Progress
 from coax_env.simulation.maneuvers import AXES, DEGREE, Maneuver
 from coax_env.simulation.multisine import multisines, steps
-from coax_env.simulation.simulate import Gusts, Track, fly
+from coax_env.simulation.simulate import Gusts, Track
 
 DRAWS = 5
 """Vehicles drawn from the file's spread that must stay inside the envelope too."""
@@ -235,13 +235,10 @@ def _safe(
     """The maneuver flown with the vehicle, or why it must not be."""
     first: Track | None = None
     for k, one in enumerate([vehicle, *spread]):
-        try:
-            flown = fly(one, option, dt=ROW)
-        except InputError as error:
-            return None, str(error)
-        why = envelope.breach(flown)
-        if why:
-            return None, why + (" with a vehicle drawn from the spread" if k else "")
+        whose = " with a vehicle drawn from the spread" if k else ""
+        flown, why = flown_inside(one, option, envelope, whose)
+        if flown is None:
+            return None, why
         first = first or flown
     return first, ""
 

@@ -10,12 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from coax_env.design.candidates import Envelope, candidates
-from coax_env.design.discrimination import ROW, Alternative, distance
+from coax_env.design.candidates import Envelope, candidates, flown_inside
+from coax_env.design.discrimination import Alternative, distance
 from coax_env.errors import InputError
 from coax_env.estimation.state_space import Noise
 from coax_env.simulation.maneuvers import Maneuver
-from coax_env.simulation.simulate import fly
 
 MOST_ALTERNATIVES = 4
 
@@ -93,13 +92,9 @@ def _worth(
     """
     least = math.inf
     for truth in alternatives:
-        try:
-            flown = fly(truth.vehicle, plan, dt=ROW)
-        except InputError as error:
-            return least, str(error)
-        why = envelope.breach(flown)
-        if why:
-            return least, f"{why} with {truth.name}"
+        flown, why = flown_inside(truth.vehicle, plan, envelope, f" with {truth.name}")
+        if flown is None:
+            return least, why
         for other in alternatives:
             if other is not truth:
                 least = min(least, distance(flown, other, noise, rates))

@@ -68,7 +68,7 @@ from coax_env.estimation.whiteness import Whiteness, whiteness
 from coax_env.logs.fast_rows import decimated
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model import effects
-from coax_env.model.layout import CHANNELS, RPM_PER_RAD_S
+from coax_env.model.layout import CHANNELS, ROTOR_SPEEDS, RPM_PER_RAD_S
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 from coax_env.progress import Progress, reporter, shows_progress
@@ -336,7 +336,7 @@ def _followed(flight: Flight) -> tuple[np.ndarray, np.ndarray]:
     """Battery voltages [V], and measured over commanded rotor speeds at them, (n,) each."""
     volts, ratio = [np.empty(0)], [np.empty(0)]
     for run in flight.runs:
-        for k, channel in enumerate(("rpm_upper", "rpm_lower")):
+        for k, channel in enumerate(ROTOR_SPEEDS):
             if run.battery is None or channel not in run.measured:
                 continue
             command = run.command[:, k] * RPM_PER_RAD_S

@@ -24,7 +24,7 @@ from coax_env.estimation.parted_engine import AT
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.model import effects
 from coax_env.model import parameters as P
-from coax_env.model.layout import INERTIAL
+from coax_env.model.layout import INERTIAL, ROTOR_SPEEDS
 from coax_env.progress import Progress
 
 SERVO_FORMS = ("servo_lag", "servo_delay")
@@ -84,9 +84,6 @@ OF_ROTORS = frozenset({
     "motor_lag", "motor_droop", "command_delay", "battery_sag", "battery_voltage",
 })  # fmt: skip
 """Effects that part a rotor's speed from its command."""
-
-ROTOR_SPEEDS = ("rpm_upper", "rpm_lower")
-"""Channels that show commands, and no gust."""
 
 T = TypeVar("T")
 

@@ -35,7 +35,6 @@ from coax_env.diagnosis.moves import (
 )
 from coax_env.diagnosis.problem import (
     LATE_ROTORS,
-    ROTOR_SPEEDS,
     SERVO_FORMS,
     WEAK_OR_LATE,
     Fit,
@@ -44,6 +43,7 @@ from coax_env.diagnosis.problem import (
 from coax_env.diagnosis.scores import Score, loss, most_gains, scores, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
+from coax_env.model.layout import ROTOR_SPEEDS
 
 MOST_ROTORED = 2
 """Sets of effects beside which one search tries rotors that follow late: each takes as long as some

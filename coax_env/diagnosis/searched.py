@@ -59,7 +59,7 @@ from coax_env.diagnosis.fits import (
 from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
-from coax_env.diagnosis.problem import OF_ROTORS, ROTOR_SPEEDS, Fit, Problem
+from coax_env.diagnosis.problem import OF_ROTORS, Fit, Problem
 from coax_env.diagnosis.rotor_jitter import in_jitter
 from coax_env.diagnosis.run_air import with_own_air
 from coax_env.diagnosis.scores import cost
@@ -82,7 +82,7 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import with_jitter
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.estimation.whiteness import are_white, correlation, is_white, whiteness
-from coax_env.model.layout import INERTIAL, RPM_PER_RAD_S
+from coax_env.model.layout import INERTIAL, ROTOR_SPEEDS, RPM_PER_RAD_S
 
 COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""

@@ -17,7 +17,7 @@ from coax_env.logs.held import interpolated, repeats
 from coax_env.logs.outliers import are_answers, find_leaps, find_outliers, off_median
 from coax_env.logs.packets import broken_packets
 from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS, without
-from coax_env.model.layout import ANGLES, CHANNELS, RPM_PER_RAD_S
+from coax_env.model.layout import ANGLES, CHANNELS, ROTOR_SPEEDS, RPM_PER_RAD_S
 
 SHORTEST_RUN = 2.0
 """A run must last this long [s]."""
@@ -34,8 +34,6 @@ CATCH_UP_ROWS = 12  # most rows in which a logger catches up after a stall
 POSE = (*ANGLES, "h", "pn", "pe")
 WHOLE = 0.9
 """Share of the rows with any of a pose that have all of it, where one tracker says it; ours."""
-
-_MEASURED_ROTOR = ("rpm_upper", "rpm_lower")
 
 
 @dataclass(frozen=True)
@@ -288,7 +286,7 @@ def _off_medians(data: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """How far commands and measured rotor speeds are off their running medians, (n,) each."""
     return {
         name: off_median(hold_last(data[name]))
-        for name in (*ROTOR_COMMANDS, *SWASH_COMMANDS, *_MEASURED_ROTOR)
+        for name in (*ROTOR_COMMANDS, *SWASH_COMMANDS, *ROTOR_SPEEDS)
         if name in data and not np.isnan(data[name]).all()
     }
 
@@ -304,7 +302,7 @@ def _commands(
     Where a rotor's command was not logged its measured speed drives the model, and is no reading.
     """
     columns, driving = [], set()
-    for name, stand_in in zip(ROTOR_COMMANDS, _MEASURED_ROTOR, strict=True):
+    for name, stand_in in zip(ROTOR_COMMANDS, ROTOR_SPEEDS, strict=True):
         speed = data.get(name)
         if speed is None or np.isnan(speed).all():
             if stand_in not in measured:

@@ -78,8 +78,10 @@ ANGLES = ("phi", "theta", "psi")
 """Channels whose innovations wrap."""
 GYROS, ACCELEROMETERS = ("p", "q", "r"), ("ax", "ay", "az")
 INERTIAL = (*GYROS, *ACCELEROMETERS)
+ROTOR_SPEEDS = ("rpm_upper", "rpm_lower")
+"""Channels that show commands, and no gust."""
 SENSOR_GROUPS = {
-    "rotor speeds": ("rpm_upper", "rpm_lower"), "gyros": GYROS, "accelerometers": ACCELEROMETERS,
+    "rotor speeds": ROTOR_SPEEDS, "gyros": GYROS, "accelerometers": ACCELEROMETERS,
     "attitude": ("phi", "theta"), "heading": ("psi",), "height": ("h",),
     "velocity": ("vn", "ve", "vd"), "position": ("pn", "pe"), "speed": ("v",),
 }  # fmt: skip

@@ -13,10 +13,10 @@ from coax_env.plain_words import (
     capital,
     channel_name,
     count_word,
+    error_change,
     number,
     plain,
     seconds,
-    whole_percent,
 )
 from coax_env.report.causes import cause_sections, confounding_blocks, since
 from coax_env.report.diagnosis_details import detail_blocks
@@ -109,11 +109,8 @@ def lead(findings: Findings) -> list[str]:
     if findings["verdict"] == "consistent":
         sentences.append("The residual is sensor noise and gusts: no effect is worth adding.")
     if gain and findings["causes"]:
-        removed = gain["error_removed_percent"]
-        error = f"the error of a {seconds(gain['horizon_s'])} prediction is"
-        change = f"**{whole_percent(removed)}** of {error} gone"
-        if removed is not None and round(removed) < 0:
-            change = f"{error} **{whole_percent(-removed)}** larger"
+        error = f"the error of a {seconds(gain['horizon_s'])} prediction"
+        change = error_change(gain["error_removed_percent"], error, "**")
         runs = and_list(list(gain["held_out"]))
         sentences.append(f"With them in the model, {change} on runs held out of the fit ({runs}).")
     elif not gain:

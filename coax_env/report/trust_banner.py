@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from coax_env.plain_words import and_list, capital, count_word, plain, whole_percent
+from coax_env.plain_words import and_list, capital, count_word, error_change, plain, whole_percent
 from coax_env.report.page import Markup, banner
 
 if TYPE_CHECKING:
@@ -83,10 +83,7 @@ def _gain(gain: Mapping[str, Any] | None) -> str:
         return "**Gain.** Not measured: no run was held out."
     removed, nothing = gain["error_removed_percent"], gain["persistence_percent"]
     low, high = gain["ci95"]
-    change = f"{whole_percent(removed)} of the error is gone"
-    if round(removed) < 0:
-        change = f"the error is {whole_percent(-removed)} larger"
-    text = f"**Gain.** On runs that it has not seen {change}"
+    text = f"**Gain.** On runs that it has not seen {error_change(removed)}"
     text += f" ({low:.0f} to {high:.0f})." if low is not None else "."
     if low is not None and low <= 0.0:
         text += " The interval holds zero."
