@@ -64,7 +64,9 @@ def check_only(flights: list[PlannedFlight], options: Any, command: str) -> None
 def planned(options: Any) -> list[PlannedFlight]:
     """The flights that the command line asks for."""
     if options.arms:
-        return arms.plan_arms(options.arms, options.clean, options.effects, options.seed)
+        return arms.plan_arms(
+            options.arms, options.clean, options.effects, options.seed, options.first
+        )
     runs = None if options.full else plan.RICH
     return plan.plan(options.clean, options.effects, options.seed, runs, options.many)
 
@@ -82,6 +84,11 @@ def parse() -> Any:
     parser.add_argument(
         "--arms", default="", metavar="ARM,ARM|all",
         help="flights of these arms, --clean and --effects of each, instead, without baselines",
+    )  # fmt: skip
+    parser.add_argument(
+        "--first", type=int, default=0, metavar="N",
+        help="with --arms: number of each arm's first flight; another one has another effect, other "
+        "sensors, another pilot",
     )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="24 flights in all")
     parser.add_argument(
@@ -114,6 +121,10 @@ def parse() -> Any:
     counts = (options.clean, options.effects, options.many)
     if min(counts) < 0 or sum(counts) == 0:
         raise InputError("a study needs at least one flight")
+    if options.first and not options.arms:
+        raise InputError("--first goes with --arms")
+    if options.first < 0:
+        raise InputError(f"--first {options.first}: a flight's number is 0 or more")
     if options.adopt and not options.calibrate:
         raise InputError("--adopt goes with --calibrate")
     return options

@@ -456,6 +456,13 @@ def test_an_arm_is_the_same_every_time_and_beside_any_others() -> None:
     assert not {f.seed for f in large} & {f.seed for f in arms.plan_arms(["gusty"], 9, 9, seed=4)}
 
 
+def test_a_study_may_begin_with_any_number() -> None:
+    whole = {f.name: f for f in arms.plan_arms(["gusty", "dryden"], 6, 4, seed=3)}
+    later = {f.name: f for f in arms.plan_arms(["gusty", "dryden"], 2, 1, seed=3, first=3)}
+    assert later.items() <= whole.items()
+    assert sorted({f.number for f in later.values()}) == [3, 4]
+
+
 def test_any_part_of_the_arms_is_a_fair_sample() -> None:
     flights = arms.plan_arms(list(arms.ARMS), 50, 60)
     early = [f.arm for f in flights[: len(flights) // 10]]

@@ -130,16 +130,19 @@ LEAST_SCALE = -0.6
 """Of a scale: three times the usual size could turn a time constant's sign."""
 
 
-def plan_arms(arms: Sequence[str], clean: int, effects: int, seed: int = 0) -> list[PlannedFlight]:
+def plan_arms(
+    arms: Sequence[str], clean: int, effects: int, seed: int = 0, first: int = 0
+) -> list[PlannedFlight]:
     """The flights of some arms, evenly mixed so that a part of the study is a fair sample.
 
     Args:
         arms: keys of ARMS. clean: flights without an effect, per arm. effects: with some, per arm;
             two thirds have one, one sixth two, one sixth three. An arm of unlisted ones has no others.
-        seed: the study's.
+        seed: the study's. first: number of the first flight of each kind; effects that stand alone,
+            sensors, pilots and cards follow from the number, whatever the seed.
     """
     flights = [
-        (position, planned(arm, kind, number, seed))
+        (position, planned(arm, kind, first + number, seed))
         for arm in arms
         for kind, count in counts(ARMS[arm], clean, effects).items()
         for number, position in enumerate((np.arange(count) + 0.5) / max(count, 1))
