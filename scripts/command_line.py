@@ -9,10 +9,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from coax_env.errors import InputError, MissingPackage
-from coax_env.files import read_toml, write_text
-from coax_env.progress import shown
-from coax_env.workers import BACKENDS
+try:
+    from coax_env.errors import InputError, MissingPackage
+    from coax_env.files import read_toml, write_text
+    from coax_env.progress import shown
+    from coax_env.workers import BACKENDS
+except ModuleNotFoundError as missing:  # a Python that is not the one of .venv
+    print(
+        f"error: {sys.executable} has no {missing.name}: scripts/demo or scripts/test sets up "
+        f".venv once, then .venv/bin/python {sys.argv[0]}",
+        file=sys.stderr,
+    )
+    sys.exit(2)  # BAD_INPUT
 
 progress = shown
 """A bar with the step and the time; one plain line a step where output is a file."""

@@ -238,6 +238,20 @@ def test_it_is_refused_in_a_process_of_its_own(what, tmp_path):
     check_refused(script(name, *words, cwd=tmp_path), tmp_path, *said)
 
 
+@pytest.mark.parametrize("name", sorted(set(PYTHON_SCRIPTS) - {"coax.py"}))
+def test_a_python_without_the_package_is_told_what_to_run(name, tmp_path):
+    """All scripts import `command_line` before any package; ``-S`` hides what is installed. coax.py
+    is installed with the package."""
+    without = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+    done = subprocess.run(
+        [sys.executable, "-S", str(ROOT / "scripts" / name), "x"], cwd=tmp_path, env=without,
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 2 and not done.stdout
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ") and "scripts/demo" in line and name in line
+
+
 def test_a_name_that_is_taken_is_left_alone(sound_text, here, tmp_path):
     put(tmp_path, sound_text)
     (tmp_path / "taken").write_text("a file")
