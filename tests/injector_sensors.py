@@ -130,6 +130,9 @@ SENSORS = {
         NOISE,
         smooth=dict.fromkeys(("p", "q", "r"), (35.0, 2)) | dict.fromkeys(("ax", "ay", "az"), (25.0, 2)),
     ),
+    "filtered_speeds": Sensors(  # averaged over a turn or two, as a motor controller reports them
+        NOISE, smooth=dict.fromkeys(("rpm_upper", "rpm_lower"), (8.0, 1))
+    ),
     "pose": Sensors(
         POSE, step=1.0 / 150.0, unrest=0.2, lost=0.01, outliers=0.002,
         formats=dict.fromkeys(("t", "h", "pn", "pe"), "%.5f"),

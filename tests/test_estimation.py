@@ -202,6 +202,36 @@ def test_records_add_up():
     assert whole.log_likelihood(TRUTH, NOISE, which=[2]) == pytest.approx(parts[2])
 
 
+def with_gaps(seed: int) -> Record:
+    """A record whose second channel has three readings in ten."""
+    record = swing(seed, n=400)
+    z = record.z.copy()
+    z[np.arange(400) % 10 > 2, 1] = np.nan
+    return replace(record, z=z)
+
+
+def test_channels_add_up():
+    """To the likelihood, but for the constant of each reading's normal density."""
+    records = [with_gaps(seed) for seed in range(2)]
+    engine = Engine(Pendulum(), records)
+    found = engine.likelihood_by_channel(TRUTH, NOISE)
+    readings = np.sum([np.isfinite(r.z).sum(axis=0) for r in records], axis=0)
+    assert readings.tolist() == [800, 240, 800]
+    found = found - 0.5 * math.log(2.0 * math.pi) * readings
+    assert found.sum() == pytest.approx(engine.log_likelihood(TRUTH, NOISE), rel=1e-9)
+
+
+def test_the_channel_of_a_sensor_in_error_has_most_of_the_loss():
+    records = [with_gaps(seed) for seed in range(2)]
+    error = np.array([0.0, 0.0, 0.5])
+    spoilt = [replace(r, z=r.z + error * np.sin(9.0 * r.t)[:, None]) for r in records]
+    sound, wrong = (
+        Engine(Pendulum(), own).likelihood_by_channel(TRUTH, NOISE) for own in (records, spoilt)
+    )
+    loss = sound - wrong
+    assert loss[2] > 100.0 and loss[2] > 2.0 * abs(loss[:2]).sum()
+
+
 @pytest.mark.parametrize("threads", [2, 3])
 def test_runs_worked_on_side_by_side_are_those_worked_on_one_by_one(threads):
     """To the last bit, whichever thread took which run, over and over."""

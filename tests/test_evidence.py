@@ -88,7 +88,8 @@ class Flights:
         model = SimpleNamespace(moments={}, bare_values={}, channels=("p",))
         own: dict[str, tuple[()]] = dict.fromkeys(self.worth, ())
         engine = SimpleNamespace(
-            threads=1, records=[SimpleNamespace(t=row * np.arange(9), z=np.zeros((9, 1)))]
+            threads=1, records=[SimpleNamespace(t=row * np.arange(9), z=np.zeros((9, 1)))],
+            likelihood_by_channel=lambda values, noise: np.zeros(1),
         )
         problem = Problem(model, engine, (), own, **unseen)  # type: ignore[arg-type]
         fit, _, found = prune(problem, Fit(tuple(self.worth), {}, noise))
@@ -343,6 +344,9 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "_worth", lambda problem, fit, quadratic, effect: THRESHOLD)
     monkeypatch.setattr(evidence, "threshold", lambda problem, quadratic, active: THRESHOLD)
     monkeypatch.setattr(evidence, "weigh", removals)
+    monkeypatch.setattr(
+        evidence, "beside_channels", lambda problem, fit, left: {e: r.evidence for e, r in left.items()}
+    )
     problem, fit, _, found = weighed(tables, Fit(active, {}, Noise({})))
     assert problem.gains == (tables.worth_it and tables.white and tables.feels)
     assert set(found) == set(fit.active)
@@ -353,6 +357,30 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     else:
         assert apart == [False]
     return fit.active
+
+
+@pytest.mark.parametrize(
+    ("lost", "inflation", "without", "against"),
+    [
+        (100.0, 1.0, 15.0, True), (100.0, 1.0, 13.0, False),  # the evidence of a name
+        (9000.0, 1.0, 91.0, True), (9000.0, 1.0, 89.0, False),  # and a hundredth of the cause's
+        (200.0, 2.0, 29.0, True), (200.0, 2.0, 27.0, False),  # both where innovations are coloured
+    ],
+)  # fmt: skip
+def test_channels_that_are_likelier_without_a_cause_speak_against_it(
+    lost, inflation, without, against
+):
+    nats = {"with": np.array([0.0, -50.0]), "without": np.array([-lost - without, without - 50.0])}
+    problem: Any = SimpleNamespace(
+        settings=SETTINGS, model=SimpleNamespace(channels=("rpm_upper", "az")),
+        engine=SimpleNamespace(likelihood_by_channel=lambda values, noise: nats[values["is"]]),
+    )  # fmt: skip
+    fit = Fit(("motor_lag",), {"is": "with"}, Noise({}))  # type: ignore[dict-item]
+    rest = fit.at({"is": "without"})  # type: ignore[dict-item]
+    removal = evidence.Removal(Evidence(lost, inflation), rest)
+    found = evidence.beside_channels(problem, fit, {"motor_lag": removal})["motor_lag"]
+    assert (found.lost, found.inflation) == (lost, inflation)
+    assert found.against == (pytest.approx({"az": without / inflation}) if against else {})
 
 
 def test_a_number_is_as_unsure_as_the_commands_would_have_it_elsewhere():

@@ -206,3 +206,16 @@ def test_of_a_low_pass_that_was_found_the_time_alone_is_looked_for_anew(monkeypa
     assert found.order == order and found.time == pytest.approx(0.013, rel=0.02)
     assert begun[:fits] == [1.0, 2.0, 3.0, 4.0, 1.0, 2.0, 3.0, 4.0][:fits]
     assert len(begun) == fits + 2  # at the likeliest time, and without
+
+
+@pytest.mark.slow
+def test_rotor_speeds_behind_a_filter_are_no_late_motors(tmp_path):
+    """Thrust and torque follow at once; the speeds alone, which are read well, come 20 ms late."""
+    injector.fly(
+        tmp_path / "flight", {}, gusts=True, sensors="filtered_speeds", seed=5, longest=9.0,
+        runs=("lon_3211", "heave_3211", "yaw_3211", "climb_descend"),
+    )  # fmt: skip
+    found = diagnose(tmp_path / "flight", hold_out=[]).findings
+    assert found["causes"] == [] and found["verdict"] == "unexplained"
+    (speeds,) = (u for u in found["unexplained"] if u.get("like") == "motor_lag")
+    assert any("vertical acceleration" in why for why in speeds["why"])

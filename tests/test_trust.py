@@ -304,7 +304,7 @@ def test_a_size_is_unusual_from_two_and_a_half_on_and_a_limit_at_five(size, word
 def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
     """An effect against which nothing speaks but what is said here."""
     sound = Against(
-        channels=tuple(channels), coloured=(), elsewhere=0.0, loud=(), falls_at=(),
+        channels=tuple(channels), coloured=(), elsewhere=0.0, likelier_without={}, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
         may_be_none=False, flies_worse=False, within_form=False, alternatives=(), nats=100.0,
         of_moment=math.inf, shaken=False, poses_alone=False, clock_error=0.0, smoothed=False,
@@ -423,6 +423,14 @@ def test_a_number_that_may_be_none_is_doubted_and_with_one_thing_more_has_no_nam
     of = known_of(may_be_none=True, coloured=("q",) * coloured, falls_at=("half of all",) * falls)
     assert without_name({one: of}, SETTINGS) == ({one} if coloured or falls else set())
     assert any("may as well be none" in text for text in doubts(one, {one: of}, SETTINGS))
+
+
+def test_what_a_channel_is_likelier_without_has_no_name():
+    """Rotor speeds read through a filter: a motor lag that the accelerometer denies."""
+    of = known_of(likelier_without={"az": 276.0})
+    assert without_name({"motor_lag": of}, SETTINGS) == {"motor_lag"}
+    (doubt,) = doubts("motor_lag", {"motor_lag": of}, SETTINGS)
+    assert "vertical acceleration are 276 nats likelier without it" in doubt
 
 
 @pytest.mark.parametrize("none", [False, True])

@@ -1,7 +1,8 @@
 """What speaks against a name: as measured, in plain words, and when it is enough to take the name.
 
 What stands at the limit of what is believed and is not determined, or does not hold under other noise
-or on parts of the flights, stands for something else. What changed in flight, by little evidence, has
+or on parts of the flights, stands for something else; so does what the readings of some channel are
+likelier without. What changed in flight, by little evidence, has
 no name: a hub stiffness, a servo's delay and a centre of gravity did on three clean **synthetic**
 flights, for 18 to 27 nats. Two of these take a name, too: noise left where it shows, little evidence
 there or by poses alone, other noise, parts of the flights, such a one beside it, numbers of which none
@@ -42,6 +43,8 @@ class Against:
         channels: in which it shows most, strongest first.
         coloured: those of them in which more than noise is left.
         elsewhere: share of all channels in which it is.
+        likelier_without: channels whose readings are likelier without it, beyond chance, and by how
+            many nats.
         loud: channels whose innovations are over LOUD times as loud in a run as their noise is.
         falls_at: variations of the noise under which it does not hold.
         parts: how it fared on parts of the flights. runs: number of runs that were fitted.
@@ -68,6 +71,7 @@ class Against:
     channels: tuple[str, ...]
     coloured: tuple[str, ...]
     elsewhere: float
+    likelier_without: Mapping[str, float]
     loud: tuple[str, ...]
     falls_at: tuple[str, ...]
     parts: Replication
@@ -156,6 +160,7 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         effect
         for effect, of in against.items()
         if effect in standing_in
+        or of.likelier_without
         or of.is_little_change(chosen)
         or voices(effect, of) >= SPEAKING_AGAINST
     }
@@ -181,6 +186,11 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
         yield f"it shows in {coloured}, where the model leaves more than noise"
     elif of.elsewhere > MOST:
         yield "the model leaves more than noise in most of what was read"
+    for channel, nats in of.likelier_without.items():
+        yield (
+            f"the readings of {channel_name(channel)} are {nats:.0f} nats likelier without it: "
+            "a sensor that is late or wrong looks so"
+        )
     if of.loud:
         loud = and_list([channel_name(c) for c in of.loud])
         yield f"a run is over {LOUD:g} times as loud in {loud} as the noise that was fitted"

@@ -27,7 +27,7 @@ before poses show it makes an answer weak or slow, and none late by a constant t
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -65,10 +65,12 @@ clean **synthetic** flight; ours."""
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a cause is worth. lost: nats without it. inflation: variance inflation in its direction."""
+    """What a cause is worth. lost: nats without it. inflation: variance inflation in its direction.
+    against: channels whose readings are likelier without it, beyond chance, and by how many nats."""
 
     lost: float
     inflation: float
+    against: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def nats(self) -> float:
@@ -158,9 +160,38 @@ def prune(
         else:
             better = None if again else _in_brief_gusts(problem, fit, quadratic, enough, removals)
             if better is None:
-                left = (e for e in fit.active if e in removals)
-                return fit, quadratic, {e: removals[e].evidence for e in left}
+                left = {e: removals[e] for e in fit.active if e in removals}
+                if again:
+                    return fit, quadratic, {e: removal.evidence for e, removal in left.items()}
+                return fit, quadratic, beside_channels(problem, fit, left)
         fit = with_latent_noise(problem, better) or better
+
+
+def beside_channels(
+    problem: Problem, fit: Fit, removals: Mapping[str, Removal]
+) -> dict[str, Evidence]:
+    """The evidence of each cause, and which channels speak against it.
+
+    What acts makes the readings of no channel less likely: of 40 true causes on **synthetic** flights
+    by two simulators none lost more than 4 nats in one. A sensor that is late, or in error, may look
+    like a cause in its own readings and in no other's: rotor speeds that were averaged over 50 ms were
+    a motor lag of 21 ms, sure, for 10,000 nats, that the vertical acceleration was 276 nats likelier
+    without.
+
+    Args:
+        problem, fit: with the causes. removals: of each.
+    """
+    chosen = problem.settings
+    with_it = problem.engine.likelihood_by_channel(fit.values, fit.noise) if removals else 0.0
+    found = {}
+    for effect, removal in removals.items():
+        rest, worth = removal.rest, removal.evidence
+        lost = problem.engine.likelihood_by_channel(rest.values, rest.noise) - with_it
+        least = max(chosen.evidence, chosen.against_share * worth.lost) * worth.inflation
+        named = zip(problem.model.channels, lost.tolist(), strict=True)
+        against = {c: nats / worth.inflation for c, nats in named if nats > least}
+        found[effect] = replace(worth, against=against)
+    return found
 
 
 def _without_small(problem: Problem, fit: Fit) -> Fit:
@@ -268,7 +299,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
             asked, other = fitted(second, rest), {}
         if asked.active == pruned.active:
             lesser = {
-                e: min(x, other.get(e, x), key=lambda worth: worth.nats)
+                e: replace(min(x, other.get(e, x), key=lambda w: w.nats), against=x.against)
                 for e, x in evidence.items()
             }
             if not _feels_gusts(problem):

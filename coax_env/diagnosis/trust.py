@@ -124,6 +124,7 @@ def trusts(
             channels=tuple(channels),
             coloured=tuple(c for c in channels if c in white and not white[c].white),
             elsewhere=elsewhere,
+            likelier_without=evidence[effect].against,
             loud=loud,
             falls_at=tuple(falling[effect]),
             parts=replicated[effect],

@@ -168,6 +168,29 @@ class Engine(RunPasses):
                 return known.score.log_likelihood
         return float(sum(p.log_likelihood for p in self.filter(values, noise, which=which)))
 
+    def likelihood_by_channel(self, values: Mapping[str, float], noise: Noise) -> np.ndarray:
+        """Log-likelihood of each channel's readings, (m,) [nats], but for a constant.
+
+        A row's readings are taken one by one in the order of the channels: each is judged by what was
+        known before it. Without those of a run whose filter diverged.
+
+        Args:
+            values: of the parameters, by name. noise: levels of process and reading noise.
+        """
+        p = self.model.vector(values, noise)
+
+        def one(i: int) -> np.ndarray:
+            with self.borrowed_buffers() as buffers:
+                run, _ = self.filter_run(i, *self.of_run(i, values, noise, p), buffers)
+                nats = -0.5 * run.innovations**2
+                seen = np.isfinite(nats)
+                if not np.isfinite(run.log_likelihood):
+                    return np.zeros(nats.shape[1])
+                nats[seen] += np.log(run.per_sigma)
+                return np.where(seen, nats, 0.0).sum(axis=0)
+
+        return np.asarray(np.sum(self.each(one), axis=0))
+
     def of_run(
         self, i: int, values: Mapping[str, float], noise: Noise, p: np.ndarray
     ) -> tuple[np.ndarray, Noise]:

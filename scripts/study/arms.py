@@ -103,6 +103,9 @@ ARMS = {
         "CoaX class, a camera: poses at 33 Hz, 3 mm and 0.6 degrees",
         sensors=("camera",), card=(None, 1.0), craft="coax",
     ),
+    "filtered_speeds": Arm(
+        "rotor speeds behind low-passes of 8 Hz, first order", sensors=("filtered_speeds",)
+    ),
     "by_radio": Arm("a radio that loses 3 % of the commands", pilots=("by_radio",)),
     "by_steps": Arm("commands that arrive in steps of 4 mrad and 0.4 %", pilots=("by_steps",)),
     "mixed": Arm(
