@@ -168,7 +168,7 @@ def test_what_moves_the_rotors_comes_first_and_plain_jitter_with_it(
         "_is_coloured": lambda found, channels: white == "never" or (
             white == "beside a drift" and found.fit is lag),
         "_in_noise_anew": lambda problem, fit, noise: drifting,
-        "in_jitter": jitter, "_searched": whole,
+        "in_jitter": jitter, "_searched": whole, "_nothing_forgotten": lambda best, fit: best,
         "_searched_from": from_there, "_with_levels_of_jitter": lambda noise, wider, fit: "begun",
     }  # fmt: skip
     for name, stand_in in given.items():
@@ -554,6 +554,33 @@ def test_jitter_stands_where_the_search_in_it_ends_likelier(
         assert (begun.level(JITTER_LEVEL), begun.level(JITTER_MEMORY)) == (0.4, 0.07)
     else:
         assert begun is FINE
+
+
+@pytest.mark.parametrize(
+    ("had", "costs", "active", "searches"),
+    [
+        (("motor_lag",), {"motor_droop": 100.0, "motor_lag": 90.0}, "motor_lag", 1),
+        (("motor_lag",), {"motor_droop": 90.0, "motor_lag": 100.0}, "motor_droop", 1),
+        (("motor_droop",), {}, "motor_droop", 0),  # nothing was forgotten
+        ((), {}, "motor_droop", 0),
+    ],
+)
+def test_a_cause_that_jitter_was_found_beside_is_not_forgotten(
+    monkeypatch, had, costs, active, searches
+):
+    """In jitter a droop came first where motors lag, 6,700 nats less likely (**synthetic**)."""
+    begun: list[tuple[str, ...]] = []
+
+    def search(problem: Any, fit: Fit) -> tuple[Fit, None]:
+        begun.append(fit.active)
+        return fit, None
+
+    monkeypatch.setattr(searched, "search", search)
+    monkeypatch.setattr(searched, "cost", lambda problem, fit, quadratic: costs[fit.active[0]])
+    droop = Fit(("motor_droop",), {}, FINE)
+    best = Searched(SimpleNamespace(), droop, droop, droop, None)  # type: ignore[arg-type]
+    found = searched._nothing_forgotten(best, replace(droop, active=had))
+    assert found.fit.active == (active,) and begun == [had] * searches
 
 
 @pytest.mark.parametrize("coloured", [True, False])

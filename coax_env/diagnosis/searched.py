@@ -444,7 +444,7 @@ def _rotors_first(problem: Problem, noise: Noise) -> tuple[Searched, Noise] | No
         return _searched_from(problem, bare, refitted, rotors), noise
     begun = _with_levels_of_jitter(noise, *jittery)
     problem.report("searching with rotor speeds that jitter")
-    return _searched(jittery[0], begun), begun
+    return _nothing_forgotten(_searched(jittery[0], begun), jittery[1]), begun
 
 
 def _in_noise_anew(problem: Problem, fit: Fit, noise: Noise) -> Fit:
@@ -520,6 +520,18 @@ def _white_since(found: Searched, clock: Mapping[str, Lap], gained: float) -> Se
     return replace(found, changing=state)
 
 
+def _nothing_forgotten(best: Searched, found: Fit) -> Searched:
+    """`_likelier`, where the search ended without a cause that jitter was found beside.
+
+    In jitter, which takes up a part of what it was fitted without, another cause may come first: a
+    droop of the motors in the place of their lag, which no single step exchanges (**synthetic**).
+
+    Args:
+        best: from no cause. found: causes in the same problem, jitter in it.
+    """
+    return best if set(found.active) <= set(best.fit.active) else _likelier(best, found)
+
+
 def _likelier(best: Searched, found: Fit) -> Searched:
     """That, or what a search from something else ends with, where it is likelier.
 
@@ -591,7 +603,7 @@ def _jittery(found: Searched, noise: Noise) -> tuple[Searched, Noise]:
         return found, noise
     wider.report("searching again with rotor speeds that jitter")
     begun = _with_levels_of_jitter(noise, wider, fit)
-    other = _searched(wider, begun)
+    other = _nothing_forgotten(_searched(wider, begun), fit)
     gained = found.cost - other.cost
     wider.report(f"rotor speeds that jitter after the search: {gained:.1f} nats")
     return (other, begun) if gained > 0.0 else (found, noise)
