@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import binom, norm
 
 from coax_env.diagnosis import moves, replication, unlisted
@@ -38,6 +39,7 @@ from coax_env.diagnosis.trust import (
     may_be_none,
     moved_far,
     of_line,
+    taken_back,
 )
 from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import HeliModel
@@ -308,7 +310,7 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
         may_be_none=False, flies_worse=False, within_form=False, alternatives=(), nats=100.0,
         of_moment=math.inf, shaken=False, poses_alone=False, clock_error=0.0, smoothed=False,
-        errors_left=0.0, beside_terms=(), beside_moved=(),
+        errors_left=0.0, beside_terms=(), beside_moved=(), taken_back_by="",
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -431,6 +433,25 @@ def test_what_a_channel_is_likelier_without_has_no_name():
     assert without_name({"motor_lag": of}, SETTINGS) == {"motor_lag"}
     (doubt,) = doubts("motor_lag", {"motor_lag": of}, SETTINGS)
     assert "vertical acceleration are 276 nats likelier without it" in doubt
+
+
+@pytest.mark.parametrize(
+    ("share", "alike"), [(1.0, True), (0.95, True), (0.85, False), (-1.0, False)]
+)
+def test_a_tilt_and_a_bias_that_do_nothing_at_rest_are_doubted(share, alike):
+    """What a turned sensor feels of gravity, by SciPy's rotations, is what the bias takes."""
+    x, y = -0.0186, 0.0195
+    felt = Rotation.from_rotvec([x, y, 0.0]).inv().apply([0.0, 0.0, -9.81])
+    values = {
+        "gravity": 9.81, "imu_tilt.x": x, "imu_tilt.y": y,
+        "accel_bias.x": -share * felt[0], "accel_bias.y": -share * felt[1],
+    }  # fmt: skip
+    found = taken_back(Fit(("imu_tilt", "accel_bias"), values, Noise({})))
+    assert found == ({"imu_tilt": "accel_bias", "accel_bias": "imu_tilt"} if alike else {})
+    assert not taken_back(Fit(("imu_tilt",), values, Noise({})))
+    of = known_of(taken_back_by="accel_bias")
+    (doubt,) = doubts("imu_tilt", {"imu_tilt": of}, SETTINGS)
+    assert "accel bias beside it" in doubt and not without_name({"imu_tilt": of}, SETTINGS)
 
 
 @pytest.mark.parametrize("none", [False, True])

@@ -66,6 +66,7 @@ class Against:
             0 where they are in the model, or nothing asks for them.
         beside_terms: channels among its own in which what no effect explains acts, too.
         beside_moved: numbers of the vehicle far from its file's that show in channels among its own.
+        taken_back_by: a cause that takes back at rest what it does; empty: none.
     """
 
     channels: tuple[str, ...]
@@ -91,6 +92,7 @@ class Against:
     errors_left: float
     beside_terms: tuple[str, ...]
     beside_moved: tuple[str, ...]
+    taken_back_by: str
 
     @property
     def at_limit(self) -> bool:
@@ -200,6 +202,9 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
     if of.beside_moved:
         moved = and_list([plain(name) for name in of.beside_moved])
         yield f"beside it the vehicle's {moved} had to go far from the file's: one of the two is wrong"
+    if of.taken_back_by:
+        other = plain(of.taken_back_by)
+        yield f"{other} beside it takes it back at rest: gyros that are turned alone look like both"
     yield from under_noise(of.falls_at)
     yield from on_parts(of.parts, of.runs, chosen)
     yield from of_sizes(of.sizes)
