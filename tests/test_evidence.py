@@ -26,6 +26,7 @@ from coax_env.diagnosis.evidence import Evidence, prune, weighed
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.state_space import Noise
+from coax_env.model.layout import CHANNELS
 
 GOOD, POOR = Noise({"force": 1.0}), Noise({"force": 2.0})
 THRESHOLD = SETTINGS.evidence
@@ -88,7 +89,8 @@ class Flights:
         model = SimpleNamespace(moments={}, bare_values={}, channels=("p",))
         own: dict[str, tuple[()]] = dict.fromkeys(self.worth, ())
         engine = SimpleNamespace(
-            threads=1, records=[SimpleNamespace(t=row * np.arange(9), z=np.zeros((9, 1)))],
+            threads=1,
+            records=[SimpleNamespace(t=row * np.arange(9), z=np.zeros((9, 1)))],
             likelihood_by_channel=lambda values, noise: np.zeros(1),
         )
         problem = Problem(model, engine, (), own, **unseen)  # type: ignore[arg-type]
@@ -345,7 +347,9 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     monkeypatch.setattr(evidence, "threshold", lambda problem, quadratic, active: THRESHOLD)
     monkeypatch.setattr(evidence, "weigh", removals)
     monkeypatch.setattr(
-        evidence, "beside_channels", lambda problem, fit, left: {e: r.evidence for e, r in left.items()}
+        evidence,
+        "beside_channels",
+        lambda problem, fit, left: {e: r.evidence for e, r in left.items()},
     )
     problem, fit, _, found = weighed(tables, Fit(active, {}, Noise({})))
     assert problem.gains == (tables.worth_it and tables.white and tables.feels)
@@ -370,9 +374,12 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
 def test_channels_that_are_likelier_without_a_cause_speak_against_it(
     lost, inflation, without, against
 ):
-    nats = {"with": np.array([0.0, -50.0]), "without": np.array([-lost - without, without - 50.0])}
+    """The accelerometer, where a motor's lag shows, and not a gyro, by what the filter makes of it."""
+    nats = {"with": np.zeros(len(CHANNELS)), "without": np.zeros(len(CHANNELS))}
+    for channel, gained in (("rpm_upper", -lost), ("az", without), ("p", 1000.0)):
+        nats["without"][CHANNELS.index(channel)] = gained
     problem: Any = SimpleNamespace(
-        settings=SETTINGS, model=SimpleNamespace(channels=("rpm_upper", "az")),
+        settings=SETTINGS, model=SimpleNamespace(channels=CHANNELS),
         engine=SimpleNamespace(likelihood_by_channel=lambda values, noise: nats[values["is"]]),
     )  # fmt: skip
     fit = Fit(("motor_lag",), {"is": "with"}, Noise({}))  # type: ignore[dict-item]

@@ -19,7 +19,14 @@ from coax_env.diagnosis.evidence import (
 )
 from coax_env.diagnosis.fits import converged, fitted
 from coax_env.diagnosis.from_afar import FAR, in_place_of
-from coax_env.diagnosis.problem import LATE_SERVO, SERVO_FORMS, Fit, Problem, exclusive_with
+from coax_env.diagnosis.problem import (
+    LATE_SERVO,
+    SERVO_FORMS,
+    SERVO_RATE,
+    Fit,
+    Problem,
+    exclusive_with,
+)
 from coax_env.diagnosis.scores import cost, is_large, score, swap
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
@@ -297,6 +304,12 @@ def _of_one(
         trial = in_place_of(problem, fit, quadratic, effect, other)
         if trial.objective - fit.objective < tie:
             found[other] = trial
+    for form in sorted(set(SERVO_FORMS) & absent) if effect == SERVO_RATE else ():
+        if problem.changes(effect) or problem.changes(form):
+            continue
+        trial = in_place_of(problem, fit, quadratic, effect, form)
+        if trial.objective - fit.objective < max(tie, chosen.form_share * lost):
+            found[form] = trial  # a real servo is late, and limited when it has far to go
     for twin in sorted(exclusive_with(effect) & absent):
         _, move = swap(problem, quadratic, fit.active, effect, twin)
         trial = refit(twin, move, steps=TWIN_STEPS)

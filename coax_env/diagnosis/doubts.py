@@ -1,8 +1,8 @@
 """What speaks against a name: as measured, in plain words, and when it is enough to take the name.
 
 What stands at the limit of what is believed and is not determined, or does not hold under other noise
-or on parts of the flights, stands for something else; so does what the readings of some channel are
-likelier without. What changed in flight, by little evidence, has
+or on parts of the flights, stands for something else; so does what the readings of a channel that
+should show it are likelier without. What changed in flight, by little evidence, has
 no name: a hub stiffness, a servo's delay and a centre of gravity did on three clean **synthetic**
 flights, for 18 to 27 nats. Two of these take a name, too: noise left where it shows, little evidence
 there or by poses alone, other noise, parts of the flights, such a one beside it, numbers of which none
@@ -43,8 +43,8 @@ class Against:
         channels: in which it shows most, strongest first.
         coloured: those of them in which more than noise is left.
         elsewhere: share of all channels in which it is.
-        likelier_without: channels whose readings are likelier without it, beyond chance, and by how
-            many nats.
+        likelier_without: channels that should show it and whose readings are likelier without it,
+            beyond chance, and by how many nats.
         loud: channels whose innovations are over LOUD times as loud in a run as their noise is.
         falls_at: variations of the noise under which it does not hold.
         parts: how it fared on parts of the flights. runs: number of runs that were fitted.

@@ -53,6 +53,7 @@ from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, is_large, loss, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import is_white, whiteness
+from coax_env.model.effects import CATALOGUE
 from coax_env.model.layout import ACCELEROMETERS
 
 WEAK = 3.0
@@ -66,7 +67,8 @@ clean **synthetic** flight; ours."""
 @dataclass(frozen=True)
 class Evidence:
     """What a cause is worth. lost: nats without it. inflation: variance inflation in its direction.
-    against: channels whose readings are likelier without it, beyond chance, and by how many nats."""
+    against: channels that should show it and whose readings are likelier without it, beyond chance, and
+    by how many nats."""
 
     lost: float
     inflation: float
@@ -172,11 +174,11 @@ def beside_channels(
 ) -> dict[str, Evidence]:
     """The evidence of each cause, and which channels speak against it.
 
-    What acts makes the readings of no channel less likely: of 40 true causes on **synthetic** flights
-    by two simulators none lost more than 4 nats in one. A sensor that is late, or in error, may look
-    like a cause in its own readings and in no other's: rotor speeds that were averaged over 50 ms were
-    a motor lag of 21 ms, sure, for 10,000 nats, that the vertical acceleration was 276 nats likelier
-    without.
+    What acts makes no channel less likely that should show it: of 40 true causes on **synthetic**
+    flights by two simulators none lost more than 6 nats in one. A sensor that is late, or in error, may
+    look like a cause in its own readings and in no other's: rotor speeds that were averaged over 50 ms
+    were a motor lag of 21 ms, sure, for 10,000 nats, that the vertical acceleration was 276 nats
+    likelier without. In other channels, by what the filter makes of it, true ones lost up to 203.
 
     Args:
         problem, fit: with the causes. removals: of each.
@@ -188,8 +190,9 @@ def beside_channels(
         rest, worth = removal.rest, removal.evidence
         lost = problem.engine.likelihood_by_channel(rest.values, rest.noise) - with_it
         least = max(chosen.evidence, chosen.against_share * worth.lost) * worth.inflation
-        named = zip(problem.model.channels, lost.tolist(), strict=True)
-        against = {c: nats / worth.inflation for c, nats in named if nats > least}
+        named = dict(zip(problem.model.channels, lost.tolist(), strict=True))
+        shown = [c for c in CATALOGUE[effect].channels if named.get(c, 0.0) > least]
+        against = {c: named[c] / worth.inflation for c in shown}
         found[effect] = replace(worth, against=against)
     return found
 
