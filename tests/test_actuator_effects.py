@@ -450,6 +450,7 @@ def test_a_hidden_actuator_effect_is_found_and_nothing_else(effect):
     found = diagnose(flight_with(between), LAMA, hold_out=[]).findings
     assert [c["effect"] for c in found["causes"]] == [effect], found["causes"]
     (cause,) = found["causes"]
+    assert effect != "servo_rate" or cause["confusable_with"] == []
     for name, value in truth.items():
         reported = cause["parameters"][f"{effect}.{name}"]
         allowed = 3.0 * reported["std"] + 0.1 * value  # the form is another one

@@ -136,6 +136,28 @@ def test_what_begins_in_flight_has_no_alternative_from_afar(monkeypatch, begins)
     assert list(found) == ([] if begins else ["dynamic_inflow"])
 
 
+@pytest.mark.parametrize(
+    ("lost", "behind", "begins", "alike"),
+    [
+        (300.0, 29.0, (), True),  # a tenth of what it is worth
+        (300.0, 31.0, (), False),
+        (20.0, 5.0, (), True),  # a tie
+        (20.0, 7.0, (), False),
+        (300.0, 29.0, ("servo_rate",), False),  # it has two sizes
+    ],
+)
+def test_a_limited_rate_is_no_surer_than_a_servo_is_late(monkeypatch, lost, behind, begins, alike):
+    names = ("servo_rate.limit", "servo_delay.time")
+    own = {n.partition(".")[0]: (FreeParameter(n, 0.0, 1.0),) for n in names}
+    problem = Problem(HeliModel(load_vehicle("lama400d")), None, (), own)  # type: ignore[arg-type]
+    fit = Fit(("servo_rate",), dict.fromkeys(names, 0.0), Noise({}), objective=0.0)
+    monkeypatch.setattr(Problem, "changes", lambda self, effect: effect in begins)
+    monkeypatch.setattr(confounding, "_near", lambda *given: [])
+    monkeypatch.setattr(confounding, "in_place_of", lambda *given: replace(fit, objective=behind))
+    found = confounding._of_one(problem, fit, None, "servo_rate", 1.0, lost)  # type: ignore[arg-type]
+    assert list(found) == (["servo_delay"] if alike else [])
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_likelier_alternative_stays_where_it_stands_once_weighed(monkeypatch, kept):
     problem, fit, quadratic = fitted_with(0.0)

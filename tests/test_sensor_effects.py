@@ -87,7 +87,7 @@ HIDDEN = {
     "compass": ({"magnetic_field": {}}, "full", ON_AXES, SHORT),
     "markers' axes, gyros aboard": ({"frame_yaw": {}}, "tracked", ON_AXES, SHORT),
     "markers beside the centre of gravity": ({"marker_offset": {}}, "pose", ON_AXES, SHORT),
-    "tether": ({"position_spring": {}}, "tracked", FAST, 20.0),
+    "tether": ({"position_spring": {}}, "tracked", ("forward_run", "side_run"), 20.0),
     "upper blow-back": ({"upper_blowback": {}}, "full", FAST, SHORT),
 }
 
