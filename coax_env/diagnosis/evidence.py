@@ -432,14 +432,13 @@ def inflation_of(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) 
         problem, fit: with the cause. quadratic: with its numbers. effect: the cause.
     """
     colour = inflation(problem, quadratic, fit.active, effect)
-    unseen = problem.settings.unseen_inflation
     if effect not in WEAK_OR_LATE:
         return colour
     if problem.answers_unseen:
-        return colour * unseen
+        return colour * problem.unseen_times
     # what poses show late colours them, where they are fine enough to show it
     slack = problem.sees_poses_alone and effect not in PURE_DELAYS
-    return max(colour, unseen) if slack else colour
+    return max(colour, problem.unseen_times) if slack else colour
 
 
 def _worth(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:

@@ -257,6 +257,12 @@ class Problem:
         gusts that are not as it has them, what is left of a sensor's low-pass."""
         return self.reads_seldom or self.unlike_gusts or self.smoothed
 
+    @property
+    def unseen_times(self) -> float:
+        """Times that what looks like a weak or late answer must be worth more where it is not seen."""
+        seldom = self.sees_poses_alone and self.reads_seldom
+        return self.settings.seldom_poses_inflation if seldom else self.settings.unseen_inflation
+
     def is_hidden_by_gains(self, effect: str) -> bool:
         """Whether an effect's slope with the filter's gains held says little of what it is worth.
 

@@ -153,7 +153,7 @@ def _seen_late(problem: Problem) -> list[str]:
         return []
     return [
         f"{why}, and what looks like a weak or late answer must be worth"
-        f" {problem.settings.unseen_inflation:g} times as much"
+        f" {problem.unseen_times:g} times as much"
     ]
 
 

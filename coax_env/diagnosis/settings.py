@@ -24,6 +24,10 @@ class Settings:
     nats at most; true ones that should show 51 to 196. In gusts with a frequency, taken for gusts that
     fade: a play or a lag of the servos on 5 of 8 clean flights, 23 to 41 nats. And times that the
     variance of the vehicle's own such numbers is larger (evidence.beside_unseen_answers)."""
+    seldom_poses_inflation: float = 5.0
+    """The same by poses alone that come seldom, where neither is seen in time. Measured by a camera
+    (`study_diagnosis.py --arms camera`, seeds 790 and 791): on four clean flights the strongest was
+    worth 47 to 58 nats before, a play or a motor lag; three plays of 45 to 62 had had a name."""
     change_evidence: float = 28.0
     """nats that a cause must be worth to have a name where that it began, ended or changed in flight is
     worth less than `sure_evidence`: any effect could have, at any moment. Measured: three of some 600

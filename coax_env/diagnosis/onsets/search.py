@@ -133,9 +133,8 @@ def _evidence(problem: Problem, effect: str) -> float:
     flight in gusts with a frequency. By poses alone a constant delay, too: from some moment on it has
     but a part of the flight to stand on.
     """
-    chosen = problem.settings
     unseen = effect in WEAK_OR_LATE and (problem.sees_poses_alone or problem.answers_unseen)
-    return chosen.evidence * (chosen.unseen_inflation if unseen else 1.0)
+    return problem.settings.evidence * (problem.unseen_times if unseen else 1.0)
 
 
 def _beyond_drifts(state: Changing, steady: Changing, near: Sequence[Scored]) -> list[Scored]:
