@@ -1052,11 +1052,11 @@ def test_what_a_constant_cause_does_as_well_is_not_worth_a_fit():
 
 @pytest.mark.parametrize("poses", [True, False])
 def test_a_late_answer_must_be_worth_more_from_some_moment_on_where_answers_are_unseen(poses):
-    """Three times as much by poses alone, or where commands answer what the filter does not see; a
-    constant delay too; what is no answer to a command as much as else."""
+    """As many times by poses alone, or where commands answer what the filter does not see; a constant
+    delay too; what is no answer to a command as much as else."""
     found = scores(wind=(7.1, 7.1), command_delay=(20.0, 20.0), motor_lag=(22.0, 22.0))
     problem: Any = SimpleNamespace(
-        settings=SETTINGS, sees_poses_alone=poses, answers_unseen=not poses
+        settings=SETTINGS, sees_poses_alone=poses, answers_unseen=not poses, unseen_times=3.0
     )
     assert [s.effect for s in search._standing(problem, found)] == ["wind", "motor_lag"]
     state: Any = SimpleNamespace(problem=problem, fit=SimpleNamespace(active=("servo_lag",)))
