@@ -167,7 +167,7 @@ def test_nothing_is_named_where_poses_were_smoothed(tmp_path):
     found = diagnose(tmp_path)
     assert found.findings["causes"] == []
     (said,) = [line for line in found.remarks if "readings 50 ms apart" in line]
-    assert "3 times as much" in said
+    assert "5 times as much" in said
 
 
 @pytest.mark.parametrize(
