@@ -367,7 +367,7 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     ("lost", "inflation", "without", "against"),
     [
         (100.0, 1.0, 15.0, True), (100.0, 1.0, 13.0, False),  # the evidence of a name
-        (9000.0, 1.0, 91.0, True), (9000.0, 1.0, 89.0, False),  # and a hundredth of the cause's
+        (9e4, 1.0, 91.0, True), (9e4, 1.0, 89.0, False),  # and a thousandth of the cause's
         (200.0, 2.0, 29.0, True), (200.0, 2.0, 27.0, False),  # both where innovations are coloured
     ],
 )  # fmt: skip

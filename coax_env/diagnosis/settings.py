@@ -50,10 +50,11 @@ class Settings:
     Everything is at one frequency there, so that what forms are wrong by does not cancel. Measured on
     flights by blade elements whose heading swings at 6.5 Hz: false names had 0.2 and 1.4 % of what all
     causes explained, true ones 4 % and more."""
-    against_share: float = 0.01
+    against_share: float = 0.001
     """Of what a cause is worth in all, that the readings of a channel that should show it must be
     likelier without it, and `evidence`, to speak against its name. Measured: at most 6 nats of true
-    causes, 2.1 to 2.6 % of what a motor lag was worth that was the rotor speeds' own filter."""
+    causes, 0.4 to 2.6 % of what a motor lag was worth that was the rotor speeds' own filter; ours: ten
+    times `form_error`."""
     most_causes: int = 10
     """Ours; a bound on time."""
 
