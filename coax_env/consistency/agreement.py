@@ -24,7 +24,7 @@ from coax_env.consistency.machine import machine_of
 from coax_env.errors import InputError
 from coax_env.logs.flight import Flight
 from coax_env.logs.units import SWASH_COMMANDS, without
-from coax_env.model.layout import CHANNELS
+from coax_env.model.layout import CHANNELS, ROTOR_SPEEDS
 from coax_env.model.vehicle import Vehicle
 
 MOST_SAID = 3
@@ -103,7 +103,7 @@ def check_names(names: Collection[str]) -> None:
 
 def _seen(checker: Checker, found: checks.Found) -> set[str]:
     """Channels that take part in a coefficient whose sign is clear."""
-    seen = {"rpm_upper", "rpm_lower", "v"}
+    seen = {*ROTOR_SPEEDS, "v"}
     for c in found.coefficients:
         if c.strength > checks.LEAST_STRENGTH:
             seen |= {c.left, c.part}

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from coax_env.consistency.even_rows import STEP, EvenRows, weak
-from coax_env.model.layout import RPM_PER_RAD_S
+from coax_env.model.layout import ROTOR_SPEEDS, RPM_PER_RAD_S
 
 LONGEST_ANGLE = 0.6
 """Angle [rad] at which those inside a sine are cut: degrees must not make nonsense of the other
@@ -281,8 +281,8 @@ def relations(channels: frozenset[str], edges: tuple[int, ...] = (0,)) -> list[R
                 exact=False,
             )
         )
-    if {"rpm_upper", "rpm_lower"} <= channels:
-        speeds = ("rpm_upper", "rpm_lower")
+    if channels.issuperset(ROTOR_SPEEDS):
+        speeds = ROTOR_SPEEDS
     yaw, order = ("r", 1) if "r" in channels else ("psi", 2)
     found.append(Relation(yaw, order, speeds, ("r",), _yaw(speeds), SLOW, exact=False))
     return [one for one in found if {one.left, *one.uses} <= channels]

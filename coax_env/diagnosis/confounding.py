@@ -19,14 +19,7 @@ from coax_env.diagnosis.evidence import (
 )
 from coax_env.diagnosis.fits import converged, fitted
 from coax_env.diagnosis.from_afar import FAR, in_place_of
-from coax_env.diagnosis.problem import (
-    LATE_SERVO,
-    SERVO_FORMS,
-    SERVO_RATE,
-    Fit,
-    Problem,
-    exclusive_with,
-)
+from coax_env.diagnosis.problem import LATE_SERVO, Fit, Problem, exclusive_with
 from coax_env.diagnosis.scores import cost, is_large, score, swap
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
@@ -298,24 +291,19 @@ def _of_one(
             found[other] = trial
     # a lag is far from a delay of nothing: the quadratic does not reach there, and both may be there
     absent = set(problem.candidates) - set(found) - set(fit.active)
+    # a real servo is late, and limited when it has far to go
+    alike = max(tie, chosen.form_share * lost if effect in LATE_SERVO else 0.0)
     for other in sorted(FAR.get(effect, frozenset()) & absent):
         if problem.changes(effect) or problem.changes(other):
             continue  # it has two sizes, and no likeliest one
         trial = in_place_of(problem, fit, quadratic, effect, other)
-        if trial.objective - fit.objective < tie:
+        if trial.objective - fit.objective < alike:
             found[other] = trial
-    for form in sorted(set(SERVO_FORMS) & absent) if effect == SERVO_RATE else ():
-        if problem.changes(effect) or problem.changes(form):
-            continue
-        trial = in_place_of(problem, fit, quadratic, effect, form)
-        if trial.objective - fit.objective < max(tie, chosen.form_share * lost):
-            found[form] = trial  # a real servo is late, and limited when it has far to go
     for twin in sorted(exclusive_with(effect) & absent):
         _, move = swap(problem, quadratic, fit.active, effect, twin)
         trial = refit(twin, move, steps=TWIN_STEPS)
         mixed = score(problem, quadratic, fit.active, twin).evidence > chosen.evidence
-        alike = effect in SERVO_FORMS or problem.sees_poses_alone
-        most = max(tie, chosen.form_share * lost if alike else 0.0)
+        most = max(alike, chosen.form_share * lost if problem.sees_poses_alone else 0.0)
         if most < trial.objective - fit.objective < UNCONVERGED * most:
             trial = converged(problem, trial)
         if mixed or trial.objective - fit.objective < most:

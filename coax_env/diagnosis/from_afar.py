@@ -27,7 +27,14 @@ from coax_env.diagnosis.fits import (
     quadratic_at,
     without,
 )
-from coax_env.diagnosis.problem import LATE_SERVO, SERVO_RATE, Fit, Problem, exclusive_with
+from coax_env.diagnosis.problem import (
+    LATE_SERVO,
+    SERVO_FORMS,
+    SERVO_RATE,
+    Fit,
+    Problem,
+    exclusive_with,
+)
 from coax_env.diagnosis.scores import Score, cost, is_large, loss
 from coax_env.estimation.quadratic import Quadratic
 
@@ -46,10 +53,14 @@ SHARE = 0.5
 FAR_OFF = 450.0
 """nats that an effect is worth by the quadratic, from which on that is not believed about what else may
 stand in its place: thirty std from nothing, where a tenth of curvature is 45 nats; ours."""
-FAR: Mapping[str, frozenset[str]] = {"thrust_exponent": frozenset({"dynamic_inflow"})}
-"""Alternatives that no slope shows from where they are not: thrust that answers quick changes of speed
-by more than slow ones. An inflow follows late by any time, and how far thrust overshoots hardly depends
-on it: of six **synthetic** inflows of 0.1 to 0.24 s four were an exponent of 4 to 5 usual sizes."""
+FAR: Mapping[str, frozenset[str]] = {
+    "thrust_exponent": frozenset({"dynamic_inflow"}),
+    SERVO_RATE: frozenset(SERVO_FORMS),
+}
+"""Alternatives that no slope shows from where they are not, nor a quadratic reaches: of a limited rate
+what else makes a servo late; of thrust that answers quick changes of speed by more than slow ones an
+inflow, which follows late by any time, and how far thrust overshoots hardly depends on it: of six
+**synthetic** inflows of 0.1 to 0.24 s four were an exponent of 4 to 5 usual sizes."""
 
 RunnersUp = Mapping[str, Mapping[str, float]]
 """Effect -> its numbers where the fit stood when another was added."""

@@ -212,7 +212,7 @@ def _unlike_gusts(problem: Problem) -> list[str]:
     return [
         "no accelerometer's innovations are white: gusts are not as the filter has them, who flies may"
         " foresee them better, and what looks like a weak or late answer must be worth"
-        f" {problem.settings.unseen_inflation:g} times as much"
+        f" {problem.unseen_times:g} times as much"
     ]
 
 
@@ -221,7 +221,7 @@ def _smoothed(problem: Problem) -> list[str]:
         return []
     return [
         "what is left of a low-pass looks like a late answer: such a cause must be worth"
-        f" {problem.settings.unseen_inflation:g} times as much"
+        f" {problem.unseen_times:g} times as much"
     ]
 
 

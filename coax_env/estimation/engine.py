@@ -183,11 +183,10 @@ class Engine(RunPasses):
             with self.borrowed_buffers() as buffers:
                 run, _ = self.filter_run(i, *self.of_run(i, values, noise, p), buffers)
                 nats = -0.5 * run.innovations**2
-                seen = np.isfinite(nats)
                 if not np.isfinite(run.log_likelihood):
                     return np.zeros(nats.shape[1])
-                nats[seen] += np.log(run.per_sigma)
-                return np.where(seen, nats, 0.0).sum(axis=0)
+                nats[np.isfinite(nats)] += np.log(run.per_sigma)
+                return np.asarray(np.nansum(nats, axis=0))
 
         return np.asarray(np.sum(self.each(one), axis=0))
 

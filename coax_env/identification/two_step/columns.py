@@ -19,7 +19,7 @@ from coax_env.identification.two_step.processing import even_grid, lagrange_deri
 from coax_env.identification.two_step.reconstruction import flapping
 from coax_env.logs.flight import Run
 from coax_env.model import inputs as U
-from coax_env.model.layout import INERTIAL
+from coax_env.model.layout import INERTIAL, ROTOR_SPEEDS
 from coax_env.model.vehicle import Vehicle
 
 EDGE = 0.5
@@ -54,7 +54,7 @@ def rows_of(
         noise: std of each channel. cutoff: of the low-pass [Hz]. seed: of the draws of the noise.
     """
     rng = np.random.default_rng(seed)
-    dt, t, signals = even_grid(run, (*INERTIAL, "rpm_upper", "rpm_lower"))
+    dt, t, signals = even_grid(run, (*INERTIAL, *ROTOR_SPEEDS))
     held = np.searchsorted(run.t, t + 1e-9, side="right") - 1
     command = run.command[held]
     edge = round(EDGE / dt)

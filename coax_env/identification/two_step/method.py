@@ -42,7 +42,7 @@ from coax_env.identification.two_step.processing import (
 from coax_env.identification.two_step.reconstruction import Longitudinal, longitudinal
 from coax_env.identification.two_step.regression import Regression
 from coax_env.logs.flight import Flight, Run
-from coax_env.model.layout import INERTIAL
+from coax_env.model.layout import INERTIAL, ROTOR_SPEEDS
 from coax_env.model.sensors import suite
 from coax_env.model.vehicle import Parameter, Vehicle
 from coax_env.progress import Progress
@@ -121,7 +121,7 @@ def two_step(
         )
     noise = {
         c: flight.noise.get(c) or _noise_of(flight, c)
-        for c in (*INERTIAL, "h", "rpm_upper", "rpm_lower")
+        for c in (*INERTIAL, "h", *ROTOR_SPEEDS)
         if c in flight.channels
     }
     remarks = []
