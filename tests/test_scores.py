@@ -312,6 +312,7 @@ def refits(monkeypatch):
 SERVO = replace(
     PROBLEM, own={e: tuple(MODEL.effect_parameters(e)) for e in ("servo_lag", "servo_delay")}
 )
+vars(SERVO)["sees_poses_alone"] = False  # there is no engine to ask for the channels of a flight
 
 
 @pytest.mark.parametrize(

@@ -299,7 +299,7 @@ def _of_one(
         trial = in_place_of(problem, fit, quadratic, effect, other)
         if trial.objective - fit.objective < alike:
             found[other] = trial
-    for twin in sorted(exclusive_with(effect) & absent):
+    for twin in sorted(exclusive_with(effect) & absent - set(found)):
         _, move = swap(problem, quadratic, fit.active, effect, twin)
         trial = refit(twin, move, steps=TWIN_STEPS)
         mixed = score(problem, quadratic, fit.active, twin).evidence > chosen.evidence
