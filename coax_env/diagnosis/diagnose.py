@@ -27,6 +27,7 @@ from coax_env.design.loop_oscillation import remark as oscillation_remark
 from coax_env.diagnosis import (
     confounding,
     findings,
+    late_rotor_speeds,
     onboard_filter,
     sensor_low_pass,
     slow_commands,
@@ -182,6 +183,9 @@ def diagnose(
     problem = replace(problem, of_onboard_filter=circular)
     clock = clock_of(flight.runs)
     first = slow_commands.likelier_on_lines(searched(problem, noise, clock))
+    if first.problem.aboard.isdisjoint(ROTOR_SPEEDS) and not problem.aboard.isdisjoint(ROTOR_SPEEDS):
+        of_sensors.append(late_rotor_speeds.REMARK)
+        held = late_rotor_speeds.without_rotor_speeds(held, CHANNELS)
     if first.low_passes:
         unasked = set(candidates) - set(first.problem.candidates)
         of_sensors.append(sensor_low_pass.remark(first.low_passes, unasked))

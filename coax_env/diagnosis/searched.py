@@ -12,6 +12,8 @@ Where measured rotor speeds stay coloured, it is done again with rotors that jit
 (estimation/rotor_jitter.py), if these are worth more than a tie: after a search, since a motor's lag
 colours them too and must be found as what it is, and first, since nothing else touches these readings.
 
+Where these come late themselves (late_rotor_speeds.py) it is done without them.
+
 Where motion stays coloured then, it is asked whether the times of the log's rows are wrong
 (clock_errors.py), and the search done again with readings that are as good as these.
 
@@ -57,6 +59,7 @@ from coax_env.diagnosis.fits import (
     steadied,
 )
 from coax_env.diagnosis.joint_gusts import in_joint_gusts
+from coax_env.diagnosis.late_rotor_speeds import LAG, come_late, without_rotor_speeds
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
 from coax_env.diagnosis.problem import OF_ROTORS, Fit, Problem
@@ -140,9 +143,15 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         problem: what may be free. noise: levels to start from.
         clock: of all runs in the order in which they were flown.
     """
+    given = noise
     first, noise = _rotors_first(problem, noise) or (_searched(problem, noise), noise)
-    if _is_coloured(first, ROTOR_SPEEDS):
+    late = _without_late_speeds(problem, first.problem, first.fit, given)
+    if late is None and _is_coloured(first, ROTOR_SPEEDS):
         first, noise = _jittery(first, noise)
+        if _is_coloured(first, ROTOR_SPEEDS):
+            late = _without_late_speeds(problem, first.problem, first.fit, given, coloured=True)
+    if late is not None:
+        first, noise = late, given
     first = _with_clock_errors(_with_own_air(first, noise), noise)
     problem = first.problem
     smoothed = _before_low_passes(first, noise)
@@ -162,6 +171,26 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     if found.low_passes and begun is noise and _is_coloured(found, INERTIAL):
         return _without_low_passes(first, found, noise, clock)
     return found
+
+
+def _without_late_speeds(
+    problem: Problem, beside: Problem, fit: Fit, noise: Noise, coloured: bool = False
+) -> Searched | None:
+    """The search without measured rotor speeds, where these come late, beside what it finds too.
+
+    Args:
+        problem: as given. beside: the same, or with rotors that jitter. fit: of `beside`, with what
+            moves the rotors. noise: levels to start from.
+        coloured: whether rotor speeds stay so with rotors that jitter.
+    """
+    if not come_late(beside, fit, coloured):
+        return None
+    problem.report("searching without the measured rotor speeds, which come late")
+    records = without_rotor_speeds(problem.engine.records, problem.model.channels)
+    found = _searched(problem.with_records(records), noise)
+    own = {f.name: fit.values[f.name] for f in problem.own[LAG]}
+    begun = replace(fit.at(found.fit.values | own), active=(*found.fit.rest(LAG), LAG))
+    return found if come_late(beside, fitted(beside, begun), coloured) else None
 
 
 def _with_clock_errors(first: Searched, noise: Noise) -> Searched:
@@ -439,6 +468,9 @@ def _rotors_first(problem: Problem, noise: Noise) -> tuple[Searched, Noise] | No
         rotors = _in_noise_anew(problem, rotors, noise)
         found = replace(found, fit=rotors)
     coloured = _is_coloured(found, ROTOR_SPEEDS)
+    late = _without_late_speeds(problem, problem, rotors, noise) if coloured else None
+    if late is not None:
+        return late, noise
     jittery = in_jitter(problem, rotors, quadratic) if coloured else None
     if jittery is None or rotors.objective - jittery[1].objective < problem.settings.clear:
         return _searched_from(problem, bare, refitted, rotors), noise
