@@ -164,7 +164,7 @@ def test_a_low_pass_is_worth_what_it_is_at_the_likeliest_levels(monkeypatch, fro
         engine=SimpleNamespace(records=["logged"], threads=1),
         model=SimpleNamespace(channels=("p",)),
     )  # fmt: skip
-    low_pass, noise = sensor_low_pass._likeliest(problem, Fit((), {}, searched), first, ["p"], {})
+    low_pass, noise = sensor_low_pass.likeliest(problem, Fit((), {}, searched), first, ["p"], {})
     assert (low_pass != NONE) == found
     assert noise.level("force_xy") == (1.0 if found else 2.0)
 
@@ -202,7 +202,7 @@ def test_of_a_low_pass_that_was_found_the_time_alone_is_looked_for_anew(monkeypa
     )  # fmt: skip
     levels = Noise({"force_xy": 1.0}, {"p": 0.1})
     fit = Fit((), {}, levels)
-    found, _ = sensor_low_pass._likeliest(problem, fit, levels, ["p"], {"p": had})
+    found, _ = sensor_low_pass.likeliest(problem, fit, levels, ["p"], {"p": had})
     assert found.order == order and found.time == pytest.approx(0.013, rel=0.02)
     assert begun[:fits] == [1.0, 2.0, 3.0, 4.0, 1.0, 2.0, 3.0, 4.0][:fits]
     assert len(begun) == fits + 2  # at the likeliest time, and without

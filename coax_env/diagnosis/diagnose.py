@@ -186,11 +186,12 @@ def diagnose(
     if first.problem.aboard.isdisjoint(ROTOR_SPEEDS) and not problem.aboard.isdisjoint(ROTOR_SPEEDS):
         of_sensors.append(late_rotor_speeds.REMARK)
         held = late_rotor_speeds.without_rotor_speeds(held, CHANNELS)
-    if first.low_passes:
+    passes = first.problem.low_passes
+    if passes:
         unasked = set(candidates) - set(first.problem.candidates)
-        of_sensors.append(sensor_low_pass.remark(first.low_passes, unasked))
+        of_sensors.append(sensor_low_pass.remark(passes, unasked))
     problem, bare, refitted = first.problem, first.bare, first.refitted
-    held = records_before(held, CHANNELS, first.low_passes)
+    held = records_before(held, CHANNELS, passes)
     held = with_clock_error(held, problem.clock_error)
     held = slow_commands.on_straight_lines(held) if first.on_lines else held
     passes_before = problem.engine.filter(bare.values, bare.noise)

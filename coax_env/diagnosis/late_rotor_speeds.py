@@ -2,11 +2,12 @@
 
 Motor controllers report speeds averaged over a turn or more, and late. In the speeds that is a motor's
 lag; thrust and torque, which follow at once, deny it. So where a lag is found the model is fitted to
-all other readings alone. Speeds come late where these are likelier with less of it: by the threshold
-and nothing is left of the lag; or by a tie, where speeds stay coloured beside it, with rotors that
-jitter too, as no lag of the motors leaves them. Where speeds are white and a lag is left, it is theirs,
-and what the other readings have less of it is another thing (thrust that is ahead of its inflow, say).
-Late speeds are not used: the search is done again without them.
+all other readings alone. Speeds come late where these are likelier with less of it, by the threshold,
+and nothing is left of it, or where speeds stay coloured beside it, with rotors that jitter too, as no
+lag of the motors leaves them. Where speeds are white and a lag is left, it is theirs, and what the
+other readings have less of it is another thing (thrust that is ahead of its inflow, say).
+Speeds that a low-pass made late are taken back through it (sensor_low_pass.py) where that leaves them
+white; others are not used. The search is done again so.
 
 Of six **synthetic** flights whose speeds came through low-passes of 8 Hz, averages over 50 ms or 20 ms
 late, four had a motor lag for 3,900 to 34,000 nats, doubtful or denied by the vertical acceleration,
@@ -20,8 +21,10 @@ import numpy as np
 
 from coax_env.diagnosis.fits import fitted
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation.state_space import Record
-from coax_env.estimation.whiteness import whiteness
+from coax_env.diagnosis.sensor_low_pass import likeliest
+from coax_env.estimation.low_pass import NONE
+from coax_env.estimation.state_space import Noise, Record
+from coax_env.estimation.whiteness import are_white, whiteness
 from coax_env.model.layout import ROTOR_SPEEDS
 
 LAG = "motor_lag"
@@ -53,14 +56,29 @@ def come_late(problem: Problem, fit: Fit, coloured: bool = False) -> bool:
         return False
     shown = whiteness(others.engine.filter(trial.values, trial.noise), channels)
     inflation = max((judged.inflation for judged in shown.values()), default=1.0)
-    if coloured and gained > problem.settings.tie * inflation:
-        return True
     enough = problem.settings.evidence * inflation
-    if gained < enough:
-        return False
+    if gained < enough or coloured:
+        return gained > enough
     off = problem.off_values(LAG) | problem.file_values(LAG)
     at_once = replace(trial.at(off), active=trial.rest(LAG))
     return fitted(others, at_once).objective - trial.objective < enough
+
+
+def behind_low_pass(problem: Problem, fit: Fit, levels: Noise) -> Problem | None:
+    """The problem with rotor speeds as they were before their low-pass; None where that is not what
+    makes them late.
+
+    Args:
+        problem: with readings as logged. fit: to all others. levels: of rotor speeds, to start from.
+    """
+    read = [channel for channel in ROTOR_SPEEDS if channel in problem.aboard]
+    noise = fit.noise.with_levels({channel: levels.reading[channel] for channel in read})
+    low_pass, noise = likeliest(problem, replace(fit, noise=noise), noise, read, {})
+    if low_pass == NONE:
+        return None
+    behind = problem.behind(dict.fromkeys(read, low_pass), problem.engine.records)
+    shown = whiteness(behind.engine.filter(fit.values, noise), problem.model.channels)
+    return behind if are_white(shown, read) else None
 
 
 def without_rotor_speeds(records: Sequence[Record], channels: Sequence[str]) -> list[Record]:

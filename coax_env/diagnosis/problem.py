@@ -20,6 +20,7 @@ from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import GUST_LEVELS
 from coax_env.estimation.joint_gusts import SHARES
+from coax_env.estimation.low_pass import LowPass, records_before
 from coax_env.estimation.parted_engine import AT
 from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.model import effects
@@ -107,7 +108,7 @@ class Problem:
         settings: what decides.
         progress: called with a line of text.
         unlike_gusts: whether gusts turned out not to be as the filter has them (evidence.py).
-        smoothed: whether readings were taken back through a low-pass (sensor_low_pass.py).
+        low_passes: what some channels' readings were taken back through (sensor_low_pass.py).
         of_onboard_filter: whether attitudes are an onboard filter's (onboard_filter.py).
         errors_left: what errors of readings that last are worth beside what was found, where they
             explain too little to be in the model [nats] (sensor_errors.py).
@@ -122,7 +123,7 @@ class Problem:
     settings: Settings = SETTINGS
     progress: Progress | None = None
     unlike_gusts: bool = False
-    smoothed: bool = False
+    low_passes: Mapping[str, LowPass] = field(default_factory=dict)
     of_onboard_filter: bool = False
     errors_left: float = 0.0
     clock_error: float = 0.0
@@ -184,14 +185,18 @@ class Problem:
             self, model=model, engine=Engine(model, self.engine.records, self.engine.threads)
         )
 
-    def with_records(self, records: Sequence[Record], smoothed: bool = False) -> "Problem":
-        """On other records.
+    def with_records(self, records: Sequence[Record]) -> "Problem":
+        """On other records of the same runs."""
+        return replace(self, engine=Engine(self.model, records, self.engine.threads))
+
+    def behind(self, passes: Mapping[str, LowPass], records: Sequence[Record]) -> "Problem":
+        """With readings of some channels as they were before low-passes.
 
         Args:
-            records: of the same runs. smoothed: whether they were taken back through a low-pass.
+            passes: by channel. records: with readings of these as logged.
         """
-        engine = Engine(self.model, records, self.engine.threads)
-        return replace(self, engine=engine, smoothed=smoothed or self.smoothed)
+        before = records_before(records, self.model.channels, passes)
+        return replace(self.with_records(before), low_passes={**self.low_passes, **passes})
 
     def with_clock_error(self, std: float) -> "Problem":
         """With readings of motion as good as the rows' times are, whose std is this [s]."""
@@ -250,6 +255,11 @@ class Problem:
     def reads_seldom(self) -> bool:
         """Whether commands may answer what no reading but a rotor's speed has shown by then."""
         return self.between_readings > self.settings.slow_rows
+
+    @property
+    def smoothed(self) -> bool:
+        """Whether readings of gyros or accelerometers were taken back through a low-pass."""
+        return not self.low_passes.keys().isdisjoint(INERTIAL)
 
     @property
     def answers_unseen(self) -> bool:

@@ -43,7 +43,7 @@ likelier: what was found beside a delay that is off by a part of a row may stand
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -59,7 +59,12 @@ from coax_env.diagnosis.fits import (
     steadied,
 )
 from coax_env.diagnosis.joint_gusts import in_joint_gusts
-from coax_env.diagnosis.late_rotor_speeds import LAG, come_late, without_rotor_speeds
+from coax_env.diagnosis.late_rotor_speeds import (
+    LAG,
+    behind_low_pass,
+    come_late,
+    without_rotor_speeds,
+)
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
 from coax_env.diagnosis.problem import OF_ROTORS, Fit, Problem
@@ -79,7 +84,7 @@ from coax_env.estimation.helicopter_noise import (
     JITTER_RETURN,
     LEAST_READING_STD,
 )
-from coax_env.estimation.low_pass import LowPass, before_low_pass, records_before
+from coax_env.estimation.low_pass import LowPass, before_low_pass
 from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.rotor_jitter import with_jitter
@@ -114,7 +119,6 @@ class Searched:
     problem: what was searched.
     coarse: whether readings were taken to be no finer than LEAST_READING_STD.
     changing: with what began or changed in flight, where that has been asked already.
-    low_passes: what some channels' readings were taken back through.
     on_lines: whether commands are on straight lines between slow rows.
     air_asked: whether it has been asked if runs have air of their own.
     """
@@ -126,7 +130,6 @@ class Searched:
     quadratic: Quadratic
     coarse: bool = False
     changing: Changing | None = None
-    low_passes: Mapping[str, LowPass] = field(default_factory=dict)
     on_lines: bool = False
     air_asked: bool = False
 
@@ -165,10 +168,8 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         best = _behind_other_low_passes(problem, best, begun)
     if best.changing is not None:
         return best
-    found = replace(
-        _in_unrest(best, begun, clock, erring=begun is not noise), low_passes=best.low_passes
-    )
-    if found.low_passes and begun is noise and _is_coloured(found, INERTIAL):
+    found = _in_unrest(best, begun, clock, erring=begun is not noise)
+    if found.problem.smoothed and begun is noise and _is_coloured(found, INERTIAL):
         return _without_low_passes(first, found, noise, clock)
     return found
 
@@ -176,7 +177,8 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
 def _without_late_speeds(
     problem: Problem, beside: Problem, fit: Fit, noise: Noise, coloured: bool = False
 ) -> Searched | None:
-    """The search without measured rotor speeds, where these come late, beside what it finds too.
+    """The search without measured rotor speeds, where these come late, beside what it finds too; with
+    those before a low-pass where that is what makes them late.
 
     Args:
         problem: as given. beside: the same, or with rotors that jitter. fit: of `beside`, with what
@@ -190,7 +192,13 @@ def _without_late_speeds(
     found = _searched(problem.with_records(records), noise)
     own = {f.name: fit.values[f.name] for f in problem.own[LAG]}
     begun = replace(fit.at(found.fit.values | own), active=(*found.fit.rest(LAG), LAG))
-    return found if come_late(beside, fitted(beside, begun), coloured) else None
+    if not come_late(beside, fitted(beside, begun), coloured):
+        return None
+    behind = behind_low_pass(problem, found.fit, fit.noise)
+    if behind is None:
+        return found
+    problem.report("searching with rotor speeds as they were before a low-pass")
+    return _searched(behind, noise)
 
 
 def _with_clock_errors(first: Searched, noise: Noise) -> Searched:
@@ -250,10 +258,10 @@ def _searched_before(
         passes: by channel. noise: levels to start from.
     """
     problem = found.problem
-    before = records_before(logged, problem.model.channels, passes)
     asked = set(problem.candidates) - hidden_behind(passes, found.fit, problem)
-    again = _searched(problem.with_records(before, True).of_candidates(asked), noise)
-    return replace(again, low_passes=passes)
+    others = {c: own for c, own in problem.low_passes.items() if c not in INERTIAL}
+    behind = replace(problem, low_passes=others).behind(passes, logged)
+    return _searched(behind.of_candidates(asked), noise)
 
 
 def _with_errors(found: Searched, noise: Noise, clock: Mapping[str, Lap]) -> tuple[Searched, Noise]:
@@ -273,8 +281,7 @@ def _with_errors(found: Searched, noise: Noise, clock: Mapping[str, Lap]) -> tup
     if changed is not None:
         return changed, noise
     erring.problem.report("searching again with errors of readings that last")
-    best = _likelier(_searched(erring.problem, erring.begun), erring.fit)
-    return replace(best, low_passes=found.low_passes), erring.begun
+    return _likelier(_searched(erring.problem, erring.begun), erring.fit), erring.begun
 
 
 def _behind_other_low_passes(problem: Problem, found: Searched, noise: Noise) -> Searched:
@@ -289,17 +296,22 @@ def _behind_other_low_passes(problem: Problem, found: Searched, noise: Noise) ->
     behind = [
         group
         for group in GROUPS
-        if found.low_passes.keys() & set(group) or LIKE[group] in found.fit.active
+        if found.problem.low_passes.keys() & set(group) or LIKE[group] in found.fit.active
     ]
     if not behind:
         return found
     logged = problem.engine.records
     passes = low_passes(found.problem.with_records(logged), found.fit, noise, behind)
-    if _are_nearly(passes, found.low_passes):
+    if _are_nearly(passes, _inertial(found.problem.low_passes)):
         return found
     problem.report("searching again with readings as they were before these low-passes")
     again = _searched_before(found, logged, passes, noise)
     return again if _lost(problem, again) < _lost(problem, found) else found
+
+
+def _inertial(passes: Mapping[str, LowPass]) -> dict[str, LowPass]:
+    """Low-passes of gyros and accelerometers alone."""
+    return {channel: own for channel, own in passes.items() if channel in INERTIAL}
 
 
 def _are_nearly(passes: Mapping[str, LowPass], others: Mapping[str, LowPass]) -> bool:
@@ -317,7 +329,8 @@ def _lost(problem: Problem, found: Searched) -> float:
         problem: as given, with these.
     """
     channels = problem.model.channels
-    back = (before_low_pass(r, channels, found.low_passes)[1] for r in problem.engine.records)
+    passes = _inertial(found.problem.low_passes)
+    back = (before_low_pass(r, channels, passes)[1] for r in problem.engine.records)
     return found.cost - sum(back)
 
 
@@ -668,7 +681,7 @@ def _with_joint_gusts(found: Searched, noise: Noise) -> Searched:
         return found
     if _at_limits(other) - _at_limits(found):
         return found
-    return replace(other, low_passes=found.low_passes)
+    return other
 
 
 def _at_limits(found: Searched) -> set[str]:

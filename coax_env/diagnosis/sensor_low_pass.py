@@ -29,7 +29,7 @@ from coax_env.estimation.low_pass import (
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Noise
-from coax_env.model.layout import ACCELEROMETERS, GYROS
+from coax_env.model.layout import ACCELEROMETERS, GYROS, ROTOR_SPEEDS
 from coax_env.plain_words import and_list, channel_name, plain
 
 GROUPS = (GYROS, ACCELEROMETERS)
@@ -71,7 +71,7 @@ def low_passes(
     found: dict[str, LowPass] = {}
     for turn in range(TURNS if len(groups) > 1 else 1):
         for group in groups:
-            low_pass, noise = _likeliest(problem, fit, noise, group, found)
+            low_pass, noise = likeliest(problem, fit, noise, group, found)
             found |= dict.fromkeys(group, low_pass)
         if all(low_pass == NONE for low_pass in found.values()):
             return {}
@@ -119,7 +119,7 @@ def remark(passes: Mapping[str, LowPass], hidden: Collection[str]) -> str:
     said = [
         f"{and_list([channel_name(c) for c in group])} of about {passes[group[0]].cut_off:.0f} Hz"
         f" ({('first', 'second')[passes[group[0]].order - 1]} order)"
-        for group in GROUPS
+        for group in (*GROUPS, ROTOR_SPEEDS)
         if group[0] in passes
     ]
     text = (
@@ -155,7 +155,7 @@ def _pools(groups: Sequence[Sequence[str]]) -> list[Sequence[str]]:
     return [*groups, *([channel] for group in groups for channel in group)]
 
 
-def _likeliest(
+def likeliest(
     problem: Problem, fit: Fit, noise: Noise, group: Sequence[str], others: Mapping[str, LowPass]
 ) -> tuple[LowPass, Noise]:
     """A group's low-pass, NONE where it is not worth the threshold; the noise with it.

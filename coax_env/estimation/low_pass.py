@@ -18,8 +18,6 @@ import numpy as np
 
 from coax_env.estimation.state_space import Record
 
-"""Channels that share one low-pass."""
-
 
 class LowPass(NamedTuple):
     """One low-pass. time: 1 / (2 pi cut-off) [s]; 0: none. order: 1 or 2."""
