@@ -25,6 +25,7 @@ from coax_env.diagnosis import evidence
 from coax_env.diagnosis.evidence import Evidence, prune, weighed
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.low_pass import LowPass
 from coax_env.estimation.state_space import Noise
 from coax_env.model.layout import CHANNELS
 
@@ -100,7 +101,9 @@ class Flights:
 
 @pytest.mark.parametrize(
     ("row", "seen"),
-    [(0.01, {}), (0.04, {}), (0.01, {"unlike_gusts": True}), (0.01, {"smoothed": True})],
+    [(0.01, {}), (0.04, {}), (0.01, {"unlike_gusts": True}),
+     (0.01, {"low_passes": {"p": LowPass(0.01)}}),
+     ],
 )
 def test_a_weak_or_late_answer_to_what_the_filter_does_not_see_must_be_worth_more(
     monkeypatch, row, seen

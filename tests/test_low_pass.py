@@ -18,6 +18,7 @@ from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.low_pass import NONE, LowPass, before_low_pass
 from coax_env.estimation.state_space import Noise, Record
+from coax_env.model.layout import ROTOR_SPEEDS
 
 STEP = 0.01
 
@@ -129,7 +130,7 @@ def test_a_low_pass_is_asked_for_where_it_shows_or_what_looks_like_it_is_named(
         return of_one if group == ["q"] else -9.0 if len(group) == 1 else alike
 
     monkeypatch.setattr(sensor_low_pass, "_alike", correlation)
-    monkeypatch.setattr(sensor_low_pass, "_likeliest", likeliest)
+    monkeypatch.setattr(sensor_low_pass, "likeliest", likeliest)
     monkeypatch.setattr(sensor_low_pass, "_refitted", lambda problem, fit, found: fit)
     problem: Any = SimpleNamespace(
         has_slow_rows=False,
@@ -209,13 +210,30 @@ def test_of_a_low_pass_that_was_found_the_time_alone_is_looked_for_anew(monkeypa
 
 
 @pytest.mark.slow
-def test_rotor_speeds_behind_a_filter_are_no_late_motors(tmp_path):
+@pytest.mark.parametrize(
+    ("late", "effects", "names", "said"),
+    [
+        ("low-pass", {}, [], "low-pass: upper rotor speed and lower rotor speed of about 7 Hz"),
+        ("low-pass", {"motor_droop": {}}, ["motor_droop"], "upper rotor speed"),
+        ("rows", {}, [], "measured rotor speeds come later than the rotors turn"),
+    ],
+)
+def test_rotor_speeds_that_come_late_are_no_late_motors(tmp_path, late, effects, names, said):
     """Thrust and torque follow at once; the speeds alone, which are read well, come 20 ms late."""
-    injector.fly(
-        tmp_path / "flight", {}, gusts=True, sensors="filtered_speeds", seed=5, longest=9.0,
+    sensors = "filtered_speeds" if late == "low-pass" else "full"
+    folder = injector.fly(
+        tmp_path / "flight", effects, gusts=True, sensors=sensors, seed=5, longest=9.0,
         runs=("lon_3211", "heave_3211", "yaw_3211", "climb_descend"),
     )  # fmt: skip
-    found = diagnose(tmp_path / "flight", hold_out=[]).findings
-    assert found["causes"] == [] and found["verdict"] == "unexplained"
-    (speeds,) = (u for u in found["unexplained"] if u.get("like") == "motor_lag")
-    assert any("vertical acceleration" in why for why in speeds["why"])
+    for file in folder.glob("*.csv") if late == "rows" else ():
+        head, *rows = [line.split(",") for line in file.read_text().splitlines()]
+        columns = [head.index(channel) for channel in ROTOR_SPEEDS]
+        read = [[row[k] for k in columns] for row in rows]
+        for row, before in zip(rows, [read[0], read[0], *read[:-2]], strict=True):
+            for k, value in zip(columns, before, strict=True):
+                row[k] = value
+        file.write_text("\n".join(",".join(row) for row in [head, *rows]) + "\n")
+    found = diagnose(folder, hold_out=[])
+    assert [cause["effect"] for cause in found.findings["causes"]] == names
+    assert found.findings["unexplained"] == []
+    assert any(said in remark for remark in found.remarks), found.remarks

@@ -10,7 +10,8 @@ from scipy.signal import lfilter
 
 from coax_env import load_vehicle
 from coax_env.diagnosis import fits, searched
-from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis import problem as problem_module
+from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.searched import Searched
 from coax_env.diagnosis.sensor_errors import LastingErrors
 from coax_env.diagnosis.sensor_low_pass import hidden_behind
@@ -31,8 +32,9 @@ def _one_air(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def _steady_rotors(monkeypatch):
-    """Whose speeds are their commands, but where a test says otherwise."""
+    """Whose speeds are their commands, read as they are, but where a test says otherwise."""
     monkeypatch.setattr(searched, "_rotors_stray", lambda problem: False)
+    monkeypatch.setattr(searched, "_with_late_speeds", lambda *asked, coloured=False: None)
 
 
 def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
@@ -92,7 +94,7 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
     monkeypatch.setattr(searched, "_flies_better", lambda *fits: answers.pop(0))
     engine = SimpleNamespace(filter=lambda values, noise: [])
     problem = SimpleNamespace(
-        engine=engine, model=SimpleNamespace(channels=()), report=lambda text: None
+        engine=engine, model=SimpleNamespace(channels=()), report=lambda text: None, smoothed=False
     )
     found = searched.searched(problem, FINE, {})  # type: ignore[arg-type]
     assert asked == pytest.approx(stds) and found.coarse == coarse
@@ -216,7 +218,10 @@ def believes_its_sensors(monkeypatch) -> None:
 )
 def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had, costs, active):
     """From it, and from none: the likelier end stands; readings are not believed less then."""
-    plain, wider = (SimpleNamespace(name=n, report=lambda text: None) for n in ("plain", "wider"))
+    plain, wider = (
+        SimpleNamespace(name=name, report=lambda text: None, low_passes={}, smoothed=False)
+        for name in ("plain", "wider")
+    )
     asked: list[Any] = []
 
     def one(problem: Any, noise: Noise, coarse: bool = False) -> Searched:
@@ -275,7 +280,8 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
 
     engine, model = SimpleNamespace(filter=lambda values, noise: []), SimpleNamespace(channels=())
     fading, swinging = (
-        SimpleNamespace(report=lambda text: None, engine=engine, model=model) for _ in range(2)
+        SimpleNamespace(report=lambda text: None, engine=engine, model=model, smoothed=False)
+        for _ in range(2)
     )
     monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
     monkeypatch.setattr(searched, "_searched", one)
@@ -287,7 +293,7 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
     monkeypatch.setattr(searched, "with_other_swings", lambda problem, fit: None)
     found = searched.searched(fading, Noise({"force_xy": 0.2}), {})  # type: ignore[arg-type]
     assert asked == [(fading, 0.2), (swinging, 0.7)]
-    assert found.problem is (swinging if white else fading) and found.low_passes == {}
+    assert found.problem is (swinging if white else fading)
 
 
 @pytest.mark.parametrize(("costs", "used"), [((5.0, 3.0), True), ((3.0, 5.0), False)])
@@ -368,7 +374,9 @@ def test_jitter_is_asked_first_where_rotor_speeds_show_it_and_gusts_beside_it(
     engine, model = SimpleNamespace(filter=lambda values, noise: []), SimpleNamespace(channels=())
     monkeypatch.setattr(searched, "is_white", lambda passes, channels: True)
     plain, jittery, swinging = (
-        SimpleNamespace(name=name, report=lambda text: None, engine=engine, model=model)
+        SimpleNamespace(
+            name=name, report=lambda text: None, engine=engine, model=model, smoothed=False
+        )
         for name in ("p", "j", "s")
     )
 
@@ -407,7 +415,8 @@ def test_jitter_is_asked_first_where_rotor_speeds_show_it_and_gusts_beside_it(
 def test_where_times_are_wrong_all_is_searched_so(monkeypatch, wrong, problem):
     """Before anything else is asked that readings show."""
     right, other = (
-        SimpleNamespace(name=name, report=lambda text: None) for name in ("right", "wrong")
+        SimpleNamespace(name=name, report=lambda text: None, smoothed=False)
+        for name in ("right", "wrong")
     )
     asked = []
 
@@ -439,7 +448,7 @@ def test_where_times_are_wrong_all_is_searched_so(monkeypatch, wrong, problem):
 def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
     monkeypatch, costs, before, after, used
 ):
-    """From the search that ended likelier; low-passes stay."""
+    """From the search that ended likelier."""
     plain, joint = (
         SimpleNamespace(
             name=name, model=SimpleNamespace(channels=tuple("abcd")), report=lambda text: None,
@@ -448,7 +457,7 @@ def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
         for name in ("plain", "joint")
     )  # fmt: skip
     fit = Fit((), {}, FINE)
-    first = Searched(plain, fit, fit, fit, None, low_passes={"ax": LowPass(0.008)})  # type: ignore[arg-type]
+    first = Searched(plain, fit, fit, fit, None)  # type: ignore[arg-type]
     mean = {"plain": before, "joint": after}
     shown = lambda name, channels: {  # noqa: E731
         "a": SimpleNamespace(coloured_share=2.0 * mean[name]),
@@ -463,7 +472,7 @@ def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
     )
     monkeypatch.setattr(fits, "whiteness", shown)
     found = searched._with_joint_gusts(first, FINE)
-    assert (found.problem is joint) == used and found.low_passes == first.low_passes
+    assert (found.problem is joint) == used
     assert found is first or used
 
 
@@ -611,19 +620,21 @@ def test_air_of_each_runs_own_stands_where_little_is_coloured_in_it(monkeypatch,
         assert again == ("own", FINE)
 
 
+def problem_on(monkeypatch: Any, model: Any, records: Any, candidates: tuple[str, ...]) -> Problem:
+    """A problem whose engine has records, and flies nothing."""
+
+    def engine(model: Any, records: Any, threads: int) -> Any:
+        return SimpleNamespace(records=records, threads=threads)
+
+    monkeypatch.setattr(problem_module, "Engine", engine)
+    return Problem(model, engine(model, records, 1), (), dict.fromkeys(candidates, ()))
+
+
 def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypatch):
     """Without what cannot be told from what is left of it."""
     t, smooth = 0.01 * np.arange(30), np.linspace(0.0, 1.0, 30)
     record = Record("a", t, np.zeros((30, 4)), np.stack([smooth, smooth], axis=1))
     model = SimpleNamespace(channels=("ax", "h"), vehicle=SimpleNamespace(effects=()))
-
-    class Problem(SimpleNamespace):
-        def with_records(self, records: Any, smoothed: bool) -> "Problem":
-            engine = SimpleNamespace(records=records)
-            return Problem(**{**vars(self), "engine": engine, "smoothed": smoothed})
-
-        def of_candidates(self, names: Any) -> "Problem":
-            return Problem(**{**vars(self), "candidates": tuple(sorted(names))})
 
     asked = []
 
@@ -637,12 +648,9 @@ def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypa
     monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
     monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
     monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {"ax": LowPass(0.008)})
-    problem = Problem(
-        model=model, engine=SimpleNamespace(records=[record]), report=lambda text: None,
-        candidates=("thrust_exponent", "wind"),
-    )  # fmt: skip
-    found = searched.searched(problem, FINE, {})  # type: ignore[arg-type]
-    assert found.low_passes == {"ax": LowPass(0.008)}
+    problem = problem_on(monkeypatch, model, [record], ("thrust_exponent", "wind"))
+    found = searched.searched(problem, FINE, {})
+    assert found.problem.low_passes == {"ax": LowPass(0.008)}
     assert asked[0] is problem and asked[1].candidates == ("wind",)
     assert asked[1].smoothed
     searched_on = asked[1].engine.records[0].z
@@ -749,12 +757,12 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     """Where gyros and accelerometers stay coloured behind it, and nothing more is named."""
     levels, wider = Noise({}, {"phi": 0.1}), Noise({"error_gyros": 0.1}, {"phi": 0.1})
 
-    def one(problem: str, active: tuple[str, ...]) -> Searched:
+    def one(name: str, active: tuple[str, ...]) -> Searched:
         fit = Fit(active, {}, levels)
+        problem = SimpleNamespace(name=name, smoothed=name == "behind")
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
     behind, without = one("behind", ("wind",)), one("without", names)
-    behind = replace(behind, low_passes={"p": LowPass(0.01)})
     monkeypatch.setattr(searched, "_searched", lambda problem, noise: one("first", ()))
     monkeypatch.setattr(searched, "_with_clock_errors", lambda first, noise: first)
     monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: behind)
@@ -771,21 +779,21 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
         lambda problem, found, noise: asked.append("again") or found,
     )
     of_each = {"behind": 50.0, "without": lost}
-    monkeypatch.setattr(searched, "_lost", lambda problem, found: of_each[found.problem])
+    monkeypatch.setattr(searched, "_lost", lambda problem, found: of_each[found.problem.name])
     asked: list[Any] = []
 
     def in_unrest(best: Searched, noise: Noise, clock: Any, erring: bool) -> Searched:
         asked.append((noise is wider, erring))
-        return replace(best, low_passes={})
+        return best
 
     monkeypatch.setattr(searched, "_in_unrest", in_unrest)
     found = searched.searched("as given", levels, {})  # type: ignore[arg-type]
-    assert found.problem == taken
+    assert found.problem.name == taken  # type: ignore[attr-defined]
     assert asked == ["again", (True, True)]
-    assert found.low_passes == ({"p": LowPass(0.01)} if taken == "behind" else {})
 
 
 HAD = {"p": LowPass(0.01)}
+OF_ROTORS = {"rpm_upper": LowPass(0.02)}
 
 
 @pytest.mark.parametrize(
@@ -808,13 +816,6 @@ def test_low_passes_are_fitted_once_more_beside_errors_that_last(
     search began with; what cannot be told from them is no candidate then."""
     levels = Noise({"error_gyros": 0.1})
 
-    class Problem(SimpleNamespace):
-        def with_records(self, records: Any, smoothed: bool = False) -> "Problem":
-            return Problem(**{**vars(self), "records": records, "smoothed": smoothed})
-
-        def of_candidates(self, names: Any) -> "Problem":
-            return Problem(**{**vars(self), "candidates": sorted(names)})
-
     def of(problem: Any, noise: Noise) -> Searched:
         fit = Fit((active,), {}, noise)
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
@@ -822,25 +823,25 @@ def test_low_passes_are_fitted_once_more_beside_errors_that_last(
     asked: list[Any] = []
 
     def low_passes(problem: Any, fit: Fit, noise: Noise, groups: Any) -> dict[str, LowPass]:
-        asked.append((problem.records, noise, groups))
+        asked.append((problem.engine.records, noise, groups))
         return passes
 
-    given = Problem(
-        engine=SimpleNamespace(records="logged"), report=lambda text: None,
-        model=SimpleNamespace(channels=("p",), vehicle=SimpleNamespace(effects={})),
-        candidates=["thrust_exponent", "wind"],
-    )  # fmt: skip
-    found = replace(of(given.with_records("before", True), levels), low_passes=had)
+    model = SimpleNamespace(channels=("p",), vehicle=SimpleNamespace(effects={}))
+    given = problem_on(monkeypatch, model, "logged", ("thrust_exponent", "wind"))
+    monkeypatch.setattr(
+        problem_module, "records_before", lambda logged, channels, those: (logged, those)
+    )
     monkeypatch.setattr(searched, "low_passes", low_passes)
-    monkeypatch.setattr(searched, "records_before", lambda logged, channels, those: ("then", those))
+    found = of(given.behind({**had, **OF_ROTORS}, "logged"), levels)
     monkeypatch.setattr(searched, "_searched", of)
     monkeypatch.setattr(searched, "_lost", lambda problem, it: 50.0 if it is found else lost)
-    best = searched._behind_other_low_passes(given, found, levels)  # type: ignore[arg-type]
+    best = searched._behind_other_low_passes(given, found, levels)
     assert asked == ([("logged", levels, groups)] if groups else [])
     assert (best is found) == (taken == "found")
     if best is not found:
-        assert best.low_passes == passes
-        assert best.problem.records == ("then", passes) and best.problem.smoothed
+        assert best.problem.low_passes == {**passes, **OF_ROTORS}
+        assert best.problem.engine.records == ("logged", passes)
+        assert best.problem.smoothed == bool(passes)
         assert ("thrust_exponent" in best.problem.candidates) == ("ax" not in passes)
 
 
@@ -861,24 +862,21 @@ def test_gusts_that_are_known_may_leave_nothing_of_a_low_pass(
     worth = {"behind": 50.0, "as logged": lost}
     noise = Noise({}, {"phi": 0.1})
 
-    def one(name: str, passes: Any) -> Searched:
+    def one(name: str) -> Searched:
         fit = Fit((), {}, noise)
-        problem = SimpleNamespace(name=name, report=lambda text: None)
-        return Searched(problem, fit, fit, fit, None, low_passes=passes)  # type: ignore[arg-type]
+        problem = SimpleNamespace(name=name, report=lambda text: None, smoothed=name == "behind")
+        return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
-    first = one("as logged", {})
+    first = one("as logged")
     monkeypatch.setattr(searched, "_rotors_first", lambda problem, noise: (first, noise))
     monkeypatch.setattr(
         searched, "_is_coloured",
         lambda found, channels: "ax" in channels and coloured[found.problem.name],
     )  # fmt: skip
     monkeypatch.setattr(searched, "_with_clock_errors", lambda first, noise: first)
-    monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: one("behind", HAD))
+    monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: one("behind"))
     monkeypatch.setattr(searched, "_with_errors", lambda found, noise, clock: (found, noise))
-    monkeypatch.setattr(
-        searched, "_in_unrest", lambda best, noise, clock, erring: replace(best, low_passes={})
-    )
+    monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
     monkeypatch.setattr(searched, "_lost", lambda problem, found: worth[found.problem.name])
     found = searched.searched(first.problem, noise, {})
     assert found.problem.name == taken  # type: ignore[attr-defined]
-    assert found.low_passes == (HAD if taken == "behind" else {})

@@ -63,6 +63,7 @@ from coax_env.diagnosis.late_rotor_speeds import (
     LAG,
     behind_low_pass,
     come_late,
+    with_less_lag,
     without_rotor_speeds,
 )
 from coax_env.diagnosis.onsets.changing import Changing
@@ -148,11 +149,11 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     """
     given = noise
     first, noise = _rotors_first(problem, noise) or (_searched(problem, noise), noise)
-    late = _without_late_speeds(problem, first.problem, first.fit, given)
+    late = _with_late_speeds(problem, first.problem, first.fit, given)
     if late is None and _is_coloured(first, ROTOR_SPEEDS):
         first, noise = _jittery(first, noise)
         if _is_coloured(first, ROTOR_SPEEDS):
-            late = _without_late_speeds(problem, first.problem, first.fit, given, coloured=True)
+            late = _with_late_speeds(problem, first.problem, first.fit, given, coloured=True)
     if late is not None:
         first, noise = late, given
     first = _with_clock_errors(_with_own_air(first, noise), noise)
@@ -174,31 +175,35 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     return found
 
 
-def _without_late_speeds(
+def _with_late_speeds(
     problem: Problem, beside: Problem, fit: Fit, noise: Noise, coloured: bool = False
 ) -> Searched | None:
-    """The search without measured rotor speeds, where these come late, beside what it finds too; with
-    those before a low-pass where that is what makes them late.
+    """The search where rotor speeds come late: with those before their low-pass, or without them.
+
+    Without them where they come late beside what is found so, too.
 
     Args:
         problem: as given. beside: the same, or with rotors that jitter. fit: of `beside`, with what
             moves the rotors. noise: levels to start from.
         coloured: whether rotor speeds stay so with rotors that jitter.
     """
-    if not come_late(beside, fit, coloured):
+    trial = with_less_lag(beside, fit)
+    if trial is None:
+        return None
+    behind = None if beside is not problem else behind_low_pass(problem, fit, noise)
+    if behind is not None:
+        problem.report("searching with rotor speeds as they were before a low-pass")
+        return _searched(behind, noise)
+    if not come_late(beside, fit, trial, coloured):
         return None
     problem.report("searching without the measured rotor speeds, which come late")
     records = without_rotor_speeds(problem.engine.records, problem.model.channels)
     found = _searched(problem.with_records(records), noise)
     own = {f.name: fit.values[f.name] for f in problem.own[LAG]}
-    begun = replace(fit.at(found.fit.values | own), active=(*found.fit.rest(LAG), LAG))
-    if not come_late(beside, fitted(beside, begun), coloured):
-        return None
-    behind = behind_low_pass(problem, found.fit, fit.noise)
-    if behind is None:
-        return found
-    problem.report("searching with rotor speeds as they were before a low-pass")
-    return _searched(behind, noise)
+    begun = replace(fit.at(found.fit.values).at(own), active=(*found.fit.rest(LAG), LAG))
+    again = fitted(beside, begun)
+    trial = with_less_lag(beside, again)
+    return found if trial is not None and come_late(beside, again, trial, coloured) else None
 
 
 def _with_clock_errors(first: Searched, noise: Noise) -> Searched:
@@ -481,7 +486,7 @@ def _rotors_first(problem: Problem, noise: Noise) -> tuple[Searched, Noise] | No
         rotors = _in_noise_anew(problem, rotors, noise)
         found = replace(found, fit=rotors)
     coloured = _is_coloured(found, ROTOR_SPEEDS)
-    late = _without_late_speeds(problem, problem, rotors, noise) if coloured else None
+    late = _with_late_speeds(problem, problem, rotors, noise) if coloured else None
     if late is not None:
         return late, noise
     jittery = in_jitter(problem, rotors, quadratic) if coloured else None
