@@ -1,0 +1,101 @@
+"""When measured rotor speeds are taken to come late: the decisions, on fits that are stood in for."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from coax_env.diagnosis import late_rotor_speeds
+from coax_env.diagnosis.late_rotor_speeds import (
+    LAG,
+    come_late,
+    with_less_lag,
+    without_rotor_speeds,
+)
+from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.state_space import Noise, Record
+
+CHANNELS = ("rpm_upper", "rpm_lower", "az")
+OWN = tuple(SimpleNamespace(name=f"{LAG}.{rotor}") for rotor in ("upper", "lower"))
+
+
+def lag_of(seconds: float, active: tuple[str, ...] = (LAG,), objective: float = 0.0) -> Fit:
+    """A fit whose rotors lag so much."""
+    values = dict.fromkeys([own.name for own in OWN], seconds)
+    return Fit(active, values, Noise({}), objective)
+
+
+def problem_of(nats: dict[float, float], aboard: Any = CHANNELS) -> Any:
+    """A problem whose other readings have a likelihood by the lag alone."""
+    engine = SimpleNamespace(
+        records=[], threads=1, filter=lambda values, noise: [],
+        log_likelihood=lambda values, noise: nats[values[OWN[0].name]],
+    )  # fmt: skip
+    return SimpleNamespace(
+        engine=engine, model=SimpleNamespace(channels=CHANNELS), settings=SETTINGS,
+        aboard=frozenset(aboard), own={LAG: OWN}, report=lambda text: None,
+        with_records=lambda records: problem_of(nats, {"az"} & set(aboard)),
+        off_values=lambda effect: {own.name: 0.0 for own in OWN}, file_values=lambda effect: {},
+    )  # fmt: skip
+
+
+def test_readings_of_rotor_speeds_alone_are_left_out():
+    t = 0.01 * np.arange(4)
+    record = Record("r", t, np.zeros((4, 4)), np.arange(12.0).reshape(4, 3))
+    (left,) = without_rotor_speeds([record], CHANNELS)
+    assert np.isnan(left.z[:, :2]).all()
+    assert_array_equal(left.z[:, 2], record.z[:, 2])
+    assert np.isfinite(record.z).all(), "the log's own stay"
+
+
+@pytest.mark.parametrize(
+    ("gained", "by_others", "active", "aboard", "asked"),
+    [
+        (3.1, 0.01, (LAG,), CHANNELS, True),
+        (2.9, 0.01, (LAG,), CHANNELS, False),  # by chance
+        (
+            50.0,
+            0.04,
+            (LAG,),
+            CHANNELS,
+            False,
+        ),  # thrust is later than the speeds: no sensor does that
+        (50.0, 0.01, ("wind",), CHANNELS, False),
+        (50.0, 0.01, (LAG,), ("az",), False),  # no speed is read
+        (50.0, 0.01, (LAG,), ("rpm_upper",), False),  # nothing else is
+    ],
+)
+def test_speeds_may_be_late_where_all_else_has_less_of_a_lag(
+    monkeypatch, gained, by_others, active, aboard, asked
+):
+    trial = lag_of(by_others, active)
+    monkeypatch.setattr(late_rotor_speeds, "fitted", lambda problem, fit: trial)
+    problem = problem_of({0.02: 0.0, by_others: gained}, aboard)
+    assert with_less_lag(problem, lag_of(0.02, active)) == (trial if asked else None)
+
+
+@pytest.mark.parametrize(
+    ("gained", "left", "coloured", "inflation", "late"),
+    [
+        (1.1, 0.9, False, 1.0, True),  # nothing is left of the lag
+        (1.1, 1.1, False, 1.0, False),  # a lag of the motors, and thrust ahead of its inflow
+        (1.1, 1.1, True, 1.0, True),  # no lag of the motors leaves speeds coloured
+        (0.9, 0.1, True, 1.0, False),
+        (1.1, 0.1, True, 2.0, False),  # other readings are coloured too: they say less
+    ],
+)
+def test_speeds_come_late_where_nothing_is_left_of_a_lag_or_they_stay_coloured(
+    monkeypatch, gained, left, coloured, inflation, late
+):
+    """`gained`, `left`: thresholds by which other readings are likelier so, and less likely without."""
+    trial = lag_of(0.01, objective=100.0)
+    off = replace(lag_of(0.0, ()), objective=100.0 + left * SETTINGS.evidence)
+    monkeypatch.setattr(late_rotor_speeds, "fitted", lambda problem, fit: off)
+    shown = {"az": SimpleNamespace(inflation=inflation)}
+    monkeypatch.setattr(late_rotor_speeds, "whiteness", lambda passes, channels: shown)
+    problem = problem_of({0.02: 0.0, 0.01: gained * SETTINGS.evidence})
+    assert come_late(problem, lag_of(0.02), trial, coloured) == late
