@@ -29,7 +29,7 @@ def lag_of(seconds: float, active: tuple[str, ...] = (LAG,), objective: float = 
     return Fit(active, values, Noise({}), objective)
 
 
-def problem_of(nats: dict[float, float], aboard: Any = CHANNELS) -> Any:
+def problem_of(nats: dict[float, float], aboard: Any = CHANNELS, slow: bool = False) -> Any:
     """A problem whose other readings have a likelihood by the lag alone."""
     engine = SimpleNamespace(
         records=[], threads=1, filter=lambda values, noise: [],
@@ -38,7 +38,8 @@ def problem_of(nats: dict[float, float], aboard: Any = CHANNELS) -> Any:
     return SimpleNamespace(
         engine=engine, model=SimpleNamespace(channels=CHANNELS), settings=SETTINGS,
         aboard=frozenset(aboard), own={LAG: OWN}, report=lambda text: None,
-        with_records=lambda records: problem_of(nats, {"az"} & set(aboard)),
+        sees_poses_alone="az" not in aboard, has_slow_rows=slow,
+        with_records=lambda records: problem_of(nats, {"az"} & set(aboard), slow),
         off_values=lambda effect: {own.name: 0.0 for own in OWN}, file_values=lambda effect: {},
     )  # fmt: skip
 
@@ -53,28 +54,23 @@ def test_readings_of_rotor_speeds_alone_are_left_out():
 
 
 @pytest.mark.parametrize(
-    ("gained", "by_others", "active", "aboard", "asked"),
+    ("gained", "by_others", "active", "aboard", "slow", "asked"),
     [
-        (3.1, 0.01, (LAG,), CHANNELS, True),
-        (2.9, 0.01, (LAG,), CHANNELS, False),  # by chance
-        (
-            50.0,
-            0.04,
-            (LAG,),
-            CHANNELS,
-            False,
-        ),  # thrust is later than the speeds: no sensor does that
-        (50.0, 0.01, ("wind",), CHANNELS, False),
-        (50.0, 0.01, (LAG,), ("az",), False),  # no speed is read
-        (50.0, 0.01, (LAG,), ("rpm_upper",), False),  # nothing else is
+        (3.1, 0.01, (LAG,), CHANNELS, False, True),
+        (2.9, 0.01, (LAG,), CHANNELS, False, False),  # by chance
+        (50.0, 0.04, (LAG,), CHANNELS, False, False),  # thrust later than speeds: no sensor does that
+        (50.0, 0.01, ("wind",), CHANNELS, False, False),
+        (50.0, 0.01, (LAG,), ("az",), False, False),  # no speed is read
+        (50.0, 0.01, (LAG,), ("rpm_upper",), False, False),  # no accelerometer or gyro is
+        (50.0, 0.01, (LAG,), CHANNELS, True, False),  # commands changed unseen between the rows
     ],
 )
 def test_speeds_may_be_late_where_all_else_has_less_of_a_lag(
-    monkeypatch, gained, by_others, active, aboard, asked
+    monkeypatch, gained, by_others, active, aboard, slow, asked
 ):
     trial = lag_of(by_others, active)
     monkeypatch.setattr(late_rotor_speeds, "fitted", lambda problem, fit: trial)
-    problem = problem_of({0.02: 0.0, by_others: gained}, aboard)
+    problem = problem_of({0.02: 0.0, by_others: gained}, aboard, slow)
     assert with_less_lag(problem, lag_of(0.02, active)) == (trial if asked else None)
 
 

@@ -7,7 +7,8 @@ low-pass (sensor_low_pass.py), and stay so if that leaves them white and is like
 they come late where the other readings are likelier so by the threshold, and nothing is left of the
 lag, or speeds stay coloured beside it, with rotors that jitter too, as no lag of the motors leaves
 them: such speeds are not used. Where speeds are white and a lag is left, it is theirs, and what the
-other readings have less of it is another thing (thrust that is ahead of its inflow, say).
+other readings have less of it is another thing (thrust that is ahead of its inflow, say). By poses
+alone, and between slow rows, commands that answer gusts make a lag look shorter: not asked there.
 
 Four clean **synthetic** flights whose speeds came through a low-pass of 8 Hz, one in steps of 10
 rev/min beside, an average over 50 ms, or 20 ms late had a motor lag of 3,900 to 34,000 nats that the
@@ -58,7 +59,7 @@ def with_less_lag(problem: Problem, fit: Fit) -> Fit | None:
     if LAG not in fit.active or problem.aboard.isdisjoint(ROTOR_SPEEDS):
         return None
     others = _others(problem)
-    if not others.aboard:
+    if others.sees_poses_alone or others.has_slow_rows:
         return None
     trial = fitted(others, fit)
     gained = _gained(others, fit, trial)
