@@ -11,9 +11,11 @@ from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.searched import Searched
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.diagnosis.slow_commands import (
+    ON_LINES,
+    SHARES,
     beside_straight_lines,
-    likelier_on_lines,
-    on_straight_lines,
+    likelier_on_the_way,
+    on_the_way,
 )
 from coax_env.estimation.state_space import Noise, Record
 
@@ -26,11 +28,11 @@ def ramp(rows: int = 5) -> Record:
     return Record("a", 0.04 * np.arange(rows), command, np.zeros((rows, 1)))
 
 
-def problem_of(slow: bool = True) -> Any:
+def problem_of(slow: bool = True, row: float = 0.04) -> Any:
     said: list[str] = []
     engine = SimpleNamespace(records=[ramp()])
     made = SimpleNamespace(
-        engine=engine, has_slow_rows=slow, settings=SETTINGS, report=said.append, said=said, at=None
+        engine=engine, has_slow_rows=slow, row=row, settings=SETTINGS, report=said.append, said=said
     )
 
     def with_records(records: Any) -> Any:
@@ -49,7 +51,7 @@ def fit_of(*active: str, objective: float = 100.0) -> Fit:
 def test_a_rows_command_is_the_mean_of_the_line_to_the_next():
     """Of a ramp that of its middle; the last row's has no next. Readings and times stay."""
     sound = ramp()
-    (found,) = on_straight_lines([sound])
+    (found,) = on_the_way([sound], ON_LINES)
     np.testing.assert_allclose(
         found.command[:-1], np.outer(np.arange(4) + 0.5, [1.0, 2.0, 3.0, 4.0])
     )
@@ -58,33 +60,50 @@ def test_a_rows_command_is_the_mean_of_the_line_to_the_next():
     np.testing.assert_array_equal(sound.command, ramp().command, "the log itself stays")
 
 
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_of_commands_between_rows_the_mean_is_a_share_of_the_next(step):
+    """One of two that were logged, on a line, has a quarter of the next; of very many a half."""
+    fine = np.linspace(0.0, 1.0, step + 1)[:step]
+    record = ramp(2)
+    (found,) = on_the_way([record], (step - 1) / (2 * step))
+    np.testing.assert_allclose(found.command[0], fine.mean() * record.command[1])
+
+
 @pytest.mark.parametrize(
-    ("slow", "active", "changing", "end", "taken"),
+    ("row", "active", "changing", "ends", "taken"),
     [
-        (True, (LAG,), None, 93.0, True),
-        (True, (LAG,), None, 95.0, False),  # a tie is 6
-        (True, (), None, 50.0, False),  # there is no cause that commands may have hidden
-        (True, (LAG,), object(), 50.0, False),  # something changed in flight
-        (False, (LAG,), None, 50.0, False),
+        (0.04, (LAG,), None, (99.0, 97.0, 93.0), 0.5),
+        (0.02, (LAG,), None, (93.0, 97.0, 99.0), 0.125),
+        (0.02, (LAG,), None, (95.0, 97.0, 99.0), 0.0),  # a tie is 6
+        (0.04, (), None, (50.0, 50.0, 50.0), 0.0),  # there is no cause that commands may have hidden
+        (0.04, (LAG,), object(), (50.0, 50.0, 50.0), 0.0),  # something changed in flight
+        (0.01, (LAG,), None, (50.0, 50.0, 50.0), 0.0),
     ],
 )
-def test_straight_lines_stand_where_they_are_likelier_beside_a_cause(
-    monkeypatch, slow, active, changing, end, taken
+def test_commands_are_on_the_way_where_that_is_likelier_beside_a_cause(
+    monkeypatch, row, active, changing, ends, taken
 ):
+    """`ends`: minus the likelihoods with each share; 100 with none."""
+    of_share = dict(zip(SHARES, ends, strict=True))
+
+    def end(problem: Any, fit: Fit) -> Fit:
+        share = problem.engine.records[0].command[0, 0]
+        return fit_of(*fit.active, objective=of_share[share])
+
     monkeypatch.setattr(module, "fitted", lambda problem, fit, steps: fit)
-    monkeypatch.setattr(
-        module, "converged", lambda problem, fit: fit_of(*fit.active, objective=end)
-    )
+    monkeypatch.setattr(module, "converged", end)
     monkeypatch.setattr(module, "quadratic_at", lambda problem, fit: (fit, "there"))
-    problem, fit = problem_of(slow), fit_of(*active)
+    problem, fit = problem_of(row=row), fit_of(*active)
     before: Any = Searched(problem, fit, fit, fit, None, changing=changing)  # type: ignore[arg-type]
-    found = likelier_on_lines(before)
-    assert found.on_lines == taken
+    found = likelier_on_the_way(before)
+    assert found.of_next == taken
     if taken:
-        np.testing.assert_allclose(found.problem.engine.records[0].command[0], [0.5, 1.0, 1.5, 2.0])
-        assert (found.fit.active, found.fit.objective) == (active, end)
+        np.testing.assert_allclose(
+            found.problem.engine.records[0].command[0], taken * np.array([1.0, 2.0, 3.0, 4.0])
+        )
+        assert (found.fit.active, found.fit.objective) == (active, min(ends))
         assert found.quadratic == "there" and found.bare is fit
-        assert problem.said == ["commands on straight lines between slow rows: 7.0 nats"]
+        assert problem.said == [f"commands at {taken:g} of the way to the next row's: 7.0 nats"]
     else:
         assert found is before
 

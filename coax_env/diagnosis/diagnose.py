@@ -182,7 +182,7 @@ def diagnose(
     problem = Problem.of(model, used, candidates, settings, report)
     problem = replace(problem, of_onboard_filter=circular)
     clock = clock_of(flight.runs)
-    first = slow_commands.likelier_on_lines(searched(problem, noise, clock))
+    first = slow_commands.likelier_on_the_way(searched(problem, noise, clock))
     if first.problem.aboard.isdisjoint(ROTOR_SPEEDS) and not problem.aboard.isdisjoint(ROTOR_SPEEDS):
         of_sensors.append(late_rotor_speeds.REMARK)
         held = late_rotor_speeds.without_rotor_speeds(held, CHANNELS)
@@ -193,7 +193,7 @@ def diagnose(
     problem, bare, refitted = first.problem, first.bare, first.refitted
     held = records_before(held, CHANNELS, passes)
     held = with_clock_error(held, problem.clock_error)
-    held = slow_commands.on_straight_lines(held) if first.on_lines else held
+    held = slow_commands.on_the_way(held, first.of_next)
     passes_before = problem.engine.filter(bare.values, bare.noise)
     state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
@@ -208,7 +208,7 @@ def diagnose(
     onsets = moments_of(problem, fit, quadratic, evidence, state.onsets)
     fit = confounding.beside_alternatives(problem, fit, quadratic, evidence, found)
     fit = confounding.beside_undecided(problem, fit, quadratic, evidence)
-    if not onsets and not first.on_lines:
+    if not onsets and not first.of_next:
         fit = slow_commands.beside_straight_lines(problem, fit, quadratic, evidence)
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
@@ -266,7 +266,7 @@ def diagnose(
             *([vibration_removed(lines)] if lines else []),
             *of_sensors,
             *([oscillation_remark(swinging)] if swinging else []),
-            *([slow_commands.REMARK] if first.on_lines else []),
+            *([slow_commands.remark(first.of_next)] if first.of_next else []),
             *remarks(problem, fit, quadratic, {e: found[e] for e in found if trust[e].named}),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
             *answered_gusts(gain),

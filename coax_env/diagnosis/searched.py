@@ -120,7 +120,7 @@ class Searched:
     problem: what was searched.
     coarse: whether readings were taken to be no finer than LEAST_READING_STD.
     changing: with what began or changed in flight, where that has been asked already.
-    on_lines: whether commands are on straight lines between slow rows.
+    of_next: share of the next row's command in a row's, 0 where commands are held (slow_commands.py).
     air_asked: whether it has been asked if runs have air of their own.
     """
 
@@ -131,7 +131,7 @@ class Searched:
     quadratic: Quadratic
     coarse: bool = False
     changing: Changing | None = None
-    on_lines: bool = False
+    of_next: float = 0.0
     air_asked: bool = False
 
     @property
