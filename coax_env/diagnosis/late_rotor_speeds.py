@@ -34,20 +34,15 @@ LAG = "motor_lag"
 LEAST = 3.0
 """nats by which other readings must be likelier with less of a lag, or no more is asked; chance reaches
 it once in 40 flights whose rotors lag."""
-LEAST = 3.0
-"""nats by which other readings must be likelier with less of a lag, or no more is asked; chance reaches
-it once in 40 flights whose rotors lag."""
+ORDERS = (1, 2)
+"""Of low-passes that are tried."""
+TURNS = 2
+"""Of a low-pass and all numbers, the lag's too, at most; ours."""
 REMARK = (
     "measured rotor speeds come later than the rotors turn: a filter or a delay of their own. They"
     " were not used"
 )
 """For who reads the findings."""
-
-
-ORDERS = (1, 2)
-"""Of low-passes that are tried."""
-TURNS = 2
-"""Of a low-pass and all numbers, the lag's too, at most; ours."""
 
 
 def with_less_lag(problem: Problem, fit: Fit) -> Fit | None:
