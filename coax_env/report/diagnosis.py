@@ -112,7 +112,10 @@ def lead(findings: Findings) -> list[str]:
         error = f"the error of a {seconds(gain['horizon_s'])} prediction"
         change = error_change(gain["error_removed_percent"], error, "**")
         runs = and_list(list(gain["held_out"]))
-        sentences.append(f"With them in the model, {change} on runs held out of the fit ({runs}).")
+        which = "it" if len(findings["causes"]) == 1 else "them"
+        sentences.append(
+            f"With {which} in the model, {change} on runs held out of the fit ({runs})."
+        )
     elif not gain:
         sentences.append("No run was held out, so how well this predicts is not known.")
     alternatives = sorted({name for c in findings["causes"] for name in c["confusable_with"]})
