@@ -102,6 +102,32 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
     assert found.fit.noise.reading["phi"] == pytest.approx(stds[kept])
 
 
+def test_readings_that_are_coarse_enough_are_held_as_they_were_fitted(monkeypatch):
+    """Not as the card has them: with angles at half their noise a **synthetic** flight by poses alone
+    had an attitude delay of 1,596 nats and a swash phase, and inertias at 0.3 of theirs."""
+    asked = []
+
+    def one(problem: Any, noise: Noise, coarse: bool = False) -> Any:
+        asked.append(dict(noise.reading))
+        fit = Fit((), {}, noise if coarse else Noise({}, {"phi": 0.01, "h": 0.0004}))
+        return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
+
+    believes_its_sensors(monkeypatch)
+    monkeypatch.setattr(searched, "_searched", one)
+    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
+    monkeypatch.setattr(searched, "with_swings", lambda problem, fit: None)
+    monkeypatch.setattr(searched, "is_white", lambda passes, channels: False)
+    monkeypatch.setattr(searched, "_flies_better", lambda *fits: False)
+    problem: Any = SimpleNamespace(
+        engine=SimpleNamespace(filter=lambda values, noise: []), report=lambda text: None,
+        model=SimpleNamespace(channels=()),
+    )  # fmt: skip
+    given = Noise({}, {"phi": 0.005, "h": 0.0002})
+    best = one(problem, given)
+    searched._in_unrest(best, given, {}, erring=False)
+    assert asked[1] == {"phi": 0.01, "h": LEAST_READING_STD["h"]}
+
+
 # --- rotors first -------------------------------------------------------------------------------------
 
 

@@ -372,9 +372,11 @@ def _in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: b
     passes = problem.engine.filter(best.fit.values, best.fit.noise)
     if not coarser or is_white(passes, problem.model.channels):
         return best
+    reading = best.fit.noise.reading
+    as_fitted = {c: reading[c] for c in LEAST_READING_STD if c in reading}  # they are held, too
     for factor in COARSENESS:
         problem.report("the innovations stay coloured: searching again with readings believed less")
-        levels = {channel: factor * std for channel, std in coarser.items()}
+        levels = as_fitted | {channel: factor * std for channel, std in coarser.items()}
         other = _searched(problem, noise.with_levels(levels), coarse=True)
         if not _flies_better(problem, other.fit, best.fit):
             break
