@@ -101,9 +101,12 @@ class Flights:
 
 @pytest.mark.parametrize(
     ("row", "seen"),
-    [(0.01, {}), (0.04, {}), (0.01, {"unlike_gusts": True}),
-     (0.01, {"low_passes": {"p": LowPass(0.01)}}),
-     ],
+    [
+        (0.01, {}),
+        (0.04, {}),
+        (0.01, {"unlike_gusts": True}),
+        (0.01, {"low_passes": {"p": LowPass(0.01)}}),
+    ],
 )
 def test_a_weak_or_late_answer_to_what_the_filter_does_not_see_must_be_worth_more(
     monkeypatch, row, seen

@@ -11,12 +11,14 @@ from numpy.testing import assert_array_equal
 from coax_env.diagnosis import late_rotor_speeds
 from coax_env.diagnosis.late_rotor_speeds import (
     LAG,
+    behind_low_pass,
     come_late,
     with_less_lag,
     without_rotor_speeds,
 )
 from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.low_pass import NONE, LowPass
 from coax_env.estimation.state_space import Noise, Record
 
 CHANNELS = ("rpm_upper", "rpm_lower", "az")
@@ -95,3 +97,27 @@ def test_speeds_come_late_where_nothing_is_left_of_a_lag_or_they_stay_coloured(
     monkeypatch.setattr(late_rotor_speeds, "whiteness", lambda passes, channels: shown)
     problem = problem_of({0.02: 0.0, 0.01: gained * SETTINGS.evidence})
     assert come_late(problem, lag_of(0.02), trial, coloured) == late
+
+
+@pytest.mark.parametrize(
+    ("low_pass", "white", "nats", "taken"),
+    [
+        (LowPass(0.02), True, 15.0, True),
+        (LowPass(0.02), True, 13.0, False),
+        (LowPass(0.02), False, 900.0, False),
+        (NONE, True, 900.0, False),  # other noise levels are likelier, and no low-pass is
+    ],
+)
+def test_a_low_pass_stands_for_a_lag_where_speeds_are_white_behind_it_and_it_is_likelier(
+    monkeypatch, low_pass, white, nats, taken
+):
+    problem = problem_of({0.02: 0.0, 0.0: nats})
+    problem.behind = lambda passes, records: problem
+    monkeypatch.setattr(late_rotor_speeds, "fitted", lambda problem, fit: fit)
+    monkeypatch.setattr(
+        late_rotor_speeds, "likeliest", lambda problem, fit, noise, *rest: (low_pass, noise)
+    )
+    shown = dict.fromkeys(CHANNELS, SimpleNamespace(white=white))
+    monkeypatch.setattr(late_rotor_speeds, "whiteness", lambda passes, channels: shown)
+    found = behind_low_pass(problem, lag_of(0.02), Noise({}))
+    assert found is (problem if taken else None)

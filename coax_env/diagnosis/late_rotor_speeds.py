@@ -15,7 +15,6 @@ rev/min beside, an average over 50 ms, or 20 ms late had a motor lag of 3,900 to
 vertical acceleration denied, and stayed unexplained. So nothing is named on them, and nothing left.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -53,7 +52,7 @@ def with_less_lag(problem: Problem, fit: Fit) -> Fit | None:
     """
     if LAG not in fit.active or problem.aboard.isdisjoint(ROTOR_SPEEDS):
         return None
-    others = _others(problem)
+    others = without_speeds(problem)
     if others.sees_poses_alone or others.has_slow_rows:
         return None
     trial = fitted(others, fit)
@@ -75,16 +74,19 @@ def behind_low_pass(problem: Problem, fit: Fit, noise: Noise) -> Problem | None:
     lag = float(np.mean([fit.values[f.name] for f in problem.own[LAG]]))
     best, most = None, problem.settings.evidence
     for order in ORDERS:
-        behind, nats = _behind(problem, at_once, LowPass(lag, order))
+        found = _behind(problem, at_once, LowPass(lag, order))
+        if found is None:
+            continue
+        behind, nats = found
         problem.report(f"a low-pass in the place of a motor's lag: {nats - logged:.1f} nats")
         if nats - logged > most:
             best, most = behind, nats - logged
     return best
 
 
-def _behind(problem: Problem, trial: Fit, low_pass: LowPass) -> tuple[Problem, float]:
-    """The problem behind a low-pass of the rotor speeds, and the likelihood of what was logged, of
-    none where these are not white then.
+def _behind(problem: Problem, trial: Fit, low_pass: LowPass) -> tuple[Problem, float] | None:
+    """The problem behind a low-pass of the rotor speeds, and the likelihood of what was logged; None
+    where there is none, or these are not white then.
 
     Args:
         problem: with readings as logged. trial: without a motor's lag, which may come to be.
@@ -92,21 +94,19 @@ def _behind(problem: Problem, trial: Fit, low_pass: LowPass) -> tuple[Problem, f
     """
     records, channels = problem.engine.records, problem.model.channels
     read = [channel for channel in ROTOR_SPEEDS if channel in problem.aboard]
-    behind = problem
     for _ in range(TURNS):
-        low_pass, levels = likeliest(
-            problem, trial, trial.noise, read, dict.fromkeys(read, low_pass)
-        )
+        passes = dict.fromkeys(read, low_pass)
+        low_pass, levels = likeliest(problem, trial, trial.noise, read, passes)
+        if low_pass == NONE:
+            return None
         passes = dict.fromkeys(read, low_pass)
         behind = problem.behind(passes, records)
         trial = fitted(behind, replace(trial, noise=levels))
         seen = behind.engine.filter(trial.values, trial.noise)
-        if low_pass == NONE or are_white(whiteness(seen, channels), read):
-            break
-    else:
-        return behind, -math.inf
-    nats = sum(before_low_pass(record, channels, passes)[1] for record in records)
-    return behind, nats + behind.engine.log_likelihood(trial.values, trial.noise)
+        if are_white(whiteness(seen, channels), read):
+            nats = sum(before_low_pass(record, channels, passes)[1] for record in records)
+            return behind, nats + behind.engine.log_likelihood(trial.values, trial.noise)
+    return None
 
 
 def come_late(problem: Problem, fit: Fit, trial: Fit, coloured: bool) -> bool:
@@ -116,7 +116,7 @@ def come_late(problem: Problem, fit: Fit, trial: Fit, coloured: bool) -> bool:
         problem, fit: with the lag. trial: to all other readings.
         coloured: whether rotor speeds stay so with rotors that jitter.
     """
-    others = _others(problem)
+    others = without_speeds(problem)
     shown = whiteness(others.engine.filter(trial.values, trial.noise), problem.model.channels)
     inflation = max((judged.inflation for judged in shown.values()), default=1.0)
     enough = problem.settings.evidence * inflation
@@ -129,7 +129,7 @@ def come_late(problem: Problem, fit: Fit, trial: Fit, coloured: bool) -> bool:
     return fitted(others, at_once).objective - trial.objective < enough
 
 
-def _others(problem: Problem) -> Problem:
+def without_speeds(problem: Problem) -> Problem:
     """The problem without readings of rotor speeds."""
     records = without_rotor_speeds(problem.engine.records, problem.model.channels)
     return problem.with_records(records)

@@ -64,7 +64,7 @@ from coax_env.diagnosis.late_rotor_speeds import (
     behind_low_pass,
     come_late,
     with_less_lag,
-    without_rotor_speeds,
+    without_speeds,
 )
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
@@ -190,15 +190,15 @@ def _with_late_speeds(
     trial = with_less_lag(beside, fit)
     if trial is None:
         return None
-    behind = None if beside is not problem else behind_low_pass(problem, fit, noise)
+    asked = beside is problem and not coloured  # with rotors that jitter, it has been
+    behind = behind_low_pass(problem, fit, noise) if asked else None
     if behind is not None:
         problem.report("searching with rotor speeds as they were before a low-pass")
         return _searched(behind, noise)
     if not come_late(beside, fit, trial, coloured):
         return None
     problem.report("searching without the measured rotor speeds, which come late")
-    records = without_rotor_speeds(problem.engine.records, problem.model.channels)
-    found = _searched(problem.with_records(records), noise)
+    found = _searched(without_speeds(problem), noise)
     own = {f.name: fit.values[f.name] for f in problem.own[LAG]}
     begun = replace(fit.at(found.fit.values).at(own), active=(*found.fit.rest(LAG), LAG))
     again = fitted(beside, begun)
