@@ -18,7 +18,7 @@ from study.one_flight import hide
 
 from coax_env import diagnose, load_vehicle, simulate
 from coax_env.diagnosis import rotor_jitter as asking
-from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.searched import SHOWN_BY
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
@@ -251,17 +251,25 @@ def test_a_record_starts_without_jitter_but_with_its_spread():
     assert not P[N_FULL:].any() and not P[:, N_FULL:].any()
 
 
+def six_seconds() -> tuple[Record, Noise]:
+    """Of a flight without jitter, and levels with it; without the readings that show lift and course."""
+    flight = simulate(LAMA, "yaw_3211", seed=3, sensors="onboard")
+    record = record_of(flight.runs[0])
+    rows = record.t < record.t[0] + 6.0
+    z = record.z[rows].copy()
+    z[:, [CHANNELS.index(channel) for channel in ("az", "vn", "ve", "vd", "h")]] = np.nan
+    short = replace(record, t=record.t[rows], command=record.command[rows], z=z)
+    return short, with_jitter(starting_noise(flight, LAMA), PLAIN)
+
+
 def shaken_for_six_seconds(reaction: float) -> tuple[Engine, Noise]:
     """Measured rotor speeds jitter by 0.6 rad/s for 60 ms, and the body takes it up, made here.
 
     The rest is the air's; the motors return it as fast as it fades. Faster rotors turn the body, too;
     they lift it as well, and its course changes, so nothing is read that shows these.
     """
-    flight = simulate(LAMA, "yaw_3211", seed=3, sensors="onboard")
-    record = record_of(flight.runs[0])
-    rows = record.t < record.t[0] + 6.0
-    z, rng = record.z[rows].copy(), np.random.default_rng(4)
-    z[:, [CHANNELS.index(channel) for channel in ("az", "vn", "ve", "vd", "h")]] = np.nan
+    quiet, noise = six_seconds()
+    z, rng = quiet.z.copy(), np.random.default_rng(4)
     dt, left = 1e-3, math.exp(-1e-3 / 0.06)
     jitter, back, angle = 0.6 * rng.standard_normal(2), 0.0, 0.0
     for row in z:
@@ -273,8 +281,7 @@ def shaken_for_six_seconds(reaction: float) -> tuple[Engine, Noise]:
             back += dt * turned_by_torque(*jitter)
             back -= dt * (1.0 - reaction) * taken_up(*jitter) / 0.06
             jitter = left * jitter + math.sqrt(1.0 - left**2) * 0.6 * rng.standard_normal(2)
-    short = replace(record, t=record.t[rows], command=record.command[rows], z=z)
-    return Engine(MODEL, [short]), with_jitter(starting_noise(flight, LAMA), PLAIN)
+    return Engine(MODEL, [replace(quiet, z=z)]), noise
 
 
 @pytest.fixture(scope="module")
@@ -332,6 +339,19 @@ def test_a_planted_level_and_memory_return(engine_and_noise):
     found = fit_noise(engine, engine.model.bare_values, noise, fitted_levels(noise), 20, 0.1)
     assert found.level(JITTER_LEVEL) == pytest.approx(0.6, rel=0.15)
     assert found.level(JITTER_MEMORY) == pytest.approx(0.06, rel=0.35)
+
+
+def test_jitter_of_one_run_alone_is_seen(engine_and_noise):
+    """Also where the noise of a search is fitted on another one: on the first of three here."""
+    (shaken,), noise = engine_and_noise[0].records, engine_and_noise[1]
+    quiet, _ = six_seconds()
+    wider = Problem.of(MODEL, [quiet, shaken, quiet])
+    wider = replace(wider, base=(), settings=replace(SETTINGS, noise_fit_seconds=1.0))
+    levels = tuple(n for n in fitted_levels(noise) if n not in (JITTER_LEVEL, JITTER_MEMORY))
+    plain = noise.with_levels({JITTER_LEVEL: noise.floor[JITTER_LEVEL]})
+    fit = Fit((), MODEL.bare_values, plain, levels)
+    found = asking._fitted(wider, fit, asking.LEFT_BESIDE)
+    assert found.noise.level(JITTER_LEVEL) == pytest.approx(0.6 / math.sqrt(3.0), rel=0.3)
 
 
 @pytest.mark.parametrize(
