@@ -252,7 +252,7 @@ def test_a_record_starts_without_jitter_but_with_its_spread():
 
 
 def six_seconds() -> tuple[Record, Noise]:
-    """Of a flight without jitter, and levels with it; without the readings that show lift and course."""
+    """Of a flight without jitter, and levels with it; no reading shows lift or course."""
     flight = simulate(LAMA, "yaw_3211", seed=3, sensors="onboard")
     record = record_of(flight.runs[0])
     rows = record.t < record.t[0] + 6.0
@@ -316,6 +316,22 @@ def test_of_two_summits_the_higher_one_is_taken_and_never_a_lower_share(begun, s
     assert found.level(JITTER_RETURN) == LEVELS.level(JITTER_MEMORY)  # no motor lags
     late = asking._taken_up(wider, fit.at({"motor_lag.upper": 0.06, "motor_lag.lower": 0.1}))
     assert late.noise.level(JITTER_RETURN) == pytest.approx(0.08)
+
+
+def test_the_motors_share_is_asked_again_without_gyros_that_stand_for_it(engine_and_noise):
+    """They scale by 15 % beside a share of 0.8; the true one is 1, and nothing else starts anew."""
+    engine, noise = engine_and_noise
+    problem = replace(Problem.of(MODEL, engine.records, ["gyro_scale"]), base=())
+    begun = noise.with_levels({JITTER_REACTION: 0.8, JITTER_RETURN: 0.3})
+    stands = begun.with_levels({JITTER_LEVEL: 0.6, JITTER_MEMORY: 0.06})
+    levels = tuple(fitted_levels(noise))
+    scaled = Fit(("gyro_scale",), MODEL.bare_values | {"gyro_scale.z": 0.15}, stands, levels)
+    found = asking.with_share_anew(problem, scaled, begun)
+    assert found.level(JITTER_REACTION) == pytest.approx(1.0, abs=0.15)
+    kept = {name: noise.level(name) for name in (JITTER_REACTION, JITTER_RETURN)}
+    assert found.with_levels(kept) == begun.with_levels(kept) != found
+    plain = Noise({"force_xy": 0.1})
+    assert asking.with_share_anew(problem, scaled, plain) is plain  # no jitter, no share
 
 
 def test_slopes_in_level_and_memory_are_those_of_the_likelihood(engine_and_noise):

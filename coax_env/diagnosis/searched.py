@@ -21,7 +21,8 @@ Where gyros or accelerometers are read through a low-pass (sensor_low_pass.py) i
 what was before it. This comes next: errors that last would take a part of it up. Where errors of
 readings last (sensor_errors.py) it is done again with these in it; where inertial sensors stay coloured
 behind a low-pass, without it too, and that stands if it is likelier and has no name more: errors of
-every memory at once look like a low-pass. Low-passes are then fitted once more. Where inertial sensors
+every memory at once look like a low-pass. Low-passes are then fitted once more. What motors make of
+jitter is asked anew for readings as they are then. Where inertial sensors
 stay coloured in the end, with gusts as they are, readings as logged are asked in these gusts too: a
 swing looks like a low-pass.
 
@@ -69,7 +70,7 @@ from coax_env.diagnosis.late_rotor_speeds import (
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
 from coax_env.diagnosis.problem import OF_ROTORS, Fit, Problem
-from coax_env.diagnosis.rotor_jitter import in_jitter
+from coax_env.diagnosis.rotor_jitter import in_jitter, share_of, with_share_anew
 from coax_env.diagnosis.run_air import with_own_air
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import added, search
@@ -159,18 +160,21 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     first = _with_clock_errors(_with_own_air(first, noise), noise)
     problem = first.problem
     smoothed = _before_low_passes(first, noise)
-    best, begun = _with_errors(smoothed or first, noise, clock)
+    of_smoothed = share_of(smoothed.fit, noise) if smoothed is not None else noise
+    best, begun = _with_errors(smoothed or first, of_smoothed, clock)
+    erring = begun is not of_smoothed
     if smoothed is not None and _is_coloured(best, INERTIAL):
         other, begun_so = _with_errors(first, noise, clock)
         no_more = set(other.fit.active) <= set(best.fit.active)
         if other is not first and no_more and _lost(problem, other) < _lost(problem, best):
-            best, begun = other, begun_so
-    if begun is not noise and best.changing is None:
+            best, begun, erring = other, begun_so, True
+    if erring and best.changing is None:
         best = _behind_other_low_passes(problem, best, begun)
+        begun = share_of(best.fit, begun)
     if best.changing is not None:
         return best
-    found = _in_unrest(best, begun, clock, erring=begun is not noise)
-    if found.problem.smoothed and begun is noise and _is_coloured(found, INERTIAL):
+    found = _in_unrest(best, begun, clock, erring)
+    if found.problem.smoothed and not erring and _is_coloured(found, INERTIAL):
         return _without_low_passes(first, found, noise, clock)
     return found
 
@@ -266,7 +270,8 @@ def _searched_before(
     asked = set(problem.candidates) - hidden_behind(passes, found.fit, problem)
     others = {c: own for c, own in problem.low_passes.items() if c not in INERTIAL}
     behind = replace(problem, low_passes=others).behind(passes, logged)
-    return _searched(behind.of_candidates(asked), noise)
+    begun = with_share_anew(behind, found.fit, noise)
+    return _searched(behind.of_candidates(asked), begun)
 
 
 def _with_errors(found: Searched, noise: Noise, clock: Mapping[str, Lap]) -> tuple[Searched, Noise]:
@@ -286,7 +291,8 @@ def _with_errors(found: Searched, noise: Noise, clock: Mapping[str, Lap]) -> tup
     if changed is not None:
         return changed, noise
     erring.problem.report("searching again with errors of readings that last")
-    return _likelier(_searched(erring.problem, erring.begun), erring.fit), erring.begun
+    begun = with_share_anew(erring.problem, erring.fit, erring.begun)
+    return _likelier(_searched(erring.problem, begun), erring.fit), begun
 
 
 def _behind_other_low_passes(problem: Problem, found: Searched, noise: Noise) -> Searched:
