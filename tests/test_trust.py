@@ -487,13 +487,15 @@ def test_a_change_that_a_shock_may_have_made_has_no_name_with_one_thing_more(
 
 
 @pytest.mark.parametrize(
-    ("nats", "of_moment", "named"),
-    [(27.0, 21.0, False), (29.0, 21.0, True), (27.0, 43.0, True), (27.0, math.inf, True)],
-)
-def test_what_changed_in_flight_by_little_has_no_name(nats, of_moment, named):
-    """A centre of gravity that moved by 0.8 mm (**synthetic**, clean); what was always so has its
-    own threshold, and a moment may be clear where the cause is weak."""
-    of = known_of(nats=nats, of_moment=of_moment)
+    ("nats", "of_moment", "poses_alone", "named"),
+    [(27.0, 21.0, False, False), (29.0, 21.0, False, True), (27.0, 43.0, False, True),
+     (27.0, math.inf, False, True), (33.0, 21.0, True, False), (43.0, 21.0, True, True),
+     (33.0, 43.0, True, True), (33.0, math.inf, True, True)],
+)  # fmt: skip
+def test_what_changed_in_flight_by_little_has_no_name(nats, of_moment, poses_alone, named):
+    """A centre of gravity that moved by 0.8 mm, by poses alone a swash offset (**synthetic**, clean);
+    what was always so has its own threshold, and a moment may be clear where the cause is weak."""
+    of = known_of(nats=nats, of_moment=of_moment, poses_alone=poses_alone)
     assert without_name({"cg_offset": of}, SETTINGS) == (set() if named else {"cg_offset"})
 
 

@@ -4,7 +4,7 @@ What stands at the limit of what is believed and is not determined, or does not 
 or on parts of the flights, stands for something else; so does what the readings of a channel that
 should show it are likelier without. What changed in flight, by little evidence, has
 no name: a hub stiffness, a servo's delay and a centre of gravity did on three clean **synthetic**
-flights, for 18 to 27 nats. Two of these take a name, too: noise left where it shows, little evidence
+flights, for 18 to 27 nats, and by poses alone a swash offset for 33. Two of these take a name, too: noise left where it shows, little evidence
 there or by poses alone, other noise, parts of the flights, such a one beside it, numbers of which none
 is known to be another than nothing, held-out runs that the model flies worse with the causes and that
 are likelier without it, a share of what all causes explain that their forms may be wrong by where the
@@ -104,8 +104,9 @@ class Against:
         return self.of_moment < chosen.sure_evidence
 
     def is_little_change(self, chosen: Settings) -> bool:
-        """Whether that is so, and it is worth little itself."""
-        return self.may_have_been_constant(chosen) and self.nats < chosen.change_evidence
+        """Whether that is so, and it is worth little itself; by poses alone no less than that is."""
+        least = chosen.sure_evidence if self.poses_alone else chosen.change_evidence
+        return self.may_have_been_constant(chosen) and self.nats < least
 
     def may_be_shock(self, chosen: Settings) -> bool:
         """Whether that is so where gusts come in single shocks."""

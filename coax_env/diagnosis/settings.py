@@ -30,8 +30,9 @@ class Settings:
     worth 47 to 58 nats before, a play or a motor lag; three plays of 45 to 62 had had a name."""
     change_evidence: float = 28.0
     """nats that a cause must be worth to have a name where that it began, ended or changed in flight is
-    worth less than `sure_evidence`: any effect could have, at any moment. Measured: three of some 600
-    clean flights had such a cause, of 18, 26 and 27."""
+    worth less than `sure_evidence`: any effect could have, at any moment. By poses alone that much is
+    asked of the cause, too. Measured: three of some 600 clean flights had such a cause, of 18, 26 and
+    27, and by poses alone another, of 33 (`--arms mixed_poses`, seed 798, clean 55)."""
     tie: float = 6.0
     """nats within which alternatives are confounded: odds of 400 to 1, ours."""
     form_share: float = 0.1
