@@ -82,9 +82,10 @@ PURE_DELAYS = frozenset({"command_delay", "servo_delay"})
 """Of these those that are a constant time."""
 
 OF_ROTORS = frozenset({
-    "motor_lag", "motor_droop", "command_delay", "battery_sag", "battery_voltage",
+    "motor_lag", "motor_droop", "command_delay", "battery_sag", "battery_voltage", "spin_up_reaction",
 })  # fmt: skip
-"""Effects that part a rotor's speed from its command."""
+"""Effects that part a rotor's speed from its command, and what the body takes up of it at once: without
+that a yaw rate denies a motor's lag, and jitter takes its place."""
 
 T = TypeVar("T")
 

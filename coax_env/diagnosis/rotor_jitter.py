@@ -41,8 +41,6 @@ LOOKED_AT = (0.4, 1.0)
 """Shares that motors make of it between which the likelihood may have two summits: on a flight of
 another simulator (`tests/blade_element.py`, **synthetic**), whose air shakes the rotors, one at 0.07
 and one at 2, 1,064 nats lower, with a spin-up reaction of 1.48 +- 0.10 for 1; ours."""
-BESIDE = OF_ROTORS | {"spin_up_reaction"}
-"""Effects beside which the motors' share is asked for again: the body takes these up, too."""
 WITHIN = 0.05
 """Of the body's share of the rotors' angular momentum, to which it is looked for; ours."""
 
@@ -80,7 +78,7 @@ def with_share_anew(problem: Problem, fit: Fit, noise: Noise) -> Noise:
     """
     if JITTER_LEVEL not in noise.process:
         return noise
-    beside = tuple(effect for effect in fit.active if effect in BESIDE)
+    beside = tuple(effect for effect in fit.active if effect in OF_ROTORS)
     off: dict[str, float] = {}
     for effect in set(fit.active) - set(beside):
         off |= problem.off_values(effect) | problem.file_values(effect)
