@@ -2,13 +2,13 @@
 
 What stands at the limit of what is believed and is not determined, or does not hold under other noise
 or on parts of the flights, stands for something else; so does what the readings of a channel that
-should show it are likelier without. What changed in flight, by little evidence, has
-no name: a hub stiffness, a servo's delay and a centre of gravity did on three clean **synthetic**
-flights, for 18 to 27 nats, and by poses alone a swash offset for 33. Two of these take a name, too:
-noise left where it shows, little evidence there or by poses alone, other noise, parts of the flights, such a one beside it, numbers of which none
-is known to be another than nothing, held-out runs that the model flies worse with the causes and that
-are likelier without it, a share of what all causes explain that their forms may be wrong by where the
-control loop oscillates, a change in flight that a single shock may have made.
+should show it are likelier without. What changed in flight, by little evidence, has no name: a hub
+stiffness, a servo's delay and a centre of gravity did on three clean **synthetic** flights, for 18 to
+27 nats, and by poses alone a swash offset for 33. Two of these take a name, too: noise left where it
+shows, little evidence there or by poses alone, other noise, parts of the flights, such a one beside it,
+numbers of which none is known to be another than nothing, held-out runs that the model flies worse with
+the causes and that are likelier without it, a share of what all causes explain that their forms may be
+wrong by where the control loop oscillates, a change in flight that a single shock may have made.
 """
 
 import math

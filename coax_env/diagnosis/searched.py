@@ -22,9 +22,8 @@ what was before it. This comes next: errors that last would take a part of it up
 readings last (sensor_errors.py) it is done again with these in it; where inertial sensors stay coloured
 behind a low-pass, without it too, and that stands if it is likelier and has no name more: errors of
 every memory at once look like a low-pass. Low-passes are then fitted once more. What motors make of
-jitter is asked anew for readings as they are then. Where inertial sensors
-stay coloured in the end, with gusts as they are, readings as logged are asked in these gusts too: a
-swing looks like a low-pass.
+jitter is asked anew for readings as they are then. Where inertial sensors stay coloured in the end,
+with gusts as they are, readings as logged are asked in these gusts too: a swing looks like a low-pass.
 
 Where runs have air of their own (run_air.py) it is done again in that: after the first search, since
 noise of one level makes many names, and once more here.
