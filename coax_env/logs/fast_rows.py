@@ -1,10 +1,11 @@
 """Logs with more rows than a body of this size moves by: fewer rows, and nothing lost.
 
-A fit costs so much for every row, and 500 rows a second tell nothing of a flight that their means
-over a hundredth of a second do not. So rows are kept every hundredth of a second, and besides all rows
-with a reading of a sensor slower than the log, untouched. Of a sensor with a reading in every row the
-mean around a kept row stands there, over as much time before as after: what changes evenly stays as it
-is. Of a command the mean of what was held until the next kept row stands, whose effect is the same.
+A fit costs so much for every row, and 500 rows a second tell nothing of a flight that their means over
+a hundredth of a second do not. So rows are kept every hundredth of a second, and besides all rows with
+a reading of a sensor slower than the log, untouched. Of a sensor with a reading in every row the mean
+of the rows around a kept row stands there, at that row's time: what changes evenly stays as it is, and
+white noise white. Of a command the mean of what was held until the next kept row stands, whose effect
+is the same.
 """
 
 import math
@@ -105,8 +106,8 @@ def _kept_rows(count: int, factor: int, needed: np.ndarray) -> np.ndarray:
 def _means(channel: str, values: np.ndarray, t: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """Means around the rows kept, at the times of these.
 
-    Where rows are uneven the mean of their times is another one: a millisecond beside it is 3 mm at
-    3 m/s.
+    Where rows are uneven, or of an even number, the mean of their times is another one: a millisecond
+    beside it is 3 mm at 3 m/s.
     """
     there = np.flatnonzero(np.isfinite(values))
     smooth = values.copy()
@@ -121,24 +122,21 @@ def _means(channel: str, values: np.ndarray, t: np.ndarray, kept: np.ndarray) ->
 
 
 def _around(values: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Means around the rows kept, as far as half the way to the nearer neighbour on either side.
+    """Means of the rows next to those kept, each row in one mean alone.
 
-    A row half way belongs to both by half.
+    As many on either side as half the way to the nearer neighbour has; where that is a row itself, it
+    belongs to the row kept after it. Taken by half into both means it made neighbours' noise alike by
+    a sixth at 200 to 299 rows a second: innovations stayed coloured, and readings were believed less.
     """
     finite = np.isfinite(values)
     sums = np.append(0.0, np.cumsum(np.where(finite, values, 0.0)))
     counts = np.append(0, np.cumsum(finite))
     apart = np.diff(kept)
     spacing = np.minimum(np.append(apart[:1], apart), np.append(apart, apart[-1:]))
-    half, even = spacing // 2, (spacing % 2 == 0) & (spacing > 0)
-    first, last = kept - half, kept + half
-    total = sums[last + 1] - sums[first]
-    weight = (counts[last + 1] - counts[first]).astype(float)
-    for end in (first, last):
-        total -= np.where(even, 0.5 * np.where(finite[end], values[end], 0.0), 0.0)
-        weight -= np.where(even, 0.5 * finite[end], 0.0)
+    first, behind = kept - spacing // 2, kept + (spacing + 1) // 2
+    weight = (counts[behind] - counts[first]).astype(float)
     found = np.full(kept.size, np.nan)
-    np.divide(total, weight, out=found, where=weight > 0.0)
+    np.divide(sums[behind] - sums[first], weight, out=found, where=weight > 0.0)
     return found
 
 
