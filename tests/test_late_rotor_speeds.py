@@ -60,7 +60,14 @@ def test_readings_of_rotor_speeds_alone_are_left_out():
     [
         (3.1, 0.01, (LAG,), CHANNELS, False, True),
         (2.9, 0.01, (LAG,), CHANNELS, False, False),  # by chance
-        (50.0, 0.04, (LAG,), CHANNELS, False, False),  # thrust later than speeds: no sensor does that
+        (
+            50.0,
+            0.04,
+            (LAG,),
+            CHANNELS,
+            False,
+            False,
+        ),  # thrust later than speeds: no sensor does that
         (50.0, 0.01, ("wind",), CHANNELS, False, False),
         (50.0, 0.01, (LAG,), ("az",), False, False),  # no speed is read
         (50.0, 0.01, (LAG,), ("rpm_upper",), False, False),  # no accelerometer or gyro is
@@ -119,5 +126,25 @@ def test_a_low_pass_stands_for_a_lag_where_speeds_are_white_behind_it_and_it_is_
     )
     shown = dict.fromkeys(CHANNELS, SimpleNamespace(white=white))
     monkeypatch.setattr(late_rotor_speeds, "whiteness", lambda passes, channels: shown)
-    found = behind_low_pass(problem, lag_of(0.02), Noise({}))
+    found = behind_low_pass(problem, lag_of(0.02), lag_of(0.0), Noise({}))
     assert found is (problem if taken else None)
+
+
+@pytest.mark.parametrize(
+    ("by_others", "lag", "time"),
+    [(0.0, 0.0, 0.08), (0.03, 0.0, 0.08), (0.05, 0.05, 0.03), (0.075, 0.075, 0.01)],
+)
+def test_a_low_pass_is_looked_for_beside_the_lag_that_all_other_readings_have(
+    monkeypatch, by_others, lag, time
+):
+    """From the time that is left, a row at least; where they have less than half, in its place."""
+    begun = []
+
+    def behind(problem: Any, trial: Fit, low_pass: LowPass) -> None:
+        begun.append((trial.values[OWN[0].name], round(low_pass.time, 9), low_pass.order))
+
+    monkeypatch.setattr(late_rotor_speeds, "_behind", behind)
+    problem = problem_of({0.08: 0.0})
+    problem.row = 0.01
+    assert behind_low_pass(problem, lag_of(0.08), lag_of(by_others), Noise({})) is None
+    assert begun == [(lag, time, 1), (lag, time, 2)]

@@ -194,7 +194,7 @@ def _with_late_speeds(
     if trial is None:
         return None
     asked = beside is problem and not coloured  # with rotors that jitter, it has been
-    behind = behind_low_pass(problem, fit, noise) if asked else None
+    behind = behind_low_pass(problem, fit, trial, noise) if asked else None
     if behind is not None:
         problem.report("searching with rotor speeds as they were before a low-pass")
         return _searched(behind, noise)
