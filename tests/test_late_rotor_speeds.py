@@ -126,25 +126,27 @@ def test_a_low_pass_stands_for_a_lag_where_speeds_are_white_behind_it_and_it_is_
     )
     shown = dict.fromkeys(CHANNELS, SimpleNamespace(white=white))
     monkeypatch.setattr(late_rotor_speeds, "whiteness", lambda passes, channels: shown)
+    monkeypatch.setattr(late_rotor_speeds, "show_lag", lambda problem, trial: False)
     found = behind_low_pass(problem, lag_of(0.02), lag_of(0.0), Noise({}))
     assert found is (problem if taken else None)
 
 
 @pytest.mark.parametrize(
-    ("by_others", "lag", "time"),
-    [(0.0, 0.0, 0.08), (0.03, 0.0, 0.08), (0.05, 0.05, 0.03), (0.075, 0.075, 0.01)],
+    ("by_others", "shown", "beside"),
+    [(0.05, False, []), (0.05, True, [(0.05, 0.03)]), (0.075, True, [(0.075, 0.01)])],
 )
-def test_a_low_pass_is_looked_for_beside_the_lag_that_all_other_readings_have(
-    monkeypatch, by_others, lag, time
+def test_a_low_pass_is_looked_for_beside_the_lag_that_all_other_readings_show(
+    monkeypatch, by_others, shown, beside
 ):
-    """From the time that is left, a row at least; where they have less than half, in its place."""
+    """In the place of the lag, and beside theirs from the time that is left, a row at least."""
     begun = []
 
     def behind(problem: Any, trial: Fit, low_pass: LowPass) -> None:
         begun.append((trial.values[OWN[0].name], round(low_pass.time, 9), low_pass.order))
 
     monkeypatch.setattr(late_rotor_speeds, "_behind", behind)
+    monkeypatch.setattr(late_rotor_speeds, "show_lag", lambda problem, trial: shown)
     problem = problem_of({0.08: 0.0})
     problem.row = 0.01
     assert behind_low_pass(problem, lag_of(0.08), lag_of(by_others), Noise({})) is None
-    assert begun == [(lag, time, 1), (lag, time, 2)]
+    assert begun == [(*at, order) for at in [(0.0, 0.08), *beside] for order in (1, 2)]

@@ -17,6 +17,7 @@ vertical acceleration denied, and stayed unexplained. So nothing is named on the
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -33,8 +34,6 @@ LAG = "motor_lag"
 LEAST = 3.0
 """nats by which other readings must be likelier with less of a lag, or no more is asked; chance reaches
 it once in 40 flights whose rotors lag."""
-MOST_OF_LAG = 0.5
-"""Share of a lag from which, if all other readings have it, motors are taken to lag; ours."""
 ORDERS = (1, 2)
 """Of low-passes that are tried."""
 TURNS = 2
@@ -67,8 +66,9 @@ def with_less_lag(problem: Problem, fit: Fit) -> Fit | None:
 def behind_low_pass(problem: Problem, fit: Fit, trial: Fit, noise: Noise) -> Problem | None:
     """The problem with rotor speeds as they were before a low-pass, where that is what makes them late.
 
-    Beside the lag that the other readings have, where they have most of it: a low-pass of 8 Hz beside a
-    lag of 0.17 s, taken for one low-pass, was not found (**synthetic**; a command delay stood for it).
+    In the place of the lag, and, where the other readings show one, beside theirs: a low-pass of 8 Hz
+    beside a lag of 0.17 s, taken for one low-pass, was not found (**synthetic**; a command delay stood
+    for it).
 
     Args:
         problem, fit: with readings as logged, and a motor's lag. trial: to all other readings.
@@ -78,12 +78,11 @@ def behind_low_pass(problem: Problem, fit: Fit, trial: Fit, noise: Noise) -> Pro
     lag, own = (
         float(np.mean([at.values[f.name] for f in problem.own[LAG]])) for at in (fit, trial)
     )
-    if own > MOST_OF_LAG * lag:
-        begun, time = trial, max(lag - own, problem.row)
-    else:
-        begun, time = fit.at(problem.off_values(LAG)), lag
+    starts = [(fit.at(problem.off_values(LAG)), lag)]
+    if show_lag(problem, trial):
+        starts.append((trial, max(lag - own, problem.row)))
     best, most = None, problem.settings.evidence
-    for order in ORDERS:
+    for (begun, time), order in product(starts, ORDERS):
         found = _behind(problem, replace(begun, noise=noise), LowPass(time, order))
         if found is None:
             continue
@@ -127,16 +126,28 @@ def come_late(problem: Problem, fit: Fit, trial: Fit, coloured: bool) -> bool:
         coloured: whether rotor speeds stay so with rotors that jitter.
     """
     others = without_speeds(problem)
-    shown = whiteness(others.engine.filter(trial.values, trial.noise), problem.model.channels)
-    inflation = max((judged.inflation for judged in shown.values()), default=1.0)
-    enough = problem.settings.evidence * inflation
-    if _gained(others, fit, trial) < enough:
+    if _gained(others, fit, trial) < _enough(others, trial):
         return False
-    if coloured:
-        return True
+    return coloured or not show_lag(problem, trial)
+
+
+def show_lag(problem: Problem, trial: Fit) -> bool:
+    """Whether all readings but rotor speeds show a motor's lag, by the threshold.
+
+    Args:
+        problem: with all readings. trial: the fit to the others.
+    """
+    others = without_speeds(problem)
     off = problem.off_values(LAG) | problem.file_values(LAG)
     at_once = replace(trial.at(off), active=trial.rest(LAG))
-    return fitted(others, at_once).objective - trial.objective < enough
+    return fitted(others, at_once).objective - trial.objective >= _enough(others, trial)
+
+
+def _enough(others: Problem, trial: Fit) -> float:
+    """nats that other readings must say, by how coloured these are."""
+    shown = whiteness(others.engine.filter(trial.values, trial.noise), others.model.channels)
+    inflation = max((judged.inflation for judged in shown.values()), default=1.0)
+    return others.settings.evidence * inflation
 
 
 def without_speeds(problem: Problem) -> Problem:
