@@ -121,6 +121,11 @@ SENSORS = {
         {"phi": 0.01, "theta": 0.01, "psi": 0.01, "pn": 0.003, "pe": 0.003, "h": 0.004}, step=0.01,
         every_row=(3,), formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"),
     ),
+    "two_hundred": Sensors(NOISE, step=0.005, formats={"t": "%.5f"}),
+    "pose_two_hundred": Sensors(
+        {c: 5.0 * std for c, std in POSE.items()}, step=0.005,
+        formats=dict.fromkeys(("t", "h", "pn", "pe"), "%.5f"),
+    ),
     "coarse": Sensors(NOISE, quanta={c: 2.0 * std for c, std in NOISE.items()}),
     "spiky": Sensors(NOISE, outliers=0.003),
     "smooth": Sensors(  # as the low-pass of an inertial sensor is often set

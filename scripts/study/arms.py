@@ -90,6 +90,10 @@ ARMS = {
     "fused": Arm("attitudes, velocities and height of an onboard filter", sensors=("fused",)),
     "stamped": Arm("logged times wrong by 2 ms", sensors=("stamped",)),
     "fast": Arm("gyros and accelerometers at 500 Hz", sensors=("fast",)),
+    "two_hundred": Arm("200 rows a second of all sensors", sensors=("two_hundred",)),
+    "pose_two_hundred": Arm(
+        "CoaX class, a motion capture at 200 Hz", sensors=("pose_two_hundred",), craft="coax"
+    ),
     "resampled": Arm("readings of 10-50 Hz on one clock by straight lines", sensors=("resampled",)),
     "held": Arm("readings of 10-50 Hz, each written again until the next", sensors=("held",)),
     "fifty": Arm("every second row of 100 Hz", sensors=("fifty",)),
