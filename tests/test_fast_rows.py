@@ -1,5 +1,6 @@
 """Logs of many rows a second: what their means keep, in closed form, and what is found in them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from injector_sensors import FAST, SENSORS
 import coax_env
 from coax_env.logs.fast_rows import ENOUGH_RATE, decimated
 from coax_env.logs.flight import Flight, Run, read_flight
+from coax_env.model.layout import RPM_PER_RAD_S
 
 RNG = np.random.default_rng(3)
 
@@ -118,6 +120,22 @@ def test_commands_bring_the_same_in_all():
     after = np.vstack([np.zeros(4), np.cumsum(run.command[:-1] * np.diff(run.t)[:, None], axis=0)])
     np.testing.assert_allclose(after, before - before[0], atol=1e-12)
     np.testing.assert_array_equal(run.command[-1], whole.command[rows[-1]])
+
+
+@pytest.mark.parametrize("slow", [0, 7])
+@pytest.mark.parametrize("rate", [200.0, 400.0, 500.0])
+def test_a_speed_that_follows_at_once_stays_that_of_its_command(rate, slow):
+    """Commands that change in every row: a mean of other rows was coloured, and thrust seemed to follow
+    the speed less. What lags does not jump, and stands at its row's time as all else."""
+    t = times(rate)
+    seldom = {"h": np.where(np.arange(t.size) % slow == 0, 1.0, np.nan)} if slow else {}
+    flight = log(rate, rpm_lower=2000.0 + 100.0 * t, **seldom)
+    at_once = RPM_PER_RAD_S * flight.runs[0].command[:, 0]
+    (run,) = flight.runs
+    run = replace(run, measured={**run.measured, "rpm_upper": at_once})
+    found = decimated(replace(flight, runs=(run,))).runs[0]
+    np.testing.assert_allclose(found.measured["rpm_upper"], RPM_PER_RAD_S * found.command[:, 0])
+    np.testing.assert_allclose(found.measured["rpm_lower"], 2000.0 + 100.0 * found.t, rtol=1e-12)
 
 
 def test_what_was_done_is_said():
