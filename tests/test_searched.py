@@ -768,17 +768,18 @@ def test_one_shock_may_be_what_changed_in_flight(monkeypatch, shock, onsets, sha
 
 
 @pytest.mark.parametrize(
-    ("white", "names", "lost", "taken"),
+    ("white", "names", "lost", "erring", "taken"),
     [
-        (True, (), 10.0, "behind"),
-        (False, (), 10.0, "without"),  # errors of every memory look like a low-pass
-        (False, (), 90.0, "behind"),
-        (False, ("thrust_exponent",), 10.0, "behind"),  # likelier by a name alone
-        (False, ("wind",), 10.0, "without"),
+        (True, (), 10.0, True, "behind"),
+        (False, (), 10.0, True, "without"),  # errors of every memory look like a low-pass
+        (False, (), 10.0, False, "without"),  # such errors are told, and not in the model
+        (False, (), 90.0, True, "behind"),
+        (False, ("thrust_exponent",), 10.0, True, "behind"),  # likelier by a name alone
+        (False, ("wind",), 10.0, True, "without"),
     ],
 )
 def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
-    monkeypatch, white, names, lost, taken
+    monkeypatch, white, names, lost, erring, taken
 ):
     """Where gyros and accelerometers stay coloured behind it, and nothing more is named."""
     levels, wider = Noise({}, {"phi": 0.1}), Noise({"error_gyros": 0.1}, {"phi": 0.1})
@@ -794,7 +795,9 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: behind)
     monkeypatch.setattr(
         searched, "_with_errors",
-        lambda found, noise, clock: (found if found is behind else without, wider),
+        lambda found, noise, clock: (
+            (behind, wider) if found is behind else (without, wider if erring else noise)
+        ),
     )  # fmt: skip
     monkeypatch.setattr(
         searched, "_is_coloured", lambda found, channels: "ax" in channels and not white
@@ -815,7 +818,7 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     monkeypatch.setattr(searched, "_in_unrest", in_unrest)
     found = searched.searched("as given", levels, {})  # type: ignore[arg-type]
     assert found.problem.name == taken  # type: ignore[attr-defined]
-    assert asked == ["again", (True, True)]
+    assert asked == (["again", (True, True)] if erring else [(False, False)])
 
 
 HAD = {"p": LowPass(0.01)}

@@ -166,7 +166,7 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         other, begun_so = _with_errors(first, noise, clock)
         no_more = set(other.fit.active) <= set(best.fit.active)
         if other is not first and no_more and _lost(problem, other) < _lost(problem, best):
-            best, begun, erring = other, begun_so, True
+            best, begun, erring = other, begun_so, begun_so is not noise
     if erring and best.changing is None:
         best = _behind_other_low_passes(problem, best, begun)
         begun = share_of(best.fit, begun)
