@@ -21,6 +21,8 @@ FAST = ("rpm_upper", "rpm_lower", "p", "q", "r", "ax", "ay", "az")
 
 POSE = {"phi": 1.4e-3, "theta": 1.6e-3, "psi": 8e-4, "pn": 1e-4, "pe": 1e-4, "h": 2e-4}
 """What third differences of the real CoaX flights show: rad and m."""
+LAB_POSE = {channel: 5.0 * std for channel, std in POSE.items()}
+"""Of a motion capture that is coarser."""
 
 FLICKERS = (0.03, 0.3, 3.0, 30.0)
 """s, memories of an error that is equal in each decade."""
@@ -109,11 +111,11 @@ SENSORS = {
     ),
     "fifty": Sensors(NOISE, every_row=(2,)),
     "pose_steadied": Sensors(  # by the motion capture's own software
-        {c: 5.0 * std for c, std in POSE.items()}, step=0.01,
+        LAB_POSE, step=0.01,
         steadied=dict.fromkeys(POSE, 10.0), formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"),
     ),
     "lab": Sensors(  # poses of a motion capture, and what is on board
-        {c: std for c, std in NOISE.items() if c in FAST} | {c: 5.0 * std for c, std in POSE.items()},
+        {c: std for c, std in NOISE.items() if c in FAST} | LAB_POSE,
         formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"),
     ),
     "inertial": Sensors({c: std for c, std in NOISE.items() if c in (*FAST, "h")}),
@@ -123,8 +125,7 @@ SENSORS = {
     ),
     "two_hundred": Sensors(NOISE, step=0.005, formats={"t": "%.5f"}),
     "pose_two_hundred": Sensors(
-        {c: 5.0 * std for c, std in POSE.items()}, step=0.005,
-        formats=dict.fromkeys(("t", "h", "pn", "pe"), "%.5f"),
+        LAB_POSE, step=0.005, formats=dict.fromkeys(("t", "h", "pn", "pe"), "%.5f")
     ),
     "coarse": Sensors(NOISE, quanta={c: 2.0 * std for c, std in NOISE.items()}),
     "spiky": Sensors(NOISE, outliers=0.003),

@@ -254,7 +254,7 @@ def test_what_has_become_too_small_leaves_whatever_a_refit_without_it_says(monke
     flights = Flights({"gyro_bias": CLEAR, "hub_stiffness": PLAIN})
     small = {"hub_stiffness"}
     monkeypatch.setattr(evidence, "is_large", lambda problem, effect, values: effect not in small)
-    monkeypatch.setattr(evidence, "_only", lambda problem, fit, kept: replace(fit, active=kept))
+    monkeypatch.setattr(evidence, "only", lambda problem, fit, kept: replace(fit, active=kept))
     fit, found = flights.pruned(monkeypatch, GOOD)
     assert fit.active == ("gyro_bias",) and set(found) == {"gyro_bias"}
     assert fit.history == (("- hub_stiffness", 0.0),)

@@ -11,6 +11,7 @@ from numpy.testing import assert_array_equal
 from coax_env.diagnosis import late_rotor_speeds
 from coax_env.diagnosis.late_rotor_speeds import (
     LAG,
+    ByOthers,
     behind_low_pass,
     come_late,
     with_less_lag,
@@ -60,14 +61,7 @@ def test_readings_of_rotor_speeds_alone_are_left_out():
     [
         (3.1, 0.01, (LAG,), CHANNELS, False, True),
         (2.9, 0.01, (LAG,), CHANNELS, False, False),  # by chance
-        (
-            50.0,
-            0.04,
-            (LAG,),
-            CHANNELS,
-            False,
-            False,
-        ),  # thrust later than speeds: no sensor does that
+        (50.0, 0.04, (LAG,), CHANNELS, False, False),  # thrust later than speeds: no sensor does so
         (50.0, 0.01, ("wind",), CHANNELS, False, False),
         (50.0, 0.01, (LAG,), ("az",), False, False),  # no speed is read
         (50.0, 0.01, (LAG,), ("rpm_upper",), False, False),  # no accelerometer or gyro is
@@ -80,7 +74,9 @@ def test_speeds_may_be_late_where_all_else_has_less_of_a_lag(
     trial = lag_of(by_others, active)
     monkeypatch.setattr(late_rotor_speeds, "fitted", lambda problem, fit: trial)
     problem = problem_of({0.02: 0.0, by_others: gained}, aboard, slow)
-    assert with_less_lag(problem, lag_of(0.02, active)) == (trial if asked else None)
+    found = with_less_lag(problem, lag_of(0.02, active))
+    assert (found and found.fit) == (trial if asked else None)
+    assert found is None or found.gained == gained
 
 
 @pytest.mark.parametrize(
@@ -102,8 +98,7 @@ def test_speeds_come_late_where_nothing_is_left_of_a_lag_or_they_stay_coloured(
     monkeypatch.setattr(late_rotor_speeds, "fitted", lambda problem, fit: off)
     shown = {"az": SimpleNamespace(inflation=inflation)}
     monkeypatch.setattr(late_rotor_speeds, "whiteness", lambda passes, channels: shown)
-    problem = problem_of({0.02: 0.0, 0.01: gained * SETTINGS.evidence})
-    assert come_late(problem, lag_of(0.02), trial, coloured) == late
+    assert come_late(ByOthers(problem_of({}), trial, gained * SETTINGS.evidence), coloured) == late
 
 
 @pytest.mark.parametrize(
@@ -126,8 +121,8 @@ def test_a_low_pass_stands_for_a_lag_where_speeds_are_white_behind_it_and_it_is_
     )
     shown = dict.fromkeys(CHANNELS, SimpleNamespace(white=white))
     monkeypatch.setattr(late_rotor_speeds, "whiteness", lambda passes, channels: shown)
-    monkeypatch.setattr(late_rotor_speeds, "show_lag", lambda problem, trial: False)
-    found = behind_low_pass(problem, lag_of(0.02), lag_of(0.0), Noise({}))
+    others: Any = SimpleNamespace(fit=lag_of(0.0), show_lag=False)
+    found = behind_low_pass(problem, lag_of(0.02), others, Noise({}))
     assert found is (problem if taken else None)
 
 
@@ -145,8 +140,8 @@ def test_a_low_pass_is_looked_for_beside_the_lag_that_all_other_readings_show(
         begun.append((trial.values[OWN[0].name], round(low_pass.time, 9), low_pass.order))
 
     monkeypatch.setattr(late_rotor_speeds, "_behind", behind)
-    monkeypatch.setattr(late_rotor_speeds, "show_lag", lambda problem, trial: shown)
     problem = problem_of({0.08: 0.0})
     problem.row = 0.01
-    assert behind_low_pass(problem, lag_of(0.08), lag_of(by_others), Noise({})) is None
+    others: Any = SimpleNamespace(fit=lag_of(by_others), show_lag=shown)
+    assert behind_low_pass(problem, lag_of(0.08), others, Noise({})) is None
     assert begun == [(*at, order) for at in [(0.0, 0.08), *beside] for order in (1, 2)]

@@ -35,6 +35,7 @@ from coax_env.diagnosis.fits import (
     converged,
     fitted,
     noise_fitted,
+    only,
     quadratic_at,
     with_latent_noise,
     without,
@@ -206,7 +207,7 @@ def _without_small(problem: Problem, fit: Fit) -> Fit:
     for effect in fit.active:
         if not is_large(problem, effect, fit.values):
             problem.report(f"dropped {effect}: {TOO_SMALL}")
-            fit = _only(problem, fit, fit.rest(effect)).noted(f"- {effect}", 0.0)
+            fit = only(problem, fit, fit.rest(effect)).noted(f"- {effect}", 0.0)
     return fit
 
 
@@ -295,7 +296,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
             continue
         if not has_command_gains(wider):
             return first, pruned, quadratic, evidence
-        rest = _only(second, again, pruned.active)
+        rest = only(second, again, pruned.active)
         if pruned.active:
             asked, _, other = prune(second, rest, again=True)
         else:
@@ -311,7 +312,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
                 own = problem.base_names(pruned.active)
                 pruned = as_far_apart(problem, pruned, quadratic, evidence, asked, own)
             return first, pruned, quadratic, lesser
-        fit = _only(problem, fit, asked.active)
+        fit = only(problem, fit, asked.active)
 
 
 def beside_unseen_answers(
@@ -406,21 +407,13 @@ def _is_white(problem: Problem, fit: Fit) -> bool:
     return is_white(problem.engine.filter(fit.values, fit.noise), problem.model.channels)
 
 
-def _only(problem: Problem, fit: Fit, causes: Collection[str]) -> Fit:
-    """The fit with all other causes off."""
-    for effect in set(fit.active) - set(causes):
-        off = problem.off_values(effect) | problem.file_values(effect)
-        fit = replace(fit.at(off), active=fit.rest(effect))
-    return fit
-
-
 def as_named(problem: Problem, fit: Fit, other: Fit) -> Fit:
     """The fit with the causes of another one, those that it does not have at their numbers there.
 
     Args:
         problem, fit: before anything was weighed. other: with the causes.
     """
-    rest = _only(problem, fit, other.active)
+    rest = only(problem, fit, other.active)
     new = [f.name for e in other.active if e not in fit.active for f in problem.own[e]]
     return replace(rest.at({name: other.values[name] for name in new}), active=other.active)
 

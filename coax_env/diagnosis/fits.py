@@ -136,6 +136,18 @@ def without(problem: Problem, fit: Fit, quadratic: Quadratic, *effects: str) -> 
     return at_optimum(problem, fit, quadratic, rest, fixed)
 
 
+def only(problem: Problem, fit: Fit, effects: Collection[str]) -> Fit:
+    """The fit with all other effects off; the rest stays where it is.
+
+    Args:
+        problem, fit: what may be free, and where. effects: those that stay.
+    """
+    for effect in set(fit.active) - set(effects):
+        off = problem.off_values(effect) | problem.file_values(effect)
+        fit = replace(fit.at(off), active=fit.rest(effect))
+    return fit
+
+
 def fitted(
     problem: Problem,
     fit: Fit,

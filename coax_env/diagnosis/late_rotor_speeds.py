@@ -16,12 +16,13 @@ vertical acceleration denied, and stayed unexplained. So nothing is named on the
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
 
-from coax_env.diagnosis.fits import fitted
+from coax_env.diagnosis.fits import fitted, only
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.sensor_low_pass import likeliest
 from coax_env.estimation.low_pass import NONE, LowPass, before_low_pass
@@ -45,7 +46,34 @@ REMARK = (
 """For who reads the findings."""
 
 
-def with_less_lag(problem: Problem, fit: Fit) -> Fit | None:
+@dataclass(frozen=True)
+class ByOthers:
+    """What all readings but rotor speeds say of a motor's lag.
+
+    problem: with these readings. fit: to them. gained: nats by which they are likelier so than by the
+    fit to all.
+    """
+
+    problem: Problem
+    fit: Fit
+    gained: float
+
+    @cached_property
+    def enough(self) -> float:
+        """nats that they must say, by how coloured they are."""
+        passes = self.problem.engine.filter(self.fit.values, self.fit.noise)
+        shown = whiteness(passes, self.problem.model.channels)
+        inflation = max((judged.inflation for judged in shown.values()), default=1.0)
+        return self.problem.settings.evidence * inflation
+
+    @cached_property
+    def show_lag(self) -> bool:
+        """Whether they show a lag."""
+        at_once = fitted(self.problem, only(self.problem, self.fit, self.fit.rest(LAG)))
+        return at_once.objective - self.fit.objective >= self.enough
+
+
+def with_less_lag(problem: Problem, fit: Fit) -> ByOthers | None:
     """The fit to all readings but rotor speeds, where these are likelier with less of a motor's lag.
 
     Args:
@@ -57,13 +85,14 @@ def with_less_lag(problem: Problem, fit: Fit) -> Fit | None:
     if others.sees_poses_alone or others.has_slow_rows:
         return None
     trial = fitted(others, fit)
-    gained = _gained(others, fit, trial)
+    likelihood = others.engine.log_likelihood
+    gained = likelihood(trial.values, fit.noise) - likelihood(fit.values, fit.noise)
     problem.report(f"a motor's lag without the measured rotor speeds: {gained:.1f} nats")
     less = sum(trial.values[f.name] - fit.values[f.name] for f in problem.own[LAG])
-    return trial if gained > LEAST and less < 0.0 else None
+    return ByOthers(others, trial, gained) if gained > LEAST and less < 0.0 else None
 
 
-def behind_low_pass(problem: Problem, fit: Fit, trial: Fit, noise: Noise) -> Problem | None:
+def behind_low_pass(problem: Problem, fit: Fit, others: ByOthers, noise: Noise) -> Problem | None:
     """The problem with rotor speeds as they were before a low-pass, where that is what makes them late.
 
     In the place of the lag, and, where the other readings show one, beside theirs: a low-pass of 8 Hz
@@ -71,16 +100,16 @@ def behind_low_pass(problem: Problem, fit: Fit, trial: Fit, noise: Noise) -> Pro
     for it).
 
     Args:
-        problem, fit: with readings as logged, and a motor's lag. trial: to all other readings.
+        problem, fit: with readings as logged, and a motor's lag. others: what all others say of it.
         noise: levels to start from: those of the fit have taken up what is wrong with it.
     """
     logged = problem.engine.log_likelihood(fit.values, fit.noise)
     lag, own = (
-        float(np.mean([at.values[f.name] for f in problem.own[LAG]])) for at in (fit, trial)
+        float(np.mean([at.values[f.name] for f in problem.own[LAG]])) for at in (fit, others.fit)
     )
     starts = [(fit.at(problem.off_values(LAG)), lag)]
-    if show_lag(problem, trial):
-        starts.append((trial, max(lag - own, problem.row)))
+    if others.show_lag:
+        starts.append((others.fit, max(lag - own, problem.row)))
     best, most = None, problem.settings.evidence
     for (begun, time), order in product(starts, ORDERS):
         found = _behind(problem, replace(begun, noise=noise), LowPass(time, order))
@@ -118,48 +147,20 @@ def _behind(problem: Problem, trial: Fit, low_pass: LowPass) -> tuple[Problem, f
     return None
 
 
-def come_late(problem: Problem, fit: Fit, trial: Fit, coloured: bool) -> bool:
+def come_late(others: ByOthers, coloured: bool) -> bool:
     """Whether rotor speeds come later than a motor's lag, if there is one, has them.
 
     Args:
-        problem, fit: with the lag. trial: to all other readings.
+        others: what all other readings say of the lag.
         coloured: whether rotor speeds stay so with rotors that jitter.
     """
-    others = without_speeds(problem)
-    if _gained(others, fit, trial) < _enough(others, trial):
-        return False
-    return coloured or not show_lag(problem, trial)
-
-
-def show_lag(problem: Problem, trial: Fit) -> bool:
-    """Whether all readings but rotor speeds show a motor's lag, by the threshold.
-
-    Args:
-        problem: with all readings. trial: the fit to the others.
-    """
-    others = without_speeds(problem)
-    off = problem.off_values(LAG) | problem.file_values(LAG)
-    at_once = replace(trial.at(off), active=trial.rest(LAG))
-    return fitted(others, at_once).objective - trial.objective >= _enough(others, trial)
-
-
-def _enough(others: Problem, trial: Fit) -> float:
-    """nats that other readings must say, by how coloured these are."""
-    shown = whiteness(others.engine.filter(trial.values, trial.noise), others.model.channels)
-    inflation = max((judged.inflation for judged in shown.values()), default=1.0)
-    return others.settings.evidence * inflation
+    return others.gained >= others.enough and (coloured or not others.show_lag)
 
 
 def without_speeds(problem: Problem) -> Problem:
     """The problem without readings of rotor speeds."""
     records = without_rotor_speeds(problem.engine.records, problem.model.channels)
     return problem.with_records(records)
-
-
-def _gained(others: Problem, fit: Fit, trial: Fit) -> float:
-    """nats by which other readings are likelier by a fit to them."""
-    likelihood = others.engine.log_likelihood
-    return likelihood(trial.values, fit.noise) - likelihood(fit.values, fit.noise)
 
 
 def without_rotor_speeds(records: Sequence[Record], channels: Sequence[str]) -> list[Record]:

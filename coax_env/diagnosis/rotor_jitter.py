@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from coax_env.diagnosis.fits import fitted, noise_fitted, without
+from coax_env.diagnosis.fits import fitted, noise_fitted, only, without
 from coax_env.diagnosis.problem import OF_ROTORS, WEAK_OR_LATE, Fit, Problem
 from coax_env.estimation.helicopter_noise import (
     JITTER_LEVEL,
@@ -78,14 +78,7 @@ def with_share_anew(problem: Problem, fit: Fit, noise: Noise) -> Noise:
     """
     if JITTER_LEVEL not in noise.process:
         return noise
-    beside = tuple(effect for effect in fit.active if effect in OF_ROTORS)
-    off: dict[str, float] = {}
-    for effect in set(fit.active) - set(beside):
-        off |= problem.off_values(effect) | problem.file_values(effect)
-    trial = replace(fit.at(off), active=beside)
-    for _ in range(TURNS):
-        trial = fitted(problem, _taken_up(problem, noise_fitted(problem, trial, math.inf)))
-    return share_of(trial, noise)
+    return share_of(_in_turns(problem, only(problem, fit, OF_ROTORS)), noise)
 
 
 def share_of(fit: Fit, noise: Noise) -> Noise:
@@ -101,19 +94,25 @@ def share_of(fit: Fit, noise: Noise) -> Noise:
 
 
 def _fitted(wider: Problem, fit: Fit, left: float) -> Fit:
-    """With jitter, from a share of the white noise that stood for it.
+    """With jitter, from a share of the white noise that stood for it."""
+    noise = with_jitter(fit.noise, wider.model)
+    least = max(left * noise.level(STANDING_IN), noise.floor[STANDING_IN])
+    levels = (*fit.levels, JITTER_LEVEL, JITTER_MEMORY)
+    return _in_turns(
+        wider, replace(fit, noise=noise.with_levels({STANDING_IN: least}), levels=levels)
+    )
+
+
+def _in_turns(wider: Problem, fit: Fit) -> Fit:
+    """Levels, the motors' share of the jitter and numbers, each fitted beside the others.
 
     On all of the flight: maneuvers shake rotors more than hover does, and levels of some runs may be
     worse for all of them than none. On a flight of another simulator (`tests/blade_element.py`,
     **synthetic**) jitter was worth -448 nats by 60 s of 84, by all of it 1,371.
     """
-    noise = with_jitter(fit.noise, wider.model)
-    least = max(left * noise.level(STANDING_IN), noise.floor[STANDING_IN])
-    levels = (*fit.levels, JITTER_LEVEL, JITTER_MEMORY)
-    trial = replace(fit, noise=noise.with_levels({STANDING_IN: least}), levels=levels)
     for _ in range(TURNS):
-        trial = fitted(wider, _taken_up(wider, noise_fitted(wider, trial, math.inf)))
-    return trial
+        fit = fitted(wider, _taken_up(wider, noise_fitted(wider, fit, math.inf)))
+    return fit
 
 
 def _taken_up(wider: Problem, fit: Fit) -> Fit:

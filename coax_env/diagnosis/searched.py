@@ -190,23 +190,23 @@ def _with_late_speeds(
             moves the rotors. noise: levels to start from.
         coloured: whether rotor speeds stay so with rotors that jitter.
     """
-    trial = with_less_lag(beside, fit)
-    if trial is None:
+    others = with_less_lag(beside, fit)
+    if others is None:
         return None
     asked = beside is problem and not coloured  # with rotors that jitter, it has been
-    behind = behind_low_pass(problem, fit, trial, noise) if asked else None
+    behind = behind_low_pass(problem, fit, others, noise) if asked else None
     if behind is not None:
         problem.report("searching with rotor speeds as they were before a low-pass")
         return _searched(behind, noise)
-    if not come_late(beside, fit, trial, coloured):
+    if not come_late(others, coloured):
         return None
     problem.report("searching without the measured rotor speeds, which come late")
     found = _searched(without_speeds(problem), noise)
     own = {f.name: fit.values[f.name] for f in problem.own[LAG]}
     begun = replace(fit.at(found.fit.values).at(own), active=(*found.fit.rest(LAG), LAG))
     again = fitted(beside, begun)
-    trial = with_less_lag(beside, again)
-    return found if trial is not None and come_late(beside, again, trial, coloured) else None
+    others = with_less_lag(beside, again)
+    return found if others is not None and come_late(others, coloured) else None
 
 
 def _with_clock_errors(first: Searched, noise: Noise) -> Searched:

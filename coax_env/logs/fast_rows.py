@@ -77,14 +77,16 @@ def _decimated_run(run: Run, factor: int, fast: frozenset[str]) -> Run:
     """A run with a row for `factor`, and those of readings of channels that are not `fast`."""
     slow = [np.isfinite(values) for c, values in run.measured.items() if c not in fast]
     kept = _kept_rows(run.t.size, factor, _rows_with(slow))
-    measured = {
-        c: _means(c, values, run.t, kept) if c in fast else values[kept]
-        for c, values in run.measured.items()
-    }
-    until_next = kept, np.append(kept[1:], kept[-1:] + 1)
-    for k, c in enumerate(ROTOR_SPEEDS):
-        if c in fast and _follows_at_once(run.measured[c], RPM_PER_RAD_S * run.command[:, k]):
-            measured[c] = _mean_of_rows(run.measured[c], *until_next)
+    commands = dict(zip(ROTOR_SPEEDS, RPM_PER_RAD_S * run.command[:, :2].T, strict=True))
+
+    def taken(channel: str, values: np.ndarray) -> np.ndarray:
+        if channel not in fast:
+            return values[kept]
+        if channel in commands and _follows_at_once(values, commands[channel]):
+            return _mean_of_rows(values, kept, np.append(kept[1:], kept[-1:] + 1))
+        return _means(channel, values, run.t, kept)
+
+    measured = {channel: taken(channel, values) for channel, values in run.measured.items()}
     battery = None if run.battery is None else run.battery[kept]
     return replace(
         run, t=run.t[kept], command=_held_means(run, kept), measured=measured, battery=battery,
