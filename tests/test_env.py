@@ -3,7 +3,9 @@
 import math
 import subprocess
 import sys
+import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
 import numpy as np
@@ -17,6 +19,7 @@ from coax_env.env import hover
 from coax_env.env.actions import action_map, nominal_for
 from coax_env.env.period import DT
 from coax_env.env.spaces import action_table, observation_table, observed
+from coax_env.env.threads import in_threads
 from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.errors import InputError
 from coax_env.kernel.random_streams import stream_key, two_normals, uniform
@@ -180,6 +183,48 @@ def test_threads_change_nothing():
         flown.append((observations, rewards))
     assert np.array_equal(flown[0][0], flown[1][0])
     assert np.array_equal(flown[0][1], flown[1][1])
+
+
+def test_what_a_thread_raises_is_raised_when_all_have_ended():
+    ended = []
+
+    def share(first: int, last: int) -> None:
+        if first in (0, 4):
+            raise ValueError(f"share from {first}")
+        time.sleep(0.02)
+        ended.append(first)
+
+    for _ in range(2):  # and the threads work on
+        with pytest.raises(ValueError, match="share from"):
+            in_threads(share, 12, 3)
+    assert ended == [8, 8]
+
+
+def test_calls_of_two_threads_share_workers_and_wait_for_their_own():
+    def call(k: int) -> list[int]:
+        shares: list[int] = []
+
+        def share(first: int, last: int) -> None:
+            time.sleep(0.001 * ((first + k) % 3))
+            shares.append(first)
+
+        for _ in range(20):
+            in_threads(share, 9, 3)
+            assert sorted(shares) == [0, 3, 6]
+            shares.clear()
+        return shares
+
+    with ThreadPoolExecutor(4) as callers:
+        assert list(callers.map(call, range(4))) == [[]] * 4
+
+
+@pytest.mark.parametrize("count", [3, 16])  # one by one; side by side
+def test_actions_stay_as_they_were_given(count):
+    env = CoaxVectorEnv(count, control_rate=50.0)
+    env.reset(seed=0)
+    given = np.full((count, 4), 1.5)  # clipped, but not in place
+    env.step(given)
+    assert (given == 1.5).all()
 
 
 def test_streams_are_uniform_normal_and_unrelated():

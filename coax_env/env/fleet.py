@@ -130,6 +130,7 @@ class Fleet:
         self._threads = max(1, min(threads or most or 1, count // ROWS_PER_THREAD))
         fewest = SIMD_VARIANT_FROM if any(self.makeup) else SIMD_FROM
         self._side_by_side = count >= fewest and _fit_for_simd(used)
+        self._fly_simd: Any = None  # looked up when the batch first flies
 
     def _parameters(self) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
         """The parameter vector, the places that each row has of its own, and what may be on in it."""
@@ -276,13 +277,13 @@ class Fleet:
         """One control period; `x` is a new array then, and the one before stays as it was.
 
         Args:
-            actions: (count, 4), numbers of any type; whether they are clipped in place is left open.
+            actions: (count, 4), numbers of any type; not changed.
             active: which rows fly, (count,). anew: which of the others start a new flight, (count,).
         """
         n = self.count
         simd = self._side_by_side
         # the loops are looked up once: from here on no type and no order in memory is checked
-        commands = np.empty((n, 4)) if simd else np.ascontiguousarray(actions, dtype=np.float64)
+        commands = np.empty((n, 4)) if simd else np.array(actions, dtype=np.float64, order="C")
         active = np.ascontiguousarray(active, dtype=np.bool_)
         heli, world, mission = self.helicopters, self.world, self.mission
         outcome = Outcome(
@@ -296,7 +297,9 @@ class Fleet:
         before = self.x
         self.x = x = np.empty_like(before) if simd else before.copy()
 
-        fly = _simd_loop(self.makeup) if simd else None
+        if simd and self._fly_simd is None:
+            self._fly_simd = _simd_loop(self.makeup)
+        fly = self._fly_simd
 
         def rows(first: int, last: int) -> None:
             if fly:

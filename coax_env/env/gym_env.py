@@ -248,7 +248,7 @@ class CoaxEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step of 1/control_rate seconds."""
-        outcome = self.fleet.fly_held(np.array(action, dtype=np.float64).reshape(1, 4), _ALL)
+        outcome = self.fleet.fly_held(np.asarray(action, dtype=np.float64).reshape(1, 4), _ALL)
         if self.render_mode is not None:
             self._screen.update()
         info = self._info()

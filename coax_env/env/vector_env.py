@@ -114,7 +114,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.fleet.x = self.fleet.x.copy()
         observations = self.fleet.restart(which, start_states(options, self.num_envs))
         self._screen.update()
-        return observations, self._info(which) | self._vehicles(which)
+        return observations, self._info(which.copy()) | self._vehicles(which)
 
     def step(
         self, actions: np.ndarray
@@ -124,12 +124,14 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         waiting = ended.any()
         active = ~ended if waiting else self._every
         anew = ended if waiting and self.autoreset_mode == AutoresetMode.NEXT_STEP else None
-        own = np.array(actions).reshape(self.num_envs, 4)
+        own = np.asarray(actions).reshape(self.num_envs, 4)
         outcome = fleet.fly_held(own, active, anew)
         terminated = outcome.over
-        truncated = np.zeros(self.num_envs, dtype=np.bool_)
-        if self.max_episode_steps is not None:
-            truncated = (fleet.rows >= self.max_episode_steps * fleet.periods) & active
+        if self.max_episode_steps is None:
+            truncated = np.zeros(self.num_envs, dtype=np.bool_)
+        else:
+            truncated = fleet.rows >= self.max_episode_steps * fleet.periods
+            truncated &= active
         observations = outcome.observations
         info: dict[str, Any] = {}
         done = terminated | truncated
@@ -163,7 +165,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _step_info(self, terms: np.ndarray) -> dict[str, Any]:
         every = self._every.copy()
         by_name = dict(zip(self._of_terms, (*terms.T, *[every] * terms.shape[1]), strict=True))
-        return self._info(every) | {"reward_terms": by_name, "_reward_terms": every}
+        return {**self._info(every), "reward_terms": by_name, "_reward_terms": every}
 
     def _info(self, which: np.ndarray) -> dict[str, Any]:
         fleet = self.fleet
@@ -176,7 +178,7 @@ class CoaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             info["target_rates"] = fleet.target_rates
         if fleet.task.moves_on:
             info["reached"] = fleet.progress[:, tasks.REACHED].copy()
-        return _masked(info, which.copy())
+        return _masked(info, which)
 
     def _vehicles(self, which: np.ndarray) -> dict[str, Any]:
         """What the rows of a mask drew, where vehicles are drawn."""
