@@ -19,7 +19,7 @@ from study.one_flight import hide
 from coax_env import diagnose, load_vehicle, simulate
 from coax_env.diagnosis import rotor_jitter as asking
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.searched import SHOWN_BY
+from coax_env.diagnosis.searches.rotors import SHOWN_BY
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel, record_of

@@ -8,7 +8,7 @@ import pytest
 
 from coax_env.diagnosis import slow_commands as module
 from coax_env.diagnosis.problem import Fit
-from coax_env.diagnosis.searched import Searched
+from coax_env.diagnosis.searches.once import Searched
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.diagnosis.slow_commands import (
     ON_LINES,

@@ -51,7 +51,7 @@ from coax_env.diagnosis.remarks import (
     remarks,
     vibration_removed,
 )
-from coax_env.diagnosis.searched import searched
+from coax_env.diagnosis.searches.searched import searched
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.shocks import engine_of
 from coax_env.diagnosis.trust import beside_large_axes, trusts

@@ -17,7 +17,7 @@ from coax_env.diagnosis.evidence import Evidence, as_far_apart
 from coax_env.diagnosis.fits import converged, fitted, quadratic_at
 from coax_env.diagnosis.from_afar import STEPS
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.searched import Searched
+from coax_env.diagnosis.searches.once import Searched
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
 

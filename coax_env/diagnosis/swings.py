@@ -7,7 +7,7 @@ felt, or gains no more than a tie by swinging alone, nothing else is asked. From
 noise levels and numbers are fitted in turns, frequencies by the likelihood itself, since they change
 the filter's gains. Gusts that swing have no fast part, so that white noise is asked for once more.
 What a model lacks may look like a swing as well: after a search with them nothing may be coloured, or
-none is used (searched.py).
+none is used (searches/unrest.py).
 """
 
 import math

@@ -78,6 +78,7 @@ OWN: dict[str, tuple[str, ...]] = {
     ),
     "coax_env/comparison/two_logs/*": ("tests/test_changes.py", "tests/test_edits.py"),
     "coax_env/diagnosis/onsets/*": ("tests/test_onset.py",),
+    "coax_env/diagnosis/searches/*": ("tests/test_searches.py",),
     "coax_env/diagnosis/gain.py": ("tests/test_gain.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/trust.py": ("tests/test_trust.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/replication.py": (

@@ -9,10 +9,11 @@ import pytest
 from scipy.signal import lfilter
 
 from coax_env import load_vehicle
-from coax_env.diagnosis import fits, searched
+from coax_env.diagnosis import fits
 from coax_env.diagnosis import problem as problem_module
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.searched import Searched
+from coax_env.diagnosis.searches import once, readings, rotors, searched, unrest
+from coax_env.diagnosis.searches.once import Searched
 from coax_env.diagnosis.sensor_errors import LastingErrors
 from coax_env.diagnosis.sensor_low_pass import hidden_behind
 from coax_env.diagnosis.settings import SETTINGS
@@ -23,24 +24,34 @@ from coax_env.estimation.rotor_jitter import with_jitter
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.model.layout import ACCELEROMETERS, GYROS, ROTOR_SPEEDS, RPM_PER_RAD_S
 
+MODULES = (once, rotors, readings, unrest, searched)
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, name: str, instead: Any) -> None:
+    """Something else of that name wherever a search is done."""
+    having = [module for module in MODULES if hasattr(module, name)]
+    assert having, f"no search has {name!r}"
+    for module in having:
+        monkeypatch.setattr(module, name, instead)
+
 
 @pytest.fixture(autouse=True)
 def _one_air(monkeypatch):
     """On all runs, but where a test says otherwise."""
-    monkeypatch.setattr(searched, "with_own_air", lambda problem, fit: None)
+    stand_in(monkeypatch, "with_own_air", lambda problem, fit: None)
 
 
 @pytest.fixture(autouse=True)
 def _steady_rotors(monkeypatch):
     """Whose speeds are their commands, read as they are, but where a test says otherwise."""
-    monkeypatch.setattr(searched, "_rotors_stray", lambda problem: False)
-    monkeypatch.setattr(searched, "_with_late_speeds", lambda *asked, coloured=False: None)
+    stand_in(monkeypatch, "_rotors_stray", lambda problem: False)
+    stand_in(monkeypatch, "with_late_speeds", lambda *asked, coloured=False: None)
 
 
 def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
     """Twice as fine and more; those that are coarser already are left alone."""
     reading = {"phi": 0.0029, "theta": 0.0031, "h": 0.0024, "q": 0.5}
-    found = searched._coarser(Noise({}, reading))
+    found = unrest._coarser(Noise({}, reading))
     assert found == {"phi": LEAST_READING_STD["phi"], "h": LEAST_READING_STD["h"]}
 
 
@@ -52,13 +63,11 @@ def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
 def test_errors_are_compared_by_their_geometric_mean(monkeypatch, ours, better):
     """Half of one error and twice another is no better; channels that the other lacks do not count."""
     theirs = {"h": 1.0, "q": 1.0, "ax": 0.0}
-    monkeypatch.setattr(
-        searched, "replay_runs", lambda engine, values, noise, horizon: values["rms"]
-    )
-    monkeypatch.setattr(searched, "pooled_rms", lambda rms: rms)
+    stand_in(monkeypatch, "replay_runs", lambda engine, values, noise, horizon: values["rms"])
+    stand_in(monkeypatch, "pooled_rms", lambda rms: rms)
     fit, other = (Fit((), {"rms": rms}, Noise({})) for rms in (ours, theirs))  # type: ignore
     problem = SimpleNamespace(settings=SETTINGS, engine=None)
-    assert searched._flies_better(problem, fit, other) == better  # type: ignore[arg-type]
+    assert unrest._flies_better(problem, fit, other) == better  # type: ignore[arg-type]
 
 
 FINE = Noise({}, {"phi": 0.001})
@@ -84,14 +93,14 @@ def test_readings_are_believed_less_as_long_as_that_flies_better(
         fit = Fit((), {}, noise)
         return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(searched, "_searched", one)
+    stand_in(monkeypatch, "searched_once", one)
     believes_its_sensors(monkeypatch)
-    monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
-    monkeypatch.setattr(searched, "with_swings", lambda problem, fit: None)
-    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
-    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
-    monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
-    monkeypatch.setattr(searched, "_flies_better", lambda *fits: answers.pop(0))
+    stand_in(monkeypatch, "low_passes", lambda problem, fit, noise: {})
+    stand_in(monkeypatch, "with_swings", lambda problem, fit: None)
+    stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
+    stand_in(monkeypatch, "in_shocks", lambda problem, fit: False)
+    stand_in(monkeypatch, "is_white", lambda passes, channels: white)
+    stand_in(monkeypatch, "_flies_better", lambda *fits: answers.pop(0))
     engine = SimpleNamespace(filter=lambda values, noise: [])
     problem = SimpleNamespace(
         engine=engine, model=SimpleNamespace(channels=()), report=lambda text: None, smoothed=False
@@ -113,18 +122,18 @@ def test_readings_that_are_coarse_enough_are_held_as_they_were_fitted(monkeypatc
         return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
 
     believes_its_sensors(monkeypatch)
-    monkeypatch.setattr(searched, "_searched", one)
-    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
-    monkeypatch.setattr(searched, "with_swings", lambda problem, fit: None)
-    monkeypatch.setattr(searched, "is_white", lambda passes, channels: False)
-    monkeypatch.setattr(searched, "_flies_better", lambda *fits: False)
+    stand_in(monkeypatch, "searched_once", one)
+    stand_in(monkeypatch, "in_shocks", lambda problem, fit: False)
+    stand_in(monkeypatch, "with_swings", lambda problem, fit: None)
+    stand_in(monkeypatch, "is_white", lambda passes, channels: False)
+    stand_in(monkeypatch, "_flies_better", lambda *fits: False)
     problem: Any = SimpleNamespace(
         engine=SimpleNamespace(filter=lambda values, noise: []), report=lambda text: None,
         model=SimpleNamespace(channels=()),
     )  # fmt: skip
     given = Noise({}, {"phi": 0.005, "h": 0.0002})
     best = one(problem, given)
-    searched._in_unrest(best, given, {}, erring=False)
+    unrest.in_unrest(best, given, {}, erring=False)
     assert asked[1] == {"phi": 0.01, "h": LEAST_READING_STD["h"]}
 
 
@@ -151,7 +160,7 @@ def test_rotors_stray_where_what_parts_them_from_their_commands_has_a_memory(
     problem: Any = SimpleNamespace(
         model=SimpleNamespace(channels=ROTOR_SPEEDS), engine=SimpleNamespace(records=[record])
     )
-    assert searched._rotors_stray(problem) == strays
+    assert rotors._rotors_stray(problem) == strays
 
 
 @pytest.mark.parametrize(
@@ -191,21 +200,21 @@ def test_what_moves_the_rotors_comes_first_and_plain_jitter_with_it(
     )  # fmt: skip
     bare = Fit((), {}, FINE)
     given = {
-        "_rotors_stray": lambda problem: True, "_as_given": lambda problem, noise: (bare, bare),
+        "_rotors_stray": lambda problem: True, "as_given": lambda problem, noise: (bare, bare),
         "added": lambda problem, fit: (lag, None),
-        "_is_coloured": lambda found, channels: white == "never" or (
+        "is_coloured": lambda found, channels: white == "never" or (
             white == "beside a drift" and found.fit is lag),
         "_in_noise_anew": lambda problem, fit, noise: drifting,
-        "in_jitter": jitter, "_searched": whole, "_nothing_forgotten": lambda best, fit: best,
-        "_searched_from": from_there, "_with_levels_of_jitter": lambda noise, wider, fit: "begun",
+        "in_jitter": jitter, "searched_once": whole, "nothing_forgotten": lambda best, fit: best,
+        "searched_from": from_there, "_with_levels_of_jitter": lambda noise, wider, fit: "begun",
     }  # fmt: skip
-    for name, stand_in in given.items():
-        monkeypatch.setattr(searched, name, stand_in)
-    found = searched._rotors_first(problem, FINE)
+    for name, instead in given.items():
+        stand_in(monkeypatch, name, instead)
+    found = rotors.rotors_first(problem, FINE)
     assert found == ("found", "begun" if jitters else FINE)
     assert asked == [(wider if jitters else problem, begins)]
-    monkeypatch.setattr(searched, "_rotors_stray", lambda problem: False)
-    assert searched._rotors_first(problem, FINE) is None
+    stand_in(monkeypatch, "_rotors_stray", lambda problem: False)
+    assert rotors.rotors_first(problem, FINE) is None
 
 
 @pytest.mark.parametrize("nats", [999.0, 1001.0])
@@ -217,21 +226,21 @@ def test_noise_from_the_first_guess_stands_where_that_is_likelier(monkeypatch, n
         assert fit is lag and noise is FINE
         return replace(fit, noise=noise)
 
-    monkeypatch.setattr(searched, "in_noise_from", from_guess)
-    monkeypatch.setattr(searched, "noise_fitted", lambda problem, fit: fit)
-    monkeypatch.setattr(searched, "fitted", lambda problem, fit: replace(fit, objective=nats))
-    found = searched._in_noise_anew(None, lag, FINE)  # type: ignore[arg-type]
+    stand_in(monkeypatch, "in_noise_from", from_guess)
+    stand_in(monkeypatch, "noise_fitted", lambda problem, fit: fit)
+    stand_in(monkeypatch, "fitted", lambda problem, fit: replace(fit, objective=nats))
+    found = rotors._in_noise_anew(None, lag, FINE)  # type: ignore[arg-type]
     assert found.noise is (FINE if nats < 1000.0 else lag.noise)
 
 
 def believes_its_sensors(monkeypatch) -> None:
     """No errors that last, times that are right, white rotor speeds, gusts that push or turn."""
-    monkeypatch.setattr(searched, "lasting_errors", lambda problem, fit, noise: None)
-    monkeypatch.setattr(searched, "with_clock_errors", lambda problem, fit: None)
-    monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: None)
-    monkeypatch.setattr(searched, "_may_hide_jitter", lambda found: False)
-    monkeypatch.setattr(searched, "is_much_coloured", lambda problem, fit: False)
-    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
+    stand_in(monkeypatch, "lasting_errors", lambda problem, fit, noise: None)
+    stand_in(monkeypatch, "with_clock_errors", lambda problem, fit: None)
+    stand_in(monkeypatch, "in_joint_gusts", lambda problem, fit: None)
+    stand_in(monkeypatch, "_may_hide_jitter", lambda found: False)
+    stand_in(monkeypatch, "is_much_coloured", lambda problem, fit: False)
+    stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
 
 
 @pytest.mark.parametrize(
@@ -254,18 +263,18 @@ def test_errors_that_last_take_up_no_cause_that_had_been_found(monkeypatch, had,
         fit = Fit(("wind",) if problem is wider else had, {}, noise)
         return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(searched, "_searched", one)
+    stand_in(monkeypatch, "searched_once", one)
     believes_its_sensors(monkeypatch)
     lasting = Noise({"error_gyros": 0.1}, {"phi": 0.2})
     errors = lambda problem, fit, noise: LastingErrors(wider, fit, lasting, 90.0, True)  # noqa: E731
-    monkeypatch.setattr(searched, "lasting_errors", errors)
-    monkeypatch.setattr(searched, "_white_since", lambda best, clock, gained: None)
-    monkeypatch.setattr(searched, "search", lambda problem, fit: (fit, None))
-    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
-    monkeypatch.setattr(searched, "with_swings", lambda problem, fit: asked.append(problem))
-    monkeypatch.setattr(searched, "cost", lambda problem, fit, quadratic: costs[fit.active[0]])
-    monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
-    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
+    stand_in(monkeypatch, "lasting_errors", errors)
+    stand_in(monkeypatch, "_white_since", lambda best, clock, gained: None)
+    stand_in(monkeypatch, "search", lambda problem, fit: (fit, None))
+    stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
+    stand_in(monkeypatch, "with_swings", lambda problem, fit: asked.append(problem))
+    stand_in(monkeypatch, "cost", lambda problem, fit, quadratic: costs[fit.active[0]])
+    stand_in(monkeypatch, "low_passes", lambda problem, fit, noise: {})
+    stand_in(monkeypatch, "in_shocks", lambda problem, fit: False)
     found = searched.searched(plain, FINE, {})  # type: ignore[arg-type]
     assert found.problem is wider and found.fit.active == active
     assert found.refitted.noise is lasting and asked == [wider]
@@ -286,11 +295,11 @@ def test_what_changed_once_is_no_error_that_lasts(monkeypatch, onsets, white, wo
     problem = SimpleNamespace(engine=engine, model=SimpleNamespace(channels=()))
     fit = Fit((), {}, FINE)
     state = SimpleNamespace(problem=problem, fit=fit, onsets=onsets)
-    monkeypatch.setattr(searched, "with_onsets", lambda *given: state)
-    monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
+    stand_in(monkeypatch, "with_onsets", lambda *given: state)
+    stand_in(monkeypatch, "is_white", lambda passes, channels: white)
     first = Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(searched, "most_by_change", lambda *found: worth)
-    changed = searched._white_since(first, {}, 100.0)
+    stand_in(monkeypatch, "most_by_change", lambda *found: worth)
+    changed = readings._white_since(first, {}, 100.0)
     assert (changed is not None) == used and (changed is None or changed.changing is state)
 
 
@@ -309,14 +318,14 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
         SimpleNamespace(report=lambda text: None, engine=engine, model=model, smoothed=False)
         for _ in range(2)
     )
-    monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
-    monkeypatch.setattr(searched, "_searched", one)
+    stand_in(monkeypatch, "is_white", lambda passes, channels: white)
+    stand_in(monkeypatch, "searched_once", one)
     believes_its_sensors(monkeypatch)
-    monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {})
-    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
-    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
-    monkeypatch.setattr(searched, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
-    monkeypatch.setattr(searched, "with_other_swings", lambda problem, fit: None)
+    stand_in(monkeypatch, "low_passes", lambda problem, fit, noise: {})
+    stand_in(monkeypatch, "in_shocks", lambda problem, fit: False)
+    stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
+    stand_in(monkeypatch, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
+    stand_in(monkeypatch, "with_other_swings", lambda problem, fit: None)
     found = searched.searched(fading, Noise({"force_xy": 0.2}), {})  # type: ignore[arg-type]
     assert asked == [(fading, 0.2), (swinging, 0.7)]
     assert found.problem is (swinging if white else fading)
@@ -338,13 +347,13 @@ def test_a_swing_that_what_was_found_had_hidden_is_searched_beside_where_that_is
         fit = Fit((), {}, noise)
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(searched, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
-    monkeypatch.setattr(searched, "with_other_swings", lambda p, fit: (other, {"force_xy": 0.9}))
-    monkeypatch.setattr(searched, "_searched", of)
-    monkeypatch.setattr(searched, "cost", lambda problem, fit, quadratic: worth[problem.name])
-    monkeypatch.setattr(searched, "is_white", lambda passes, channels: True)
+    stand_in(monkeypatch, "with_swings", lambda problem, fit: (swinging, {"force_xy": 0.7}))
+    stand_in(monkeypatch, "with_other_swings", lambda p, fit: (other, {"force_xy": 0.9}))
+    stand_in(monkeypatch, "searched_once", of)
+    stand_in(monkeypatch, "cost", lambda problem, fit, quadratic: worth[problem.name])
+    stand_in(monkeypatch, "is_white", lambda passes, channels: True)
     noise = Noise({"force_xy": 0.2})
-    found = searched._in_swings(of(fading, noise), noise)
+    found = unrest._in_swings(of(fading, noise), noise)
     assert found is not None and found.problem is (other if used else swinging)
     assert found.fit.noise.level("force_xy") == (0.9 if used else 0.7)
 
@@ -364,13 +373,11 @@ def test_swings_are_asked_before_shocks_and_stand_where_none_are_left(monkeypatc
         return found
 
     believes_its_sensors(monkeypatch)
-    monkeypatch.setattr(
-        searched, "in_shocks", lambda problem, fit: problem.name == "fading" or left
-    )
-    monkeypatch.setattr(searched, "_in_swings", lambda best, noise: of("swings", swinging))
-    monkeypatch.setattr(searched, "_changed", lambda best, clock: None)
-    monkeypatch.setattr(searched, "_searched_in_shocks", lambda best, noise: of("shocks", shaken))
-    found = searched._in_unrest(fading, FINE, {}, erring=True)
+    stand_in(monkeypatch, "in_shocks", lambda problem, fit: problem.name == "fading" or left)
+    stand_in(monkeypatch, "_in_swings", lambda best, noise: of("swings", swinging))
+    stand_in(monkeypatch, "_changed", lambda best, clock: None)
+    stand_in(monkeypatch, "_searched_in_shocks", lambda best, noise: of("shocks", shaken))
+    found = unrest.in_unrest(fading, FINE, {}, erring=True)
     assert done == asked and found is (shaken if left else swinging)
 
 
@@ -398,7 +405,7 @@ def test_jitter_is_asked_first_where_rotor_speeds_show_it_and_gusts_beside_it(
 ):
     asked: list[str] = []
     engine, model = SimpleNamespace(filter=lambda values, noise: []), SimpleNamespace(channels=())
-    monkeypatch.setattr(searched, "is_white", lambda passes, channels: True)
+    stand_in(monkeypatch, "is_white", lambda passes, channels: True)
     plain, jittery, swinging = (
         SimpleNamespace(
             name=name, report=lambda text: None, engine=engine, model=model, smoothed=False
@@ -421,16 +428,14 @@ def test_jitter_is_asked_first_where_rotor_speeds_show_it_and_gusts_beside_it(
     def coloured(found: Searched, channels: Any) -> bool:
         return found.problem is plain and (rate if "r" in channels else rotors)
 
-    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: False)
-    monkeypatch.setattr(searched, "with_swings", with_swings)
-    monkeypatch.setattr(searched, "with_other_swings", lambda problem, fit: None)
-    monkeypatch.setattr(searched, "_jittery", with_jitter)
-    monkeypatch.setattr(searched, "_searched", of)
-    monkeypatch.setattr(
-        searched, "_before_low_passes", lambda first, noise: asked.append("low-passes")
-    )
+    stand_in(monkeypatch, "in_shocks", lambda problem, fit: False)
+    stand_in(monkeypatch, "with_swings", with_swings)
+    stand_in(monkeypatch, "with_other_swings", lambda problem, fit: None)
+    stand_in(monkeypatch, "jittery", with_jitter)
+    stand_in(monkeypatch, "searched_once", of)
+    stand_in(monkeypatch, "before_low_passes", lambda first, noise: asked.append("low-passes"))
     believes_its_sensors(monkeypatch)
-    monkeypatch.setattr(searched, "_is_coloured", coloured)
+    stand_in(monkeypatch, "is_coloured", coloured)
     found = searched.searched(plain, Noise({"force_xy": 0.2}), {})  # type: ignore[arg-type]
     assert asked == order
     assert found.problem is (swinging if gained else plain)
@@ -452,12 +457,10 @@ def test_where_times_are_wrong_all_is_searched_so(monkeypatch, wrong, problem):
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
     believes_its_sensors(monkeypatch)
-    monkeypatch.setattr(searched, "_searched", one)
-    monkeypatch.setattr(
-        searched, "with_clock_errors", lambda problem, fit: other if wrong else None
-    )
-    monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: None)
-    monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
+    stand_in(monkeypatch, "searched_once", one)
+    stand_in(monkeypatch, "with_clock_errors", lambda problem, fit: other if wrong else None)
+    stand_in(monkeypatch, "before_low_passes", lambda first, noise: None)
+    stand_in(monkeypatch, "in_unrest", lambda best, noise, clock, erring: best)
     found = searched.searched(right, FINE, {})  # type: ignore[arg-type]
     assert found.problem.name == problem and asked == (["right", "wrong"] if wrong else ["right"])
 
@@ -489,15 +492,13 @@ def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
         "a": SimpleNamespace(coloured_share=2.0 * mean[name]),
         "b": SimpleNamespace(coloured_share=0.0),
     }
-    monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: (joint, fit))
-    monkeypatch.setattr(
-        searched, "_searched", lambda problem, noise, coarse: replace(first, problem=problem)
+    stand_in(monkeypatch, "in_joint_gusts", lambda problem, fit: (joint, fit))
+    stand_in(
+        monkeypatch, "searched_once", lambda problem, noise, coarse: replace(first, problem=problem)
     )
-    monkeypatch.setattr(
-        searched, "cost", lambda problem, fit, quadratic: costs[problem.name == "joint"]
-    )
+    stand_in(monkeypatch, "cost", lambda problem, fit, quadratic: costs[problem.name == "joint"])
     monkeypatch.setattr(fits, "whiteness", shown)
-    found = searched._with_joint_gusts(first, FINE)
+    found = unrest._with_joint_gusts(first, FINE)
     assert (found.problem is joint) == used
     assert found is first or used
 
@@ -521,15 +522,13 @@ def test_joint_gusts_stand_where_they_need_no_name_at_its_limit(monkeypatch, had
             (joint, Fit(tuple(then), then, FINE)),
         )
     )
-    monkeypatch.setattr(searched, "is_much_coloured", lambda problem, fit: False)
-    monkeypatch.setattr(searched, "in_joint_gusts", lambda problem, fit: (joint, other.fit))
-    monkeypatch.setattr(searched, "_searched", lambda problem, noise, coarse: other)
-    monkeypatch.setattr(searched, "_likelier", lambda best, fit: best)
-    monkeypatch.setattr(searched, "cost", lambda problem, fit, _: 9.0 if problem is joint else 10.0)
-    monkeypatch.setattr(
-        searched, "sizes", lambda problem, fit, effect: {effect: fit.values[effect]}
-    )
-    assert (searched._with_joint_gusts(first, FINE).problem is joint) == used
+    stand_in(monkeypatch, "is_much_coloured", lambda problem, fit: False)
+    stand_in(monkeypatch, "in_joint_gusts", lambda problem, fit: (joint, other.fit))
+    stand_in(monkeypatch, "searched_once", lambda problem, noise, coarse: other)
+    stand_in(monkeypatch, "likelier", lambda best, fit: best)
+    stand_in(monkeypatch, "cost", lambda problem, fit, _: 9.0 if problem is joint else 10.0)
+    stand_in(monkeypatch, "sizes", lambda problem, fit, effect: {effect: fit.values[effect]})
+    assert (unrest._with_joint_gusts(first, FINE).problem is joint) == used
 
 
 @pytest.mark.parametrize(
@@ -545,10 +544,10 @@ def test_joint_gusts_stand_where_they_need_no_name_at_its_limit(monkeypatch, had
 def test_jitter_is_asked_by_poses_alone_where_something_is_named(
     monkeypatch, alone, aboard, active, coloured, may
 ):
-    monkeypatch.setattr(searched, "is_much_coloured", lambda problem, fit: coloured)
+    stand_in(monkeypatch, "is_much_coloured", lambda problem, fit: coloured)
     problem = SimpleNamespace(sees_poses_alone=alone, aboard=frozenset(aboard))
     found = SimpleNamespace(problem=problem, fit=Fit(active, {}, FINE))
-    assert searched._may_hide_jitter(found) == may  # type: ignore[arg-type]
+    assert rotors._may_hide_jitter(found) == may  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -565,14 +564,14 @@ def test_jitter_stands_where_the_search_in_it_ends_likelier(
     monkeypatch, cost, aboard, coloured, used
 ):
     """With the level and memory from which that search began; and where it is what is seen."""
-    monkeypatch.setattr(searched, "is_much_coloured", lambda problem, fit: coloured)
+    stand_in(monkeypatch, "is_much_coloured", lambda problem, fit: coloured)
     noise = with_jitter(FINE, HeliModel(load_vehicle("lama400d")))
     there = Fit((), {}, noise.with_levels({JITTER_LEVEL: 0.4, JITTER_MEMORY: 0.07}))
     wider = SimpleNamespace(report=lambda text: None, model=HeliModel(load_vehicle("lama400d")))
     costs = {"found": 100.0, "wider": cost}
-    monkeypatch.setattr(searched, "in_jitter", lambda problem, fit, quadratic: (wider, there))
-    monkeypatch.setattr(
-        searched,
+    stand_in(monkeypatch, "in_jitter", lambda problem, fit, quadratic: (wider, there))
+    stand_in(
+        monkeypatch,
         "cost",
         lambda problem, fit, quadratic: costs["wider" if problem is wider else "found"],
     )
@@ -581,9 +580,9 @@ def test_jitter_stands_where_the_search_in_it_ends_likelier(
         fit = Fit((), {}, noise)
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(searched, "_searched", of)
+    stand_in(monkeypatch, "searched_once", of)
     found = of(SimpleNamespace(aboard=frozenset(aboard)), FINE)
-    again, begun = searched._jittery(found, FINE)
+    again, begun = rotors.jittery(found, FINE)
     assert (again.problem is wider) == used and (again is found) != used
     if used:
         assert (begun.level(JITTER_LEVEL), begun.level(JITTER_MEMORY)) == (0.4, 0.07)
@@ -610,11 +609,11 @@ def test_a_cause_that_jitter_was_found_beside_is_not_forgotten(
         begun.append(fit.active)
         return fit, None
 
-    monkeypatch.setattr(searched, "search", search)
-    monkeypatch.setattr(searched, "cost", lambda problem, fit, quadratic: costs[fit.active[0]])
+    stand_in(monkeypatch, "search", search)
+    stand_in(monkeypatch, "cost", lambda problem, fit, quadratic: costs[fit.active[0]])
     droop = Fit(("motor_droop",), {}, FINE)
     best = Searched(SimpleNamespace(), droop, droop, droop, None)  # type: ignore[arg-type]
-    found = searched._nothing_forgotten(best, replace(droop, active=had))
+    found = once.nothing_forgotten(best, replace(droop, active=had))
     assert found.fit.active == (active,) and begun == [had] * searches
 
 
@@ -629,19 +628,19 @@ def test_air_of_each_runs_own_stands_where_little_is_coloured_in_it(monkeypatch,
         asked.append(problem)
         return own, there
 
-    monkeypatch.setattr(searched, "with_own_air", with_own_air)
-    monkeypatch.setattr(
-        searched,
+    stand_in(monkeypatch, "with_own_air", with_own_air)
+    stand_in(
+        monkeypatch,
         "is_much_coloured",
         lambda problem, fit: coloured or (problem, fit) != (own, there),
     )
-    monkeypatch.setattr(searched, "_searched", lambda problem, noise: (problem.name, noise))
+    stand_in(monkeypatch, "searched_once", lambda problem, noise: (problem.name, noise))
     fit = Fit((), {}, FINE)
     found = Searched(SimpleNamespace(), fit, fit, fit, None)  # type: ignore[arg-type]
-    again: Any = searched._with_own_air(found, FINE)
+    again: Any = unrest.in_own_air(found, FINE)
     if coloured:
         assert again == replace(found, air_asked=True)
-        assert searched._with_own_air(again, FINE) == again and len(asked) == 1, "once is enough"
+        assert unrest.in_own_air(again, FINE) == again and len(asked) == 1, "once is enough"
     else:
         assert again == ("own", FINE)
 
@@ -669,11 +668,11 @@ def test_readings_behind_a_low_pass_are_searched_as_they_were_before_it(monkeypa
         fit = Fit(("thrust_exponent",), {}, noise)
         return Searched(problem, fit, fit, fit, None, coarse)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(searched, "_searched", one)
+    stand_in(monkeypatch, "searched_once", one)
     believes_its_sensors(monkeypatch)
-    monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
-    monkeypatch.setattr(searched, "_is_coloured", lambda found, channels: False)
-    monkeypatch.setattr(searched, "low_passes", lambda problem, fit, noise: {"ax": LowPass(0.008)})
+    stand_in(monkeypatch, "in_unrest", lambda best, noise, clock, erring: best)
+    stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
+    stand_in(monkeypatch, "low_passes", lambda problem, fit, noise: {"ax": LowPass(0.008)})
     problem = problem_on(monkeypatch, model, [record], ("thrust_exponent", "wind"))
     found = searched.searched(problem, FINE, {})
     assert found.problem.low_passes == {"ax": LowPass(0.008)}
@@ -727,13 +726,13 @@ def test_strengths_of_gusts_are_fitted_beside_what_stood_them(monkeypatch, white
     def search(problem: Any, noise: Noise) -> Any:
         return SimpleNamespace(problem=problem, fit=Fit(found, {}, noise))
 
-    monkeypatch.setattr(searched, "with_shocks", shaken)
-    monkeypatch.setattr(searched, "_searched", search)
-    monkeypatch.setattr(searched, "is_white", lambda passes, channels: white)
+    stand_in(monkeypatch, "with_shocks", shaken)
+    stand_in(monkeypatch, "searched_once", search)
+    stand_in(monkeypatch, "is_white", lambda passes, channels: white)
     first = SimpleNamespace(
         problem=problem_of("steady"), fit=Fit(("wind",), {}, FINE), refitted=Fit((), {}, FINE)
     )
-    best: Any = searched._searched_in_shocks(first, FINE)  # type: ignore[arg-type]
+    best: Any = unrest._searched_in_shocks(first, FINE)  # type: ignore[arg-type]
     assert asked == beside
     if not white:
         assert best is first
@@ -758,11 +757,11 @@ def test_one_shock_may_be_what_changed_in_flight(monkeypatch, shock, onsets, sha
         asked.append(of[-1])
         return SimpleNamespace(problem=None, fit=None, onsets=onsets)
 
-    monkeypatch.setattr(searched, "only_shock", lambda problem, fit: shock)
-    monkeypatch.setattr(searched, "with_onsets", with_onsets)
-    monkeypatch.setattr(searched, "in_shocks", lambda problem, fit: shaken)
+    stand_in(monkeypatch, "only_shock", lambda problem, fit: shock)
+    stand_in(monkeypatch, "with_onsets", with_onsets)
+    stand_in(monkeypatch, "in_shocks", lambda problem, fit: shaken)
     none: Any = None
-    state = searched._changed(searched.Searched(none, none, none, none, none), {})
+    state = unrest._changed(Searched(none, none, none, none, none), {})
     assert (state is not None) == changed and (state is None or state.changing.onsets == onsets)
     assert asked == ([shock] if shock else [])
 
@@ -790,32 +789,29 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
     behind, without = one("behind", ("wind",)), one("without", names)
-    monkeypatch.setattr(searched, "_searched", lambda problem, noise: one("first", ()))
-    monkeypatch.setattr(searched, "_with_clock_errors", lambda first, noise: first)
-    monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: behind)
-    monkeypatch.setattr(
-        searched, "_with_errors",
+    stand_in(monkeypatch, "searched_once", lambda problem, noise: one("first", ()))
+    stand_in(monkeypatch, "with_true_times", lambda first, noise: first)
+    stand_in(monkeypatch, "before_low_passes", lambda first, noise: behind)
+    stand_in(monkeypatch, "with_errors",
         lambda found, noise, clock: (
             (behind, wider) if found is behind else (without, wider if erring else noise)
         ),
     )  # fmt: skip
-    monkeypatch.setattr(
-        searched, "_is_coloured", lambda found, channels: "ax" in channels and not white
-    )
-    monkeypatch.setattr(
-        searched,
-        "_behind_other_low_passes",
+    stand_in(monkeypatch, "is_coloured", lambda found, channels: "ax" in channels and not white)
+    stand_in(
+        monkeypatch,
+        "behind_other_low_passes",
         lambda problem, found, noise: asked.append("again") or found,
     )
     of_each = {"behind": 50.0, "without": lost}
-    monkeypatch.setattr(searched, "_lost", lambda problem, found: of_each[found.problem.name])
+    stand_in(monkeypatch, "lost", lambda problem, found: of_each[found.problem.name])
     asked: list[Any] = []
 
     def in_unrest(best: Searched, noise: Noise, clock: Any, erring: bool) -> Searched:
         asked.append((noise is wider, erring))
         return best
 
-    monkeypatch.setattr(searched, "_in_unrest", in_unrest)
+    stand_in(monkeypatch, "in_unrest", in_unrest)
     found = searched.searched("as given", levels, {})  # type: ignore[arg-type]
     assert found.problem.name == taken  # type: ignore[attr-defined]
     assert asked == (["again", (True, True)] if erring else [(False, False)])
@@ -860,11 +856,11 @@ def test_low_passes_are_fitted_once_more_beside_errors_that_last(
     monkeypatch.setattr(
         problem_module, "records_before", lambda logged, channels, those: (logged, those)
     )
-    monkeypatch.setattr(searched, "low_passes", low_passes)
+    stand_in(monkeypatch, "low_passes", low_passes)
     found = of(given.behind({**had, **OF_ROTORS}, "logged"), levels)
-    monkeypatch.setattr(searched, "_searched", of)
-    monkeypatch.setattr(searched, "_lost", lambda problem, it: 50.0 if it is found else lost)
-    best = searched._behind_other_low_passes(given, found, levels)
+    stand_in(monkeypatch, "searched_once", of)
+    stand_in(monkeypatch, "lost", lambda problem, it: 50.0 if it is found else lost)
+    best = readings.behind_other_low_passes(given, found, levels)
     assert asked == ([("logged", levels, groups)] if groups else [])
     assert (best is found) == (taken == "found")
     if best is not found:
@@ -897,15 +893,14 @@ def test_gusts_that_are_known_may_leave_nothing_of_a_low_pass(
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
     first = one("as logged")
-    monkeypatch.setattr(searched, "_rotors_first", lambda problem, noise: (first, noise))
-    monkeypatch.setattr(
-        searched, "_is_coloured",
+    stand_in(monkeypatch, "rotors_first", lambda problem, noise: (first, noise))
+    stand_in(monkeypatch, "is_coloured",
         lambda found, channels: "ax" in channels and coloured[found.problem.name],
     )  # fmt: skip
-    monkeypatch.setattr(searched, "_with_clock_errors", lambda first, noise: first)
-    monkeypatch.setattr(searched, "_before_low_passes", lambda first, noise: one("behind"))
-    monkeypatch.setattr(searched, "_with_errors", lambda found, noise, clock: (found, noise))
-    monkeypatch.setattr(searched, "_in_unrest", lambda best, noise, clock, erring: best)
-    monkeypatch.setattr(searched, "_lost", lambda problem, found: worth[found.problem.name])
+    stand_in(monkeypatch, "with_true_times", lambda first, noise: first)
+    stand_in(monkeypatch, "before_low_passes", lambda first, noise: one("behind"))
+    stand_in(monkeypatch, "with_errors", lambda found, noise, clock: (found, noise))
+    stand_in(monkeypatch, "in_unrest", lambda best, noise, clock, erring: best)
+    stand_in(monkeypatch, "lost", lambda problem, found: worth[found.problem.name])
     found = searched.searched(first.problem, noise, {})
     assert found.problem.name == taken  # type: ignore[attr-defined]

@@ -1,0 +1,148 @@
+"""One search: noise and numbers of the model as given, then causes until none pays.
+
+Where commands are late it is done again with a delay of the readings' own (estimation/helicopter.py),
+if that is likelier: what was found beside a delay that is off by a part of a row may stand for that
+part.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from scipy.optimize import minimize_scalar
+
+from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
+from coax_env.diagnosis.onsets.changing import Changing
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.scores import cost
+from coax_env.diagnosis.search import search
+from coax_env.estimation.helicopter_noise import LEAST_READING_STD
+from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.state_space import Noise
+from coax_env.estimation.whiteness import are_white, whiteness
+
+READ_WITHIN = 0.02
+"""Of a row, to which the delay of the commands that readings see is looked for; ours."""
+
+
+@dataclass(frozen=True)
+class Searched:
+    """The model as given, with its own numbers refitted, and with causes; the quadratic at the last.
+
+    problem: what was searched.
+    coarse: whether readings were taken to be no finer than LEAST_READING_STD.
+    changing: with what began or changed in flight, where that has been asked already.
+    of_next: share of the next row's command in a row's, 0 where commands are held (slow_commands.py).
+    air_asked: whether it has been asked if runs have air of their own.
+    """
+
+    problem: Problem
+    bare: Fit
+    refitted: Fit
+    fit: Fit
+    quadratic: Quadratic
+    coarse: bool = False
+    changing: Changing | None = None
+    of_next: float = 0.0
+    air_asked: bool = False
+
+    @property
+    def cost(self) -> float:
+        """Minus the log evidence of what was found [nats]."""
+        return cost(self.problem, self.fit, self.quadratic)
+
+
+def searched_once(problem: Problem, noise: Noise, coarse: bool = False) -> Searched:
+    """One search, from the model as given on.
+
+    Args:
+        problem: what may be free. noise: levels to start from.
+        coarse: whether levels of readings that are finer than a rigid body are held.
+    """
+    bare, refitted = as_given(problem, noise, coarse)
+    problem.report("searching for causes")
+    return searched_from(problem, bare, refitted, refitted, coarse)
+
+
+def as_given(problem: Problem, noise: Noise, coarse: bool = False) -> tuple[Fit, Fit]:
+    """The model as given, and with its own numbers refitted, each with its own noise.
+
+    Args:
+        problem, noise, coarse: as in `searched_once`.
+    """
+    problem.report("estimating gusts and noise of the model as given")
+    bare = start(problem, noise, held=LEAST_READING_STD if coarse else ())
+    problem.report("fitting the model's own parameters")
+    return bare, steadied(problem, noise_fitted(problem, fitted(problem, bare)))
+
+
+def searched_from(
+    problem: Problem, bare: Fit, refitted: Fit, begin: Fit, coarse: bool = False
+) -> Searched:
+    """The search from a fit, and again where readings see late commands at their own delay.
+
+    Args:
+        problem, coarse: as in `searched_once`. bare, refitted: of `as_given`.
+        begin: with what is found already.
+    """
+    fit, quadratic = search(problem, begin)
+    late = _with_late_readings(problem, fit)
+    if late is not None:
+        problem = late  # without a delay it is as it was: `refitted` stays
+        problem.report("searching again with readings that see late commands at their own delay")
+        fit, quadratic = search(problem, refitted)
+    return Searched(problem, bare, refitted, fit, quadratic, coarse)
+
+
+def likelier(best: Searched, found: Fit) -> Searched:
+    """That, or what a search from something else ends with, where it is likelier.
+
+    Errors of a sensor that last take up what is always wrong with it, where they are fitted first: a
+    bias that every run has is eight errors alike.
+
+    Args:
+        best: from no cause. found: causes in the same problem.
+    """
+    if not found.active:
+        return best
+    fit, quadratic = search(best.problem, found)
+    other = replace(best, fit=fit, quadratic=quadratic)
+    return best if best.cost <= other.cost else other
+
+
+def nothing_forgotten(best: Searched, found: Fit) -> Searched:
+    """`likelier`, where the search ended without a cause that jitter was found beside.
+
+    In jitter, which takes up a part of what it was fitted without, another cause may come first: a
+    droop of the motors in the place of their lag, which no single step exchanges (**synthetic**).
+
+    Args:
+        best: from no cause. found: causes in the same problem, jitter in it.
+    """
+    return best if set(found.active) <= set(best.fit.active) else likelier(best, found)
+
+
+def _with_late_readings(problem: Problem, fit: Fit) -> Problem | None:
+    """The problem whose readings see late commands at their own delay, where that is likelier."""
+    delay = fit.values.get("command_delay.time", 0.0)
+    if delay <= 0.0 or problem.model.read_delay is not None:
+        return None
+
+    def read_after(seconds: float) -> Problem:
+        return problem.with_model(problem.model.reading_after(seconds))
+
+    row = problem.row
+    best = minimize_scalar(
+        lambda seconds: -read_after(seconds).engine.log_likelihood(fit.values, fit.noise),
+        bounds=(max(delay - row, 0.0), delay + row), method="bounded",
+        options={"xatol": READ_WITHIN * row},
+    )  # fmt: skip
+    late = read_after(float(best.x))
+    trial = fitted(late, noise_fitted(late, fitted(late, fit)))
+    return late if trial.objective < fit.objective - problem.settings.tie else None
+
+
+def is_coloured(found: Searched, channels: Sequence[str]) -> bool:
+    """Whether one of some channels is."""
+    passes = found.problem.engine.filter(found.fit.values, found.fit.noise)
+    shown = whiteness(passes, found.problem.model.channels)
+    return not are_white(shown, channels)
