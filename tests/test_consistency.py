@@ -289,6 +289,7 @@ def test_a_column_that_was_written_in_another_unit_is_found():
     assert found.advice.lines == ("phi = { scale = 57.2958 }",)
 
 
+@pytest.mark.slow
 def test_a_check_can_be_waived(tmp_path):
     flight = planted(BUNDLED, tmp_path / "f", "h = { sign = -1 }")
     vehicle = load_vehicle("lama400d").in_air(flight.air)
@@ -312,6 +313,7 @@ def test_every_fault_can_be_waived_by_its_name(tmp_path):
         assert checked(flight, failed).faults == ()
 
 
+@pytest.mark.slow
 def test_air_of_another_planet_and_unlogged_swash_are_refused(tmp_path):
     card = copied(tmp_path / "f", *RUNS, "hover") / "card.toml"
     card.write_text(card.read_text().replace("density = 1.14", "density = 1140"))

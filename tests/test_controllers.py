@@ -586,6 +586,7 @@ def test_a_design_on_the_diagnosed_model_halves_the_cost_of_flying_the_machine()
 # --- policies as plain arrays --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_shipped_policy_hovers_without_torch():
     code = """
 import sys
@@ -877,6 +878,7 @@ def test_policies_of_both_models_begin_alike_and_each_is_the_best_on_its_own(tmp
     assert made == {path: path.stat().st_mtime_ns for path in policies.rglob("score.json")}
 
 
+@pytest.mark.slow
 def test_machines_are_flown_once(tmp_path):
     from controllers import machines
 

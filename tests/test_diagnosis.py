@@ -423,6 +423,7 @@ def test_hold_out_none_fits_everything(still):
     assert result.innovations_after["lon_3211"]["t"][-1] > 11.0
 
 
+@pytest.mark.slow
 def test_hold_out_as_told(still):
     result = diagnose(still, hold_out=["lat_3211", "yaw_3211"], exclude=FEW)
     assert set(result.findings["gain"]["held_out"]) == {"lat_3211", "yaw_3211"}

@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from test_estimation import CHANNELS, DT, NOISE, RATE, TRUTH, Pendulum, stacked, swing
 
 from coax_env.estimation import gust_strength
 from coax_env.estimation.engine import Engine
-from coax_env.estimation.gust_strength import BLOCK, SPREAD, with_strengths
+from coax_env.estimation.gust_strength import BLOCK, SPREAD, prior_cost, with_strengths
 from coax_env.estimation.state_space import STEADY, Record, Strength, part
 
 
@@ -88,6 +89,15 @@ def test_every_turn_goes_up(monkeypatch):
         height = Engine(Pendulum(), records).log_likelihood(TRUTH, NOISE)
         heights.append(height - 0.5 * float(np.sum(logs**2)))
     assert np.all(np.diff(heights) > 0.0) and heights[-1] > heights[0] + 20.0
+
+
+def test_the_prior_is_a_normal_of_the_logarithms():
+    drawn = np.exp(SPREAD * np.random.default_rng(1).standard_normal((2, 4)))
+    records = [of_blocks(swing(7, n=48), factor) for factor in drawn]
+    log_density = norm.logpdf(np.log(drawn), scale=SPREAD).sum()
+    at_one = drawn.size * norm.logpdf(0.0, scale=SPREAD)
+    assert prior_cost([*records, swing(8)]) == pytest.approx(at_one - log_density)
+    assert prior_cost([swing(8)]) == 0.0
 
 
 def test_steady_noise_has_hardly_any_strengths():

@@ -114,6 +114,7 @@ def test_channels_are_chosen(flight):
             identify(flight, LAMA, channels=bad)
 
 
+@pytest.mark.slow
 def test_held_out_runs_are_flown_again_and_not_fitted(flight):
     result = identify(flight, LAMA, hold_out=["yaw_3211"])
     assert [run.name for run in result.replay_after] == ["yaw_3211"]
@@ -122,6 +123,7 @@ def test_held_out_runs_are_flown_again_and_not_fitted(flight):
         identify(flight, LAMA, hold_out=flight.run_names)
 
 
+@pytest.mark.slow
 def test_sensor_biases_are_fitted_on_request():
     biased = LAMA.with_effect("gyro_bias", x=0.02, y=-0.03, z=0.01)
     result = identify(simulate(biased, ("lon_3211", "hover"), seed=3), LAMA, also=["gyro_bias"])

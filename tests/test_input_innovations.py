@@ -216,6 +216,7 @@ def moved_start(t: np.ndarray, horizon: float = 1.0) -> int:
     return int(np.searchsorted(t, times[-1] - 1e-6))
 
 
+@pytest.mark.slow
 def test_in_still_air_the_commands_carry_no_information(tmp_path):
     injector.fly(tmp_path, {}, gusts=False, sensors="full", seed=3, runs=("lon_3211", "hover"))
     problem, fit = problem_on(tmp_path)

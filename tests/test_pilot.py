@@ -89,6 +89,7 @@ def test_corrections_go_against_the_error(flown):
     assert turning[0] * turning[1] < 0.0
 
 
+@pytest.mark.slow
 def test_hands_tremble_with_their_std_and_memory():
     """A first-order process: correlation e^-1 after its memory, at whatever rate he is asked."""
     lasts = 600.0  # s

@@ -48,6 +48,7 @@ def test_a_hedge_leaves_what_the_file_says_of_a_lag():
     assert lqr.hedged(LAMA, {}) is LAMA or lqr.hedged(LAMA, {}).values() == LAMA.values()
 
 
+@pytest.mark.slow
 def test_a_hedge_costs_nothing_without_lags_and_saves_most_with_them(lqg, hedged):
     here, there = (
         [evaluate(one, flown, 10, seed=500)["mean_cost"] for one in (lqg, hedged)]
@@ -104,6 +105,7 @@ def test_the_closed_loop_keeps_below_gamma(robust):
     assert 0.8 * robust.least_gamma < largest < 1.001 * robust.gamma
 
 
+@pytest.mark.slow
 def test_its_loop_is_more_robust_than_lqgs_and_its_hover_as_cheap(robust, lqg):
     from controllers import hinf
 

@@ -703,14 +703,24 @@ def test_what_hides_behind_a_low_pass(active, own, smoothed, hidden):
 
 
 @pytest.mark.parametrize(
-    ("white", "found", "beside"),
+    ("white", "found", "nats", "beside", "taken"),
     [
-        (False, ("wind",), ["wind"]),  # strengths do not make innovations white: none are used
-        (True, (), ["wind", "refitted"]),  # nothing stands strengths of the model without a cause
-        (True, ("wind",), ["wind", "refitted", "wind"]),  # what stands them is asked beside its own
+        (False, ("wind",), 0.0, ["wind"], "steady"),  # not white with strengths: none are used
+        (
+            True,
+            ("wind",),
+            90.0,
+            ["wind", "refitted", "wind"],
+            "strengths 3",
+        ),  # stands them, and its own
+        (True, (), 30.0, ["wind", "refitted"], "strengths 2"),  # what shocks took up stays so
+        (True, (), 90.0, ["wind", "refitted"], "strengths 1"),  # but where it is likelier, surely
+        (True, ("cg_offset",), 90.0, ["wind", "refitted", "cg_offset"], "strengths 1"),
     ],
 )
-def test_strengths_of_gusts_are_fitted_beside_what_stood_them(monkeypatch, white, found, beside):
+def test_strengths_of_gusts_are_fitted_beside_what_stood_them(
+    monkeypatch, white, found, nats, beside, taken
+):
     """The engine's likelihoods are no part of this: which model's strengths are asked, and used."""
     asked: list[str] = []
 
@@ -719,25 +729,30 @@ def test_strengths_of_gusts_are_fitted_beside_what_stood_them(monkeypatch, white
         return problem_of(f"strengths {len(asked)}"), fit
 
     def problem_of(name: str) -> Any:
-        engine = SimpleNamespace(filter=lambda values, noise: [])
-        model = SimpleNamespace(channels=())
-        return SimpleNamespace(name=name, engine=engine, model=model, report=lambda text: None)
+        records = [
+            SimpleNamespace(strength=SimpleNamespace(steady=False, factor=np.full((2, 3), 4.0)))
+        ]
+        engine = SimpleNamespace(filter=lambda values, noise: [], records=records)
+        return SimpleNamespace(
+            name=name, engine=engine, model=SimpleNamespace(channels=()), settings=SETTINGS,
+            report=lambda text: None,
+        )  # fmt: skip
 
     def search(problem: Any, noise: Noise) -> Any:
-        return SimpleNamespace(problem=problem, fit=Fit(found, {}, noise))
+        first = problem.name == "strengths 1"
+        active = ("wind",) if first else found
+        return SimpleNamespace(
+            problem=problem, fit=Fit(active, {}, noise), cost=-nats if first else 0.0
+        )
 
     stand_in(monkeypatch, "with_shocks", shaken)
     stand_in(monkeypatch, "searched_once", search)
     stand_in(monkeypatch, "is_white", lambda passes, channels: white)
-    first = SimpleNamespace(
+    first: Any = SimpleNamespace(
         problem=problem_of("steady"), fit=Fit(("wind",), {}, FINE), refitted=Fit((), {}, FINE)
     )
-    best: Any = unrest._searched_in_shocks(first, FINE)  # type: ignore[arg-type]
-    assert asked == beside
-    if not white:
-        assert best is first
-    else:
-        assert best.problem.name == f"strengths {len(beside)}"
+    best: Any = unrest._searched_in_shocks(first, FINE)
+    assert asked == beside and best.problem.name == taken
 
 
 @pytest.mark.parametrize(
