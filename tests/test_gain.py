@@ -15,6 +15,7 @@ import pytest
 from coax_env.diagnosis import gain as gain_module
 from coax_env.diagnosis.gain import BLOCK, flies_worse, gain_of, likelier_without
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.remarks import lost_in_noise
 from coax_env.estimation.prediction import ChannelReplay, RunReplay
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
@@ -107,6 +108,29 @@ def test_below_the_noise_nothing_is_left_and_no_error_is_no_channel():
     none = gain(run({"q": 0.04}), run({"q": 0.04}), run({"q": 0.04}))
     assert none["error_removed_percent"] is None and none["ci95"] == [None, None]
     assert none["channels"]["q"]["after"] == pytest.approx(0.04)
+
+
+def test_a_channel_that_is_lost_in_noise_counts_by_chance():
+    """Pitch rate 0.0502 by chance over a noise of 0.05, an error of 0.0045, then 0.0135: thrice."""
+    rng = np.random.default_rng(3)
+
+    def drawn(rms: float) -> np.ndarray:
+        noise = rng.standard_normal(400)
+        return rms * noise / np.sqrt(np.mean(noise**2))
+
+    bare = run({"h": 0.5, "q": drawn(0.0502)}, starts=400)
+    after = run({"h": math.hypot(0.3, 0.2), "q": drawn(math.hypot(0.05, 0.0135))}, starts=400)
+    found = gain(bare, bare, after)
+    assert found["error_removed_percent"] == pytest.approx(100.0 * (1 - (0.5 + 3.0) / 2), abs=2.0)
+    other = found["beyond_noise"]
+    assert other["without"] == ["q"]
+    assert other["error_removed_percent"] == pytest.approx(50.0)
+    assert other["ci95"] == pytest.approx([50.0, 50.0])
+    (words,) = lost_in_noise(found)
+    assert "pitch rate" in words and "50 %" in words
+    assert not flies_worse(found, begun=False)
+    told = gain(run({"h": 0.5, "q": 0.13}), bare, after)
+    assert "beyond_noise" not in told and lost_in_noise(told) == [] and lost_in_noise(None) == []
 
 
 def test_the_rms_is_over_all_starts_of_all_runs():

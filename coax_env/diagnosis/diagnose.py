@@ -47,6 +47,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import (
     answered_gusts,
     held_out_before,
+    lost_in_noise,
     one_step_against_a_second,
     remarks,
     vibration_removed,
@@ -268,6 +269,7 @@ def diagnose(
             *([oscillation_remark(swinging)] if swinging else []),
             *([slow_commands.remark(first.of_next)] if first.of_next else []),
             *remarks(problem, fit, quadratic, {e: found[e] for e in found if trust[e].named}),
+            *lost_in_noise(gain),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
             *answered_gusts(gain),
             *held_out_before(gain, causes, flight.run_names),

@@ -26,6 +26,9 @@ from coax_env.model.effects import CATALOGUE
 from coax_env.model.layout import AXES_OF_GUSTS, ERRING_GROUPS
 from coax_env.plain_words import and_list, channel_name, plain, with_unit
 
+OTHERWISE = 5.0
+"""Percent by which the gain must be another one without channels that are lost in noise; ours."""
+
 
 def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternatives) -> list[str]:
     """Every remark on a finished diagnosis.
@@ -61,6 +64,30 @@ def vibration_removed(lines: Sequence[Line]) -> str:
         f"the body shakes at the {lines[0].rotor} rotor's speed: {sizes};"
         " that line was taken out of these readings before anything else was looked for"
     )
+
+
+def lost_in_noise(gain: Mapping[str, Any] | None) -> list[str]:
+    """That channels count in the gain whose error is not told from their sensors' noise.
+
+    Only where it is another gain without them, by OTHERWISE percent.
+
+    Args:
+        gain: of the corrected model on the held-out runs.
+    """
+    other = (gain or {}).get("beyond_noise")
+    if not gain or other is None or other["error_removed_percent"] is None:
+        return []
+    if abs(other["error_removed_percent"] - gain["error_removed_percent"]) < OTHERWISE:
+        return []
+    low, high = other["ci95"]
+    interval = "" if low is None else f" ({low:.0f} to {high:.0f})"
+    channels = other["without"]
+    whose = "its sensor's" if len(channels) == 1 else "their sensors'"
+    return [
+        f"on the held-out runs the error of {and_list([channel_name(c) for c in channels])} is not "
+        f"told from {whose} noise, and counts in the gain by chance; by the other channels "
+        f"{other['error_removed_percent']:.0f} % of the error is removed{interval}"
+    ]
 
 
 def one_step_against_a_second(
