@@ -487,12 +487,11 @@ def test_a_change_that_a_shock_may_have_made_has_no_name_with_one_thing_more(
 
 
 @pytest.mark.parametrize(
-    ("nats", "of_moment", "poses_alone", "named"),
-    [(27.0, 21.0, False, False), (29.0, 21.0, False, True), (27.0, 43.0, False, True),
-     (27.0, math.inf, False, True), (33.0, 21.0, True, False), (43.0, 21.0, True, True),
-     (33.0, 43.0, True, True), (33.0, math.inf, True, True)],
-)  # fmt: skip
-def test_what_changed_in_flight_by_little_has_no_name(nats, of_moment, poses_alone, named):
+    ("nats", "of_moment", "named"),
+    [(41.0, 21.0, False), (43.0, 21.0, True), (27.0, 43.0, True), (27.0, math.inf, True)],
+)
+@pytest.mark.parametrize("poses_alone", [False, True])
+def test_what_changed_in_flight_by_little_has_no_name(nats, of_moment, named, poses_alone):
     """A centre of gravity that moved by 0.8 mm, by poses alone a swash offset (**synthetic**, clean);
     what was always so has its own threshold, and a moment may be clear where the cause is weak."""
     of = known_of(nats=nats, of_moment=of_moment, poses_alone=poses_alone)

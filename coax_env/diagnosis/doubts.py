@@ -104,9 +104,8 @@ class Against:
         return self.of_moment < chosen.sure_evidence
 
     def is_little_change(self, chosen: Settings) -> bool:
-        """Whether that is so, and it is worth little itself; by poses alone no less than that is."""
-        least = chosen.sure_evidence if self.poses_alone else chosen.change_evidence
-        return self.may_have_been_constant(chosen) and self.nats < least
+        """Whether that is so, and it is worth little itself."""
+        return self.may_have_been_constant(chosen) and self.nats < chosen.sure_evidence
 
     def may_be_shock(self, chosen: Settings) -> bool:
         """Whether that is so where gusts come in single shocks."""

@@ -28,11 +28,6 @@ class Settings:
     """The same by poses alone that come seldom, where neither is seen in time. Measured by a camera
     (`study_diagnosis.py --arms camera`, seeds 790 and 791): on four clean flights the strongest was
     worth 47 to 58 nats before, a play or a motor lag; three plays of 45 to 62 had had a name."""
-    change_evidence: float = 28.0
-    """nats that a cause must be worth to have a name where that it began, ended or changed in flight is
-    worth less than `sure_evidence`: any effect could have, at any moment. By poses alone that much is
-    asked of the cause, too. Measured: three of some 600 clean flights had such a cause, of 18, 26 and
-    27, and by poses alone another, of 33 (`--arms mixed_poses`, seed 798, clean 55)."""
     tie: float = 6.0
     """nats within which alternatives are confounded: odds of 400 to 1, ours."""
     form_share: float = 0.1
@@ -151,7 +146,12 @@ class Settings:
     level, one at its floor above all, is not felt and not varied."""
     sure_evidence: float = 42.0
     """nats: three thresholds. Measured (`study_diagnosis.py --arms all`, seeds 50 to 52, 310 flights):
-    so 92 of 110 true names stay sure, and 1 of 8 false ones; of four for effects in no list, none."""
+    so 92 of 110 true names stay sure, and 1 of 8 false ones; of four for effects in no list, none.
+
+    And nats that a cause must be worth to have a name where that it began, ended or changed in flight
+    is worth less: any effect could have, at any moment. Measured: four of some 940 clean flights had
+    such a cause, of 18, 26, 27 and 29 (the last: `--arms mixed`, seed 805, clean 100), and by poses
+    alone another, of 33."""
     shocks: float = 3.0
     """Excess kurtosis of the gusts' increments from which they come in shocks: that of a Laplace
     distribution. Measured: 0.1 to 2.4 of gusts that do not, 5.9 to 154 of those that do (shocks.py)."""
