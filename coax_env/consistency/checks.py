@@ -20,7 +20,7 @@ from coax_env.model.layout import CHANNELS, ROTOR_SPEEDS
 # --- when a coefficient speaks, all ours --------------------------------------------------------
 
 LEAST_STRENGTH = 4.0
-"""Std from 0 at which a sign is seen..."""
+"""Std from 0 at which a coefficient is seen: its sign..."""
 LEAST_CONTRAST = 6.0
 """...if it is so many std from 1..."""
 LEAST_SHARE = 0.25
@@ -320,6 +320,7 @@ def _fault_of(c: Coefficient, gusts_felt: bool, rows: EvenRows) -> Fault | None:
         c.exact
         and gusts_felt
         and c.share > LEAST_SHARE_OF_SMALL
+        and c.strength > LEAST_STRENGTH  # of a few windows some such share is by chance
         and c.value + CLEAR_OF * c.std < LEAST
     ):
         return Fault(c.check, f"{c.left} goes {measured} times as far as {c.part} says", channels)
