@@ -21,7 +21,7 @@ from coax_env.estimation.helicopter import HeliModel, Moment
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.low_pass import LowPass
 from coax_env.estimation.rotor_jitter import with_jitter
-from coax_env.estimation.state_space import Noise, Record
+from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.model.layout import ACCELEROMETERS, GYROS, ROTOR_SPEEDS, RPM_PER_RAD_S
 
 MODULES = (once, rotors, readings, unrest, searched)
@@ -161,6 +161,77 @@ def test_rotors_stray_where_what_parts_them_from_their_commands_has_a_memory(
         model=SimpleNamespace(channels=ROTOR_SPEEDS), engine=SimpleNamespace(records=[record])
     )
     assert rotors._rotors_stray(problem) == strays
+
+
+LAGGING = 0.03
+
+
+@pytest.mark.parametrize(
+    ("lagging", "commanded", "found", "unshown"),
+    [
+        (True, True, LAGGING, False),
+        (False, True, LAGGING, True),  # jitter with that memory
+        (True, False, LAGGING, True),  # of shaken rotors under one command nothing is told
+        (False, True, 0.004, True),  # shorter than a row
+    ],
+)
+def test_a_lag_must_be_shown_by_answers_to_commands(lagging, commanded, found, unshown):
+    """Rotors that are shaken, in both with the memory of the lag; readings 2 rev/min off."""
+    rng = np.random.default_rng(5)
+    n, dt = 2000, 0.01
+    steps = 210.0 + 4.0 * np.repeat(rng.standard_normal((n // 20, 1)), 20, axis=0)
+    command = np.tile(steps if commanded else np.full((n, 1), 210.0), (1, 4))
+    stays = np.exp(-dt / LAGGING)
+    shaken = lfilter([1.0], [1.0, -stays], 0.2 * rng.standard_normal(n))
+    speed = command[:, 0].copy()
+    if lagging:
+        for k in range(n - 1):
+            speed[k + 1] = command[k, 0] + stays * (speed[k] - command[k, 0])
+    read = RPM_PER_RAD_S * (speed + shaken) + 2.0 * rng.standard_normal(n)
+    record = Record(
+        "hover", dt * np.arange(n), command, np.stack([read, np.full(n, np.nan)], axis=1)
+    )
+    names = [FreeParameter(f"motor_lag.{rotor}", 0.0, 0.1) for rotor in ("upper", "lower")]
+    problem: Any = SimpleNamespace(
+        row=dt, own={"motor_lag": names}, aboard=frozenset(ROTOR_SPEEDS[:1]),
+        model=SimpleNamespace(channels=ROTOR_SPEEDS), engine=SimpleNamespace(records=[record]),
+    )  # fmt: skip
+    fit = Fit(("motor_lag",), {f.name: found for f in names}, FINE)
+    asked: Any = SimpleNamespace(problem=problem, fit=fit)
+    assert rotors.is_lag_unshown(asked) == unshown
+    assert not rotors.is_lag_unshown(SimpleNamespace(problem=problem, fit=replace(fit, active=())))
+    problem.aboard = frozenset({"r"})
+    assert not rotors.is_lag_unshown(asked), "no speed is read"
+
+
+@pytest.mark.parametrize(
+    ("coloured", "unshown", "asked"),
+    [(False, False, False), (True, False, True), (False, True, True)],
+)
+def test_jitter_is_asked_where_speeds_are_coloured_or_a_lag_is_not_shown(
+    monkeypatch, coloured, unshown, asked
+):
+    levels = Noise({"rotor_jitter": 0.2})
+
+    def one(problem: Any, noise: Noise) -> Any:
+        fit = Fit(("motor_lag",), {}, noise)
+        return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
+
+    def jittery(found: Searched, noise: Noise) -> Any:
+        return replace(found, fit=Fit((), {}, levels)), levels
+
+    for name, instead in {
+        "searched_once": one, "jittery": jittery, "is_lag_unshown": lambda found: unshown,
+        "is_coloured": lambda found, channels: coloured and found.fit.active != (),
+        "with_true_times": lambda found, noise: found, "in_own_air": lambda found, noise: found,
+        "before_low_passes": lambda first, noise: None,
+        "with_errors": lambda found, noise, clock: (found, noise),
+        "in_unrest": lambda best, noise, clock, erring: best,
+    }.items():  # fmt: skip
+        stand_in(monkeypatch, name, instead)
+    problem: Any = SimpleNamespace(smoothed=False)
+    found = searched.searched(problem, FINE, {})
+    assert found.fit.active == (() if asked else ("motor_lag",))
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,12 @@ from coax_env.diagnosis.searches.readings import (
     with_errors,
     with_true_times,
 )
-from coax_env.diagnosis.searches.rotors import jittery, rotors_first, with_late_speeds
+from coax_env.diagnosis.searches.rotors import (
+    is_lag_unshown,
+    jittery,
+    rotors_first,
+    with_late_speeds,
+)
 from coax_env.diagnosis.searches.unrest import in_own_air, in_unrest
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.state_space import Noise
@@ -45,7 +50,7 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     given = noise
     first, noise = rotors_first(problem, noise) or (searched_once(problem, noise), noise)
     late = with_late_speeds(problem, first.problem, first.fit, given)
-    if late is None and is_coloured(first, ROTOR_SPEEDS):
+    if late is None and (is_coloured(first, ROTOR_SPEEDS) or is_lag_unshown(first)):
         first, noise = jittery(first, noise)
         if is_coloured(first, ROTOR_SPEEDS):
             late = with_late_speeds(problem, first.problem, first.fit, given, coloured=True)
