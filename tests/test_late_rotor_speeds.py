@@ -1,18 +1,22 @@
 """When measured rotor speeds are taken to come late: the decisions, on fits that are stood in for."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import injector
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
 from coax_env.diagnosis import late_rotor_speeds
+from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.late_rotor_speeds import (
     LAG,
     ByOthers,
     behind_low_pass,
+    by_speeds_alone,
     come_late,
     with_less_lag,
     without_rotor_speeds,
@@ -77,6 +81,36 @@ def test_speeds_may_be_late_where_all_else_has_less_of_a_lag(
     found = with_less_lag(problem, lag_of(0.02, active))
     assert (found and found.fit) == (trial if asked else None)
     assert found is None or found.gained == gained
+
+
+@pytest.mark.parametrize(
+    ("shown", "active", "aboard", "slow", "alone"),
+    [
+        (13.9, (LAG,), CHANNELS, False, True),
+        (14.1, (LAG,), CHANNELS, False, False),
+        (-50.0, (LAG,), CHANNELS, False, True),
+        (math.nan, (LAG,), CHANNELS, False, False),  # the filter diverges without it
+        (0.0, ("wind",), CHANNELS, False, False),
+        (0.0, (LAG,), ("az",), False, False),  # no speed is read: something else shows it
+        (0.0, (LAG,), ("rpm_upper",), False, False),  # poses alone are not asked
+        (0.0, (LAG,), CHANNELS, True, False),
+    ],
+)
+def test_a_lag_may_be_shown_by_rotor_speeds_alone(shown, active, aboard, slow, alone):
+    problem = problem_of({0.02: shown, 0.0: 0.0}, aboard, slow)
+    assert by_speeds_alone(problem, lag_of(0.02, active)) == alone
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("run", "named"), [("hover", False), ("yaw_3211", True)])
+def test_a_lag_is_named_where_torque_shows_it(tmp_path, run, named):
+    """60 ms, one run of 14 s in gusts: in hover nobody can tell the motors from what reads speeds."""
+    lag = {"motor_lag": {"upper": 0.06, "lower": 0.06}}
+    injector.fly(tmp_path, lag, gusts=True, seed=11, runs=[run], longest=14.0)
+    (tmp_path / "truth.json").unlink()
+    found = diagnose(tmp_path).findings
+    assert [cause["effect"] for cause in found["causes"]] == [LAG] * named
+    assert [term.get("like") for term in found["unexplained"]] == [LAG] * (not named)
 
 
 @pytest.mark.parametrize(

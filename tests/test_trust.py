@@ -311,6 +311,7 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
         may_be_none=False, flies_worse=False, within_form=False, alternatives=(), nats=100.0,
         of_moment=math.inf, shaken=False, poses_alone=False, clock_error=0.0, smoothed=False,
         errors_left=0.0, beside_terms=(), beside_moved=(), taken_back_by="",
+        by_speeds_alone=False,
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -452,6 +453,13 @@ def test_a_tilt_and_a_bias_that_do_nothing_at_rest_are_doubted(share, alike):
     of = known_of(taken_back_by="accel_bias")
     (doubt,) = doubts("imu_tilt", {"imu_tilt": of}, SETTINGS)
     assert "accel bias beside it" in doubt and not without_name({"imu_tilt": of}, SETTINGS)
+
+
+def test_a_lag_that_rotor_speeds_alone_show_has_no_name():
+    of = known_of(by_speeds_alone=True)
+    assert without_name({"motor_lag": of}, SETTINGS) == {"motor_lag"}
+    (doubt,) = doubts("motor_lag", {"motor_lag": of}, SETTINGS)
+    assert "rotors' speeds" in doubt
 
 
 @pytest.mark.parametrize("none", [False, True])

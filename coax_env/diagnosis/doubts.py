@@ -2,9 +2,10 @@
 
 What stands at the limit of what is believed and is not determined, or does not hold under other noise
 or on parts of the flights, stands for something else; so does what the readings of a channel that
-should show it are likelier without. What changed in flight, by little evidence, has no name: a hub
-stiffness, a servo's delay and a centre of gravity did on three clean **synthetic** flights, for 18 to
-27 nats, and by poses alone a swash offset for 33. Two of these take a name, too: noise left where it
+should show it are likelier without; a motor's lag that measured rotor speeds alone show may be that of
+their readings. What changed in flight, by little evidence, has no name: a hub stiffness, a servo's
+delay, a centre of gravity and an accelerometer's bias did on four clean **synthetic** flights, for 18
+to 29 nats, and by poses alone a swash offset for 33. Two of these take a name, too: noise left where it
 shows, little evidence there or by poses alone, other noise, parts of the flights, such a one beside it,
 numbers of which none is known to be another than nothing, held-out runs that the model flies worse with
 the causes and that are likelier without it, a share of what all causes explain that their forms may be
@@ -67,6 +68,7 @@ class Against:
         beside_terms: channels among its own in which what no effect explains acts, too.
         beside_moved: numbers of the vehicle far from its file's that show in channels among its own.
         taken_back_by: a cause that takes back at rest what it does; empty: none.
+        by_speeds_alone: whether it is a motor's lag that measured rotor speeds alone show.
     """
 
     channels: tuple[str, ...]
@@ -93,6 +95,7 @@ class Against:
     beside_terms: tuple[str, ...]
     beside_moved: tuple[str, ...]
     taken_back_by: str
+    by_speeds_alone: bool
 
     @property
     def at_limit(self) -> bool:
@@ -164,6 +167,7 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         if effect in standing_in
         or of.likelier_without
         or of.is_little_change(chosen)
+        or of.by_speeds_alone
         or voices(effect, of) >= SPEAKING_AGAINST
     }
 
@@ -205,6 +209,11 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
     if of.taken_back_by:
         other = plain(of.taken_back_by)
         yield f"{other} beside it takes it back at rest: gyros that are turned alone look like both"
+    if of.by_speeds_alone:
+        yield (
+            "no reading but the rotors' speeds shows it: speeds that are read late look the same; "
+            "quick changes of thrust or torque would tell"
+        )
     yield from under_noise(of.falls_at)
     yield from on_parts(of.parts, of.runs, chosen)
     yield from of_sizes(of.sizes)

@@ -22,6 +22,7 @@ from coax_env.diagnosis.confounding import (
 )
 from coax_env.diagnosis.doubts import LOUD, Against, doubts, on_parts, sizes, without_name
 from coax_env.diagnosis.evidence import Evidence
+from coax_env.diagnosis.late_rotor_speeds import LAG, by_speeds_alone
 from coax_env.diagnosis.noise_variation import not_holding
 from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import LIKE_DRIFT, Fit, Problem
@@ -122,6 +123,7 @@ def trusts(
     of_form = problem.settings.oscillating_form * sum(worth.values()) if oscillates else 0.0
     far = moved_far(problem, fit, quadratic)
     undone = taken_back(fit)
+    unconfirmed = by_speeds_alone(problem, fit)
     known, against = {}, {}
     for effect in fit.active:
         channels = channels_of(problem, fit, quadratic, effect)
@@ -151,6 +153,7 @@ def trusts(
             beside_terms=tuple(c for c in channels if c in acting),
             beside_moved=tuple(name for name, own in far.items() if own & set(channels)),
             taken_back_by=undone.get(effect, ""),
+            by_speeds_alone=effect == LAG and unconfirmed,
         )
     nameless = without_name(against, problem.settings)
     return {
