@@ -13,7 +13,13 @@ import numpy as np
 import pytest
 
 from coax_env.diagnosis import gain as gain_module
-from coax_env.diagnosis.gain import BLOCK, flies_worse, gain_of, likelier_without
+from coax_env.diagnosis.gain import (
+    BLOCK,
+    LEAST_BLOCKS,
+    flies_worse,
+    gain_of,
+    likelier_without,
+)
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.remarks import lost_in_noise
 from coax_env.estimation.prediction import ChannelReplay, RunReplay
@@ -108,6 +114,19 @@ def test_below_the_noise_nothing_is_left_and_no_error_is_no_channel():
     none = gain(run({"q": 0.04}), run({"q": 0.04}), run({"q": 0.04}))
     assert none["error_removed_percent"] is None and none["ci95"] == [None, None]
     assert none["channels"]["q"]["after"] == pytest.approx(0.04)
+
+
+def test_of_a_few_blocks_there_is_no_interval_and_of_nothing_flown_no_gain():
+    """Of one block every draw is the same, as though nothing were by chance."""
+    for blocks in (1, LEAST_BLOCKS - 1, LEAST_BLOCKS):
+        starts = blocks * BLOCK
+        given = [run({"h": x}, starts=starts) for x in (0.5, 0.5, 0.8)]
+        found = gain(*given)
+        assert (found["ci95"] == [None, None]) == (blocks < LEAST_BLOCKS)
+        assert found["error_removed_percent"] < 0.0
+        assert flies_worse(found, begun=False) == (blocks >= LEAST_BLOCKS)
+    none = run({}, starts=0)
+    assert gain(none, none, none) is None
 
 
 def test_a_channel_that_is_lost_in_noise_counts_by_chance():

@@ -52,14 +52,20 @@ def test_an_effect_that_could_not_be_measured_is_held_out_rather_than_an_even_sh
 
 
 def test_of_few_runs_the_last_third_of_each_is_held_out():
-    """Split at two thirds of their own time, wherever the clock starts; every row once."""
-    some = records(3)
+    """Split at two thirds of their own time, wherever the clock starts; every row once. A third that is
+    too short for a second of prediction is fitted, too."""
+    some, short = records(3, seconds=9.0), records(4, seconds=6.6)[3:]
+    fit, out = split(
+        MODEL, [*some, *short], Noise({}), None, ("gyro_bias",), replace(SETTINGS, fewest_runs=5)
+    )
+    assert [r.name for r in fit] == ["run 3", "run 0", "run 1", "run 2"] and fit[0] is short[0]
+    assert [r.name for r in out] == [f"run {k} (last third)" for k in range(3)]
     fit, out = split(MODEL, some, Noise({}), None, ("gyro_bias",), SETTINGS)
     assert [r.name for r in fit] == ["run 0", "run 1", "run 2"]
     assert [r.name for r in out] == [f"run {k} (last third)" for k in range(3)]
     for whole, first, last in zip(some, fit, out, strict=True):
         np.testing.assert_array_equal(np.concatenate([first.t, last.t]), whole.t)
-        assert last.t[0] == pytest.approx(24.0, abs=0.011)
+        assert last.t[0] == pytest.approx(26.0, abs=0.011)
         assert first.command.shape[0] == first.t.size and last.z.shape[0] == last.t.size
         assert first.origin == last.origin == whole.origin
 

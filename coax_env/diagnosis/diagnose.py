@@ -37,7 +37,7 @@ from coax_env.diagnosis import (
 from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
-from coax_env.diagnosis.gain import flies_worse, gain_of, likelier_without
+from coax_env.diagnosis.gain import TOO_SHORT, flies_worse, gain_of, likelier_without
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.model_check import model_check
@@ -269,6 +269,7 @@ def diagnose(
             *([oscillation_remark(swinging)] if swinging else []),
             *([slow_commands.remark(first.of_next)] if first.of_next else []),
             *remarks(problem, fit, quadratic, {e: found[e] for e in found if trust[e].named}),
+            *([TOO_SHORT] if held and gain is None else []),
             *lost_in_noise(gain),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),
             *answered_gusts(gain),
@@ -404,5 +405,6 @@ def _gain(
         box = black_box(problem, refitted)
         flexible = replay_runs(engine_of(problem, held, box), box.values, box.noise, horizon)
     gain = gain_of(before, own_numbers, after, sensors, horizon, flexible)
-    gain["held_out"] = list(dict.fromkeys(r.whole for r in held))
+    if gain is not None:
+        gain["held_out"] = list(dict.fromkeys(r.whole for r in held))
     return [before, own_numbers, after], gain

@@ -1,9 +1,9 @@
 """What correcting the model gains: prediction error before and after, on runs it has not seen.
 
 Per channel e^2 = max(rms^2 - noise_rms^2, 0); the share removed is one minus the mean of
-e_after/e_before. Intervals by a block bootstrap over runs and blocks of starts. A channel whose bare
-error is not told from its sensor's noise has a ratio by chance, which may be 3: what is removed is
-given without such channels, too.
+e_after/e_before. Intervals by a block bootstrap over runs and blocks of starts, none of a few blocks. A
+channel whose bare error is not told from its sensor's noise has a ratio by chance, which may be 3: what
+is removed is given without such channels, too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,6 +21,11 @@ from coax_env.model.layout import CHANNEL_UNITS
 
 BLOCK = 8  # starts, 2 s
 DRAWS = 400
+LEAST_BLOCKS = 4
+"""From which on blocks drawn again say how far the gain is by chance: of one, every draw is the same;
+ours."""
+TOO_SHORT = "what was held out is too short, or has too many gaps, to be flown: no gain is measured"
+"""For who reads the findings."""
 
 
 def gain_of(
@@ -30,8 +35,8 @@ def gain_of(
     noise: Mapping[str, float],
     horizon: float,
     black_box: Sequence[RunReplay] = (),
-) -> dict[str, Any]:
-    """The `gain` of findings.json, without the names of the held-out runs.
+) -> dict[str, Any] | None:
+    """The `gain` of findings.json, without the names of the held-out runs; None where none was flown.
 
     Args:
         before, refitted, after: the held-out runs flown by the bare, refitted and corrected model.
@@ -41,10 +46,12 @@ def gain_of(
     """
     sums = [_block_sums(runs) for runs in (before, refitted, after)]
     channels = [c for c in COMPARED if all(c in s for s in sums)]
+    if not channels:
+        return None
     rng = np.random.default_rng(0)
     # own: arch's block bootstrap needs one evenly sampled series, and pandas; these are runs of blocks
-    blocks = len(next(iter(sums[0].values())))
-    draws = rng.integers(0, blocks, (DRAWS, blocks))
+    blocks = len(sums[0][channels[0]])
+    draws = rng.integers(0, blocks, (DRAWS if blocks >= LEAST_BLOCKS else 0, blocks))
     noise_rms = {c: noise[c] for c in channels}
     rms = [{c: _rms(s[c]) for c in channels} for s in sums]
     unmoved = {c: _rms(s) for c, s in _block_sums(after, still=True).items() if c in channels}

@@ -11,6 +11,7 @@ from coax_env.diagnosis.unlisted import excitation
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.prediction import EVERY, WARM_UP
 from coax_env.estimation.state_space import Noise, Record, part
 
 FAIR_SHARE = 0.25  # of the information on each effect that should be held out: a quarter
@@ -57,7 +58,11 @@ def split(
             [r for r in records if r.whole in hold_out],
         )
     if len({r.whole for r in records}) < settings.fewest_runs:
-        return [_third(r, False) for r in records], [_third(r, True) for r in records]
+        # a third in which nothing could be predicted is fitted, too
+        least = WARM_UP + settings.horizon + EVERY
+        parted = [r for r in records if (r.t[-1] - r.t[0]) / 3.0 >= least]
+        whole = [r for r in records if not any(r is other for other in parted)]
+        return whole + [_third(r, False) for r in parted], [_third(r, True) for r in parted]
     chosen = _fair_share(model, records, noise, candidates)
     return (
         [r for r in records if r.whole not in chosen],

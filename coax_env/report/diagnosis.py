@@ -117,7 +117,8 @@ def lead(findings: Findings) -> list[str]:
             f"With {which} in the model, {change} on runs held out of the fit ({runs})."
         )
     elif not gain:
-        sentences.append("No run was held out, so how well this predicts is not known.")
+        unknown = "how well this predicts is not known"
+        sentences.append(f"Nothing was held out that could be flown, so {unknown}.")
     alternatives = sorted({name for c in findings["causes"] for name in c["confusable_with"]})
     if alternatives:
         sentences.append(

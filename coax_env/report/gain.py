@@ -81,7 +81,7 @@ def gain_blocks(findings: Mapping[str, Any]) -> list[str]:
     """Prediction errors per channel, before and after."""
     gain = findings.get("gain")
     if not gain:
-        return [prose("All runs were fitted (nothing held out): no gain can be measured.")]
+        return [prose("No gain was measured: nothing was held out of the fit that could be flown.")]
     entries = gain["channels"]
     channels = {
         c: entries[c] for c in sorted(ordered(entries), key=lambda c: _error_left(entries[c]))

@@ -80,7 +80,7 @@ def false_alarms(rate: float | None, seen: Mapping[str, Any]) -> str:
 def _gain(gain: Mapping[str, Any] | None) -> str:
     """Whether the corrected model also predicts flights that it was not fitted to."""
     if not gain or gain["error_removed_percent"] is None:
-        return "**Gain.** Not measured: no run was held out."
+        return "**Gain.** Not measured: nothing was held out that could be flown."
     removed, nothing = gain["error_removed_percent"], gain["persistence_percent"]
     low, high = gain["ci95"]
     text = f"**Gain.** On runs that it has not seen {error_change(removed)}"

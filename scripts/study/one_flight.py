@@ -165,7 +165,7 @@ def gain_of_the_truth(
     horizon = SETTINGS.horizon
     replayed = replay_runs(engine_held, fit.values, fit.noise, horizon)
     gain = gain_of(result.replay_before, result.replay_refitted, replayed, result.noise, horizon)
-    return {key: gain[key] for key in ("error_removed_percent", "ci95")}
+    return {key: gain[key] for key in ("error_removed_percent", "ci95")} if gain else {}
 
 
 def forced(
