@@ -86,9 +86,10 @@ def gain_blocks(findings: Mapping[str, Any]) -> list[str]:
     channels = {
         c: entries[c] for c in sorted(ordered(entries), key=lambda c: _error_left(entries[c]))
     }
+    whiskers = "" if gain["ci95"][0] is None else "Whisker: 95 % interval. "
     caption = (
         f"Error of a {seconds(gain['horizon_s'])} prediction on the held-out runs "
-        f"({and_list(gain['held_out'])}), as a share of the bare model's. Whisker: 95 % interval. "
+        f"({and_list(gain['held_out'])}), as a share of the bare model's. {whiskers}"
         "Green: the sensor's noise, which is in every reading: no model gets below it but by chance. "
     )
     if gain.get("black_box_percent") is None:
