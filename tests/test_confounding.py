@@ -11,6 +11,7 @@ import pytest
 from coax_env.diagnosis import confounding, remarks
 from coax_env.diagnosis.confounding import (
     LIKELIER,
+    alike_unturned,
     beside_undecided,
     likelier,
     of_undecided,
@@ -204,3 +205,29 @@ def test_what_an_undecided_effect_would_make_of_a_number_is_said():
     assert said.endswith(f"with it {10.0 + move[1]:.3g} fits as well")
     problem, fit, quadratic = fitted_with(-0.1)
     assert remarks._resting_on_undecided(problem, fit, quadratic, {"axial_damping": {}}) == []
+
+
+@pytest.mark.parametrize(
+    ("effect", "across", "aboard", "asked", "alike"),
+    [
+        ("gyro_scale", 0.01, ("psi", "r"), False, ["magnetic_field"]),
+        ("gyro_scale", 0.05, ("psi", "r"), False, []),  # a gyro that no heading is read by is off, too
+        ("gyro_scale", 0.01, ("psi", "r"), True, []),  # headings turn: it is tried in its place
+        ("gyro_scale", 0.01, ("r",), False, []),
+        ("gyro_bias", 0.01, ("psi", "r"), False, []),
+    ],
+)
+def test_where_headings_hardly_turn_a_gyros_scale_may_be_a_magnetic_field(
+    effect, across, aboard, asked, alike
+):
+    """Two flights that hid a magnetic field had a gyro's scale, sure (**synthetic**)."""
+    free = [FreeParameter(f"{effect}.{axis}", 0.0, 0.1) for axis in "xyz"]
+    problem: Any = SimpleNamespace(
+        candidates=("magnetic_field",) if asked else (), aboard=frozenset(aboard),
+        own={effect: free}, model=SimpleNamespace(vehicle=SimpleNamespace(effects={})),
+        free_names=lambda active: [f.name for f in free],
+    )  # fmt: skip
+    values = dict(zip([f.name for f in free], (across, 0.0, 0.08), strict=True))
+    quadratic: Any = SimpleNamespace(std=lambda names: dict.fromkeys(names, 0.02))
+    fit = Fit((effect,), values, Noise({}))
+    assert alike_unturned(problem, fit, quadratic, effect) == alike

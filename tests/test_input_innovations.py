@@ -126,6 +126,8 @@ def test_a_gain_s_prior_is_what_the_filter_does_not_know_over_what_commands_show
     tied[:, 1] = tied[:, 0]  # the rotors are only moved together
     names = [f.name for f in command_gains([run], [tied])]
     assert not any(n.endswith(("rate_z", "moment_z")) for n in names) and len(names) == 5
+    short = made_pass(np.zeros((90, 4)), np.zeros((90, N_FULL)), covariances[:0])
+    assert command_gains([short], [e[:90]]) == [], "the filter's transient is all there is"
 
 
 @pytest.mark.parametrize(

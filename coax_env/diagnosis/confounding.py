@@ -44,6 +44,11 @@ LATE = frozenset({"command_delay", "pose_delay"})
 only because a late pose is taken from the state that a row has, to second order in its delay, where
 what gusts did since is lost. All of four late poses were named late commands (**synthetic**)."""
 
+GYRO_SCALE, FIELD = "gyro_scale", "magnetic_field"
+
+KNOWN = 2.0
+"""Std that a number must be away from nothing to be known to be another: of a 95 % interval."""
+
 Alternatives = Mapping[str, Mapping[str, Fit]]
 """Cause -> its confounded alternatives -> the fit with each in the cause's place."""
 
@@ -64,6 +69,24 @@ def alike_by_poses_alone(problem: Problem, effect: str) -> list[str]:
     if effect not in LATE or not problem.sees_poses_alone:
         return []
     return sorted((LATE - {effect}) & set(problem.candidates))
+
+
+def alike_unturned(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> list[str]:
+    """What the scale of the gyro of r cannot be told from where headings hardly turn.
+
+    A magnetic field bends them, as though that gyro were off by a share, and is not asked there. On two
+    **synthetic** flights of 26 s it went by that name, sure.
+
+    Args:
+        problem, fit: with the causes. quadratic: linearised at the fit. effect: one of them.
+    """
+    asked = FIELD in problem.candidates or FIELD in problem.model.vehicle.effects
+    if effect != GYRO_SCALE or asked or not {"psi", "r"} <= problem.aboard:
+        return []
+    std = quadratic.std(problem.free_names(fit.active))
+    tilting = [f for f in problem.own[effect] if not f.name.endswith(".z")]
+    shown = any(abs(fit.values[f.name] - f.value) > KNOWN * std[f.name] for f in tilting)
+    return [] if shown else [FIELD]
 
 
 def channels_of(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> list[str]:

@@ -5,7 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.confounding import Alternatives, alike_by_poses_alone
+from coax_env.diagnosis.confounding import (
+    Alternatives,
+    alike_by_poses_alone,
+    alike_unturned,
+)
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
@@ -62,6 +66,8 @@ def causes(
         known = {f.name: f for f in problem.own[effect]}
         last = [f for f in known.values() if AT not in f.name]
         factor = evidence[effect].inflation
+        untold = alike_by_poses_alone(problem, effect)
+        untold += alike_unturned(problem, fit, quadratic, effect)
         entries.append(
             {
                 "effect": effect,
@@ -74,7 +80,7 @@ def causes(
                     for f, p in zip(last, effects.CATALOGUE[effect].fitted, strict=True)
                 },
                 "evidence": evidence[effect].nats,
-                "confusable_with": confusable_with(problem, effect, found[effect]),
+                "confusable_with": confusable_with(effect, found[effect], untold),
                 "channels": list(trust[effect].channels),
                 **trust[effect].entries(),
             }
@@ -93,14 +99,14 @@ def _in_order(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(entries, key=lambda c: (c["trust"] != "sure", -c["evidence"]))
 
 
-def confusable_with(problem: Problem, effect: str, alternatives: Iterable[str]) -> list[str]:
+def confusable_with(effect: str, alternatives: Iterable[str], untold: Iterable[str]) -> list[str]:
     """What a cause may as well be: its alternatives, and those that no flight or not this one tells.
 
     Args:
-        problem: of the flight. effect: the cause. alternatives: that were fitted.
+        effect: the cause. alternatives: that were fitted. untold: what this flight cannot tell from it.
     """
     never = effects.found_by_the_name_of(effect)
-    return list(dict.fromkeys([*alternatives, *never, *alike_by_poses_alone(problem, effect)]))
+    return list(dict.fromkeys([*alternatives, *never, *untold]))
 
 
 def mixtures_as_one(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:

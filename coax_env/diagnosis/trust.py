@@ -15,8 +15,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from coax_env.diagnosis.confounding import (
+    KNOWN,
     Alternatives,
     alike_by_poses_alone,
+    alike_unturned,
     channels_of,
     channels_of_numbers,
 )
@@ -46,9 +48,6 @@ TAKEN_BACK = 0.1
 """Share of an accelerometer's bias that a tilt beside it must leave at rest, or they are one thing with
 two names: by chance a pair in a hundred does. Gyros alone that were turned by 1.1 degrees were both,
 sure, for 640 and 595 nats (**synthetic**; an inertial sensor's axes are square to 1 or 2 %); ours."""
-
-KNOWN = 2.0
-"""Std that a number must be away from nothing to be known to be another: of a 95 % interval."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +141,11 @@ def trusts(
             may_be_none=may_be_none(problem, fit, quadratic, effect, evidence[effect].inflation),
             flies_worse=effect in worse,
             within_form=worth[effect] < of_form,
-            alternatives=(*found[effect], *alike_by_poses_alone(problem, effect)),
+            alternatives=(
+                *found[effect],
+                *alike_by_poses_alone(problem, effect),
+                *alike_unturned(problem, fit, quadratic, effect),
+            ),
             nats=worth[effect],
             of_moment=onsets[effect].beside if effect in onsets else math.inf,
             shaken=shaken,

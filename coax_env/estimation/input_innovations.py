@@ -126,9 +126,14 @@ def clipped_residual(known: np.ndarray, change: np.ndarray) -> np.ndarray:
 
 
 def command_gains(passes: Sequence[RunPass], found: Sequence[np.ndarray]) -> list[FreeParameter]:
-    """The gains with their priors: std of the filter's error over that of the innovations."""
-    variances = [np.einsum("sii->si", run.start_covariances) for run in passes]
-    unknown = np.sqrt(np.vstack(variances).mean(axis=0))
+    """The gains with their priors: std of the filter's error over that of the innovations.
+
+    None where all runs end within the filter's transient.
+    """
+    variances = np.vstack([np.einsum("sii->si", run.start_covariances) for run in passes])
+    if not len(variances):
+        return []
+    unknown = np.sqrt(variances.mean(axis=0))
     spread = np.vstack(found)
     gains = []
     for name, corrected, taken in zip(P.COMMAND_GAINS, _CORRECTED, _TAKEN, strict=True):
