@@ -116,15 +116,16 @@ def test_below_the_noise_nothing_is_left_and_no_error_is_no_channel():
     assert none["channels"]["q"]["after"] == pytest.approx(0.04)
 
 
-def test_of_a_few_blocks_there_is_no_interval_and_of_nothing_flown_no_gain():
+def test_of_few_starts_the_interval_has_a_width_and_of_nothing_flown_there_is_no_gain():
     """Of one block every draw is the same, as though nothing were by chance."""
-    for blocks in (1, LEAST_BLOCKS - 1, LEAST_BLOCKS):
-        starts = blocks * BLOCK
-        given = [run({"h": x}, starts=starts) for x in (0.5, 0.5, 0.8)]
-        found = gain(*given)
-        assert (found["ci95"] == [None, None]) == (blocks < LEAST_BLOCKS)
-        assert found["error_removed_percent"] < 0.0
-        assert flies_worse(found, begun=False) == (blocks >= LEAST_BLOCKS)
+    rng = np.random.default_rng(2)
+    for starts in (LEAST_BLOCKS, BLOCK, 3 * BLOCK, 10 * BLOCK):
+        h = rng.uniform(0.4, 0.6, starts)
+        found = gain(*(run({"h": x * h}, starts=starts) for x in (1.0, 1.0, 1.2)))
+        low, high = found["ci95"]
+        assert low < found["error_removed_percent"] < high
+        low, high = found["channels"]["h"]["ci95"]
+        assert low < found["channels"]["h"]["after"] < high
     none = run({}, starts=0)
     assert gain(none, none, none) is None
 

@@ -1,7 +1,7 @@
 """What correcting the model gains: prediction error before and after, on runs it has not seen.
 
 Per channel e^2 = max(rms^2 - noise_rms^2, 0); the share removed is one minus the mean of
-e_after/e_before. Intervals by a block bootstrap over runs and blocks of starts, none of a few blocks. A
+e_after/e_before. Intervals by a block bootstrap over runs and blocks of starts. A
 channel whose bare error is not told from its sensor's noise has a ratio by chance, which may be 3: what
 is removed is given without such channels, too.
 """
@@ -22,8 +22,8 @@ from coax_env.model.layout import CHANNEL_UNITS
 BLOCK = 8  # starts, 2 s
 DRAWS = 400
 LEAST_BLOCKS = 4
-"""From which on blocks drawn again say how far the gain is by chance: of one, every draw is the same;
-ours."""
+"""Blocks of few starts are shorter, down to one each, for so many: of one block every draw is the same,
+as though nothing were by chance; ours."""
 TOO_SHORT = "what was held out is too short, or has too many gaps, to be flown: no gain is measured"
 """For who reads the findings."""
 
@@ -44,17 +44,20 @@ def gain_of(
         horizon: seconds flown.
         black_box: the same runs flown by a flexible model.
     """
-    sums = [_block_sums(runs) for runs in (before, refitted, after)]
+    block = _block_of(before)
+    sums = [_block_sums(runs, block) for runs in (before, refitted, after)]
     channels = [c for c in COMPARED if all(c in s for s in sums)]
     if not channels:
         return None
     rng = np.random.default_rng(0)
     # own: arch's block bootstrap needs one evenly sampled series, and pandas; these are runs of blocks
     blocks = len(sums[0][channels[0]])
-    draws = rng.integers(0, blocks, (DRAWS if blocks >= LEAST_BLOCKS else 0, blocks))
+    draws = rng.integers(0, blocks, (DRAWS, blocks))
     noise_rms = {c: noise[c] for c in channels}
     rms = [{c: _rms(s[c]) for c in channels} for s in sums]
-    unmoved = {c: _rms(s) for c, s in _block_sums(after, still=True).items() if c in channels}
+    unmoved = {
+        c: _rms(s) for c, s in _block_sums(after, block, still=True).items() if c in channels
+    }
     drawn = [{c: _rms(s[c][draws].transpose(1, 0, 2)) for c in channels} for s in sums]
     table = {
         c: {
@@ -75,7 +78,7 @@ def gain_of(
     gained = removed(rms[0], rms[2], noise_rms)
     further: dict[str, Any] = {}
     if black_box:
-        boxed = _block_sums(black_box)
+        boxed = _block_sums(black_box, block)
         flexible = removed(rms[0], {c: _rms(boxed[c]) for c in channels}, noise_rms)
         further = {"black_box_percent": _number(flexible)}
     told = {c: level for c, level in noise_rms.items() if _is_told(drawn[0][c], level)}
@@ -163,13 +166,24 @@ def _nanmean(table: np.ndarray) -> Any:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _block_sums(runs: Sequence[RunReplay], still: bool = False) -> dict[str, np.ndarray]:
+def _starts(run: RunReplay) -> int:
+    return max((f.error.size for f in run.channels.values()), default=0)
+
+
+def _block_of(runs: Sequence[RunReplay]) -> int:
+    """How many starts a block has."""
+    return min(max(sum(map(_starts, runs)) // LEAST_BLOCKS, 1), BLOCK)
+
+
+def _block_sums(
+    runs: Sequence[RunReplay], block_of: int, still: bool = False
+) -> dict[str, np.ndarray]:
     """Per channel: (blocks, 2) of summed squared error and count, over all runs that flew.
 
     The blocks are the same of every channel: one that a run does not read has nothing in its blocks.
 
     Args:
-        runs: flown open loop.
+        runs: flown open loop. block_of: starts that a block has.
         still: the errors of the prediction that nothing changes.
     """
     flown = [run.still if still else {c: f.error for c, f in run.channels.items()} for run in runs]
@@ -179,8 +193,8 @@ def _block_sums(runs: Sequence[RunReplay], still: bool = False) -> dict[str, np.
         size = max((error.size for error in errors.values()), default=0)
         for channel in every:
             error = errors.get(channel, np.full(size, np.nan))
-            for first in range(0, size, BLOCK):
-                block = error[first : first + BLOCK]
+            for first in range(0, size, block_of):
+                block = error[first : first + block_of]
                 block = block[np.isfinite(block)]
                 if run.diverged:
                     block = block[:0]
