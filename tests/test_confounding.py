@@ -16,6 +16,7 @@ from coax_env.diagnosis.confounding import (
     likelier,
     of_undecided,
     settled,
+    turn_that_tells,
     undecided,
 )
 from coax_env.diagnosis.evidence import Evidence
@@ -24,6 +25,7 @@ from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.model.vehicle_file import load_vehicle
+from coax_env.simulation.maneuvers import MANEUVERS
 
 MASS, DAMPING, DRAG, LAG = (
     "mass", "axial_damping.coefficient", "rotor_drag.coefficient", "servo_lag.time"
@@ -211,7 +213,13 @@ def test_what_an_undecided_effect_would_make_of_a_number_is_said():
     ("effect", "across", "aboard", "asked", "alike"),
     [
         ("gyro_scale", 0.01, ("psi", "r"), False, ["magnetic_field"]),
-        ("gyro_scale", 0.05, ("psi", "r"), False, []),  # a gyro that no heading is read by is off, too
+        (
+            "gyro_scale",
+            0.05,
+            ("psi", "r"),
+            False,
+            [],
+        ),  # a gyro that no heading is read by is off, too
         ("gyro_scale", 0.01, ("psi", "r"), True, []),  # headings turn: it is tried in its place
         ("gyro_scale", 0.01, ("r",), False, []),
         ("gyro_bias", 0.01, ("psi", "r"), False, []),
@@ -231,3 +239,11 @@ def test_where_headings_hardly_turn_a_gyros_scale_may_be_a_magnetic_field(
     quadratic: Any = SimpleNamespace(std=lambda names: dict.fromkeys(names, 0.02))
     fit = Fit((effect,), values, Noise({}))
     assert alike_unturned(problem, fit, quadratic, effect) == alike
+
+
+def test_a_turn_tells_a_gyros_scale_from_a_magnetic_field():
+    alike = {"effect": "gyro_scale", "confusable_with": ["magnetic_field"]}
+    advice = turn_that_tells([{"effect": "wind", "confusable_with": []}, alike])
+    assert advice is not None and advice["maneuver"] in MANEUVERS
+    assert advice["separates"] == ["gyro_scale", "magnetic_field"]
+    assert turn_that_tells([alike | {"confusable_with": []}]) is None

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import expit
@@ -87,6 +87,23 @@ def alike_unturned(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str
     tilting = [f for f in problem.own[effect] if not f.name.endswith(".z")]
     shown = any(abs(fit.values[f.name] - f.value) > KNOWN * std[f.name] for f in tilting)
     return [] if shown else [FIELD]
+
+
+def turn_that_tells(causes: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """`next_maneuver` of findings.json where a gyro's scale may be a magnetic field, else None.
+
+    Args:
+        causes: entries of findings.json.
+    """
+    alike = (c for c in causes if c["effect"] == GYRO_SCALE and FIELD in c["confusable_with"])
+    if next(alike, None) is None:
+        return None
+    return {
+        "maneuver": "heading_turn",
+        "separates": [GYRO_SCALE, FIELD],
+        "why": "a full turn on the spot: a field bends headings to one side, then to the other; a scale"
+        " goes on to the same",
+    }
 
 
 def channels_of(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> list[str]:

@@ -244,7 +244,8 @@ def diagnose(
             "noise": findings.noise_levels(fit.noise),
             "unexplained": unexplained,
             "gain": gain,
-            "next_maneuver": next_maneuver.advise(design, settings.evidence),
+            "next_maneuver": next_maneuver.advise(design, settings.evidence)
+            or confounding.turn_that_tells(causes),
             "false_alarm_rate": alarms.rate,
             "class": alarms.entry,
             "model_check": check.entry,
