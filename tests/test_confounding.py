@@ -213,13 +213,8 @@ def test_what_an_undecided_effect_would_make_of_a_number_is_said():
     ("effect", "across", "aboard", "asked", "alike"),
     [
         ("gyro_scale", 0.01, ("psi", "r"), False, ["magnetic_field"]),
-        (
-            "gyro_scale",
-            0.05,
-            ("psi", "r"),
-            False,
-            [],
-        ),  # a gyro that no heading is read by is off, too
+        # a gyro that no heading is read by is off, too
+        ("gyro_scale", 0.05, ("psi", "r"), False, []),
         ("gyro_scale", 0.01, ("psi", "r"), True, []),  # headings turn: it is tried in its place
         ("gyro_scale", 0.01, ("r",), False, []),
         ("gyro_bias", 0.01, ("psi", "r"), False, []),

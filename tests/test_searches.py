@@ -777,13 +777,8 @@ def test_what_hides_behind_a_low_pass(active, own, smoothed, hidden):
     ("white", "found", "nats", "beside", "taken"),
     [
         (False, ("wind",), 0.0, ["wind"], "steady"),  # not white with strengths: none are used
-        (
-            True,
-            ("wind",),
-            90.0,
-            ["wind", "refitted", "wind"],
-            "strengths 3",
-        ),  # stands them, and its own
+        # stands them, and its own
+        (True, ("wind",), 90.0, ["wind", "refitted", "wind"], "strengths 3"),
         (True, (), 30.0, ["wind", "refitted"], "strengths 2"),  # what shocks took up stays so
         (True, (), 90.0, ["wind", "refitted"], "strengths 1"),  # but where it is likelier, surely
         (True, ("cg_offset",), 90.0, ["wind", "refitted", "cg_offset"], "strengths 1"),

@@ -89,6 +89,12 @@ def alike_unturned(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str
     return [] if shown else [FIELD]
 
 
+def untold(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> list[str]:
+    """What no fit can tell from a cause on such flights; arguments as `alike_unturned`."""
+    turned = alike_unturned(problem, fit, quadratic, effect)
+    return [*alike_by_poses_alone(problem, effect), *turned]
+
+
 def turn_that_tells(causes: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """`next_maneuver` of findings.json where a gyro's scale may be a magnetic field, else None.
 

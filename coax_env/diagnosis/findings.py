@@ -5,11 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.confounding import (
-    Alternatives,
-    alike_by_poses_alone,
-    alike_unturned,
-)
+from coax_env.diagnosis.confounding import Alternatives, untold
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
@@ -66,8 +62,7 @@ def causes(
         known = {f.name: f for f in problem.own[effect]}
         last = [f for f in known.values() if AT not in f.name]
         factor = evidence[effect].inflation
-        untold = alike_by_poses_alone(problem, effect)
-        untold += alike_unturned(problem, fit, quadratic, effect)
+        alike = untold(problem, fit, quadratic, effect)
         entries.append(
             {
                 "effect": effect,
@@ -80,7 +75,7 @@ def causes(
                     for f, p in zip(last, effects.CATALOGUE[effect].fitted, strict=True)
                 },
                 "evidence": evidence[effect].nats,
-                "confusable_with": confusable_with(effect, found[effect], untold),
+                "confusable_with": confusable_with(effect, found[effect], alike),
                 "channels": list(trust[effect].channels),
                 **trust[effect].entries(),
             }
@@ -99,14 +94,14 @@ def _in_order(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(entries, key=lambda c: (c["trust"] != "sure", -c["evidence"]))
 
 
-def confusable_with(effect: str, alternatives: Iterable[str], untold: Iterable[str]) -> list[str]:
+def confusable_with(effect: str, alternatives: Iterable[str], alike: Iterable[str]) -> list[str]:
     """What a cause may as well be: its alternatives, and those that no flight or not this one tells.
 
     Args:
-        effect: the cause. alternatives: that were fitted. untold: what this flight cannot tell from it.
+        effect: the cause. alternatives: that were fitted. alike: what this flight cannot tell from it.
     """
     never = effects.found_by_the_name_of(effect)
-    return list(dict.fromkeys([*alternatives, *never, *untold]))
+    return list(dict.fromkeys([*alternatives, *never, *alike]))
 
 
 def mixtures_as_one(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:

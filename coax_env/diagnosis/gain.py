@@ -1,9 +1,9 @@
 """What correcting the model gains: prediction error before and after, on runs it has not seen.
 
 Per channel e^2 = max(rms^2 - noise_rms^2, 0); the share removed is one minus the mean of
-e_after/e_before. Intervals by a block bootstrap over runs and blocks of starts. A
-channel whose bare error is not told from its sensor's noise has a ratio by chance, which may be 3: what
-is removed is given without such channels, too.
+e_after/e_before. Intervals by a block bootstrap over runs and blocks of starts. A channel whose bare
+error is not told from its sensor's noise has a ratio by chance, which may be 3: what is removed is
+given without such channels, too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -82,10 +82,10 @@ def gain_of(
         flexible = removed(rms[0], {c: _rms(boxed[c]) for c in channels}, noise_rms)
         further = {"black_box_percent": _number(flexible)}
     told = {c: level for c, level in noise_rms.items() if _is_told(drawn[0][c], level)}
-    counted = [c for c in channels if rms[0][c] > noise_rms[c]]
-    if told and not told.keys() >= set(counted):
+    by_chance = [c for c in channels if rms[0][c] > noise_rms[c] and c not in told]
+    if told and by_chance:
         further["beyond_noise"] = {
-            "without": [c for c in counted if c not in told],
+            "without": by_chance,
             "error_removed_percent": _number(removed(rms[0], rms[2], told)),
             "ci95": _interval(removed(drawn[0], drawn[2], told)),
         }

@@ -59,9 +59,9 @@ def split(
         )
     if len({r.whole for r in records}) < settings.fewest_runs:
         # a third in which nothing could be predicted is fitted, too
-        least = WARM_UP + settings.horizon + EVERY
-        parted = [r for r in records if (r.t[-1] - r.t[0]) / 3.0 >= least]
-        whole = [r for r in records if not any(r is other for other in parted)]
+        least = 3.0 * (WARM_UP + settings.horizon + EVERY)
+        parted = [r for r in records if r.t[-1] - r.t[0] >= least]
+        whole = [r for r in records if r.t[-1] - r.t[0] < least]
         return whole + [_third(r, False) for r in parted], [_third(r, True) for r in parted]
     chosen = _fair_share(model, records, noise, candidates)
     return (

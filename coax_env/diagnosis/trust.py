@@ -17,10 +17,9 @@ from typing import Any
 from coax_env.diagnosis.confounding import (
     KNOWN,
     Alternatives,
-    alike_by_poses_alone,
-    alike_unturned,
     channels_of,
     channels_of_numbers,
+    untold,
 )
 from coax_env.diagnosis.doubts import LOUD, Against, doubts, on_parts, sizes, without_name
 from coax_env.diagnosis.evidence import Evidence
@@ -141,11 +140,7 @@ def trusts(
             may_be_none=may_be_none(problem, fit, quadratic, effect, evidence[effect].inflation),
             flies_worse=effect in worse,
             within_form=worth[effect] < of_form,
-            alternatives=(
-                *found[effect],
-                *alike_by_poses_alone(problem, effect),
-                *alike_unturned(problem, fit, quadratic, effect),
-            ),
+            alternatives=(*found[effect], *untold(problem, fit, quadratic, effect)),
             nats=worth[effect],
             of_moment=onsets[effect].beside if effect in onsets else math.inf,
             shaken=shaken,

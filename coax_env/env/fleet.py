@@ -13,6 +13,7 @@ import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -130,7 +131,6 @@ class Fleet:
         self._threads = max(1, min(threads or most or 1, count // ROWS_PER_THREAD))
         fewest = SIMD_VARIANT_FROM if any(self.makeup) else SIMD_FROM
         self._side_by_side = count >= fewest and _fit_for_simd(used)
-        self._fly_simd: Any = None  # looked up when the batch first flies
 
     def _parameters(self) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
         """The parameter vector, the places that each row has of its own, and what may be on in it."""
@@ -241,6 +241,13 @@ class Fleet:
         if self.task.shows_target:
             flight_loop.observe_targets(first, last, which, heli, mission, observations)
 
+    @cached_property
+    def _simd_loop(self) -> Any:
+        """The SIMD batch's loop, imported with the first fleet that flies by it."""
+        from coax_env.env import fleet_simd
+
+        return fleet_simd.fly_of(self.makeup)
+
     def fly_held(
         self, actions: np.ndarray, active: np.ndarray, anew: np.ndarray | None = None
     ) -> Outcome:
@@ -297,9 +304,7 @@ class Fleet:
         before = self.x
         self.x = x = np.empty_like(before) if simd else before.copy()
 
-        if simd and self._fly_simd is None:
-            self._fly_simd = _simd_loop(self.makeup)
-        fly = self._fly_simd
+        fly = self._simd_loop if simd else None
 
         def rows(first: int, last: int) -> None:
             if fly:
@@ -384,13 +389,6 @@ def _fit_for_simd(used: Sequence[str]) -> bool:
             )
             return False
     return True
-
-
-def _simd_loop(makeup: Makeup) -> Any:
-    """The SIMD batch's loop, imported with the first fleet that flies by it."""
-    from coax_env.env import fleet_simd
-
-    return fleet_simd.fly_of(makeup)
 
 
 def _mission(task: str, target: Any, sensors: str) -> Mission:

@@ -121,8 +121,8 @@ def _in_swings(found: Searched, noise: Noise) -> Searched | None:
     if again is not None:
         problem, levels = again
         problem.report("a gust has another frequency: searching again with that")
-        likelier = searched_once(problem, noise.with_levels(levels))
-        other = likelier if likelier.cost < other.cost else other
+        anew = searched_once(problem, noise.with_levels(levels))
+        other = anew if anew.cost < other.cost else other
     problem = other.problem
     passes = problem.engine.filter(other.fit.values, other.fit.noise)
     return other if is_white(passes, problem.model.channels) else None
