@@ -7,7 +7,7 @@ from pathlib import Path
 
 import fuzz_readers
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 FILES = ("card", "log", "vehicle")
@@ -77,6 +77,7 @@ def hash_of(text: str) -> int:
 @pytest.mark.parametrize("name", ["ulog", "dataflash"])
 @some(80)
 @given(changes=st.lists(st.tuples(st.integers(0, 8000), st.binary(max_size=4)), max_size=5))
+@example(changes=[(2855, b"\x00\x81\x7f")])  # a signalling NaN
 def test_a_log_with_bytes_changed_is_read_or_refused(name, tmp_path, changes):
     pytest.importorskip("pyulog" if name == "ulog" else "pymavlink")
     _, sound = fuzz_readers.TARGETS[name]

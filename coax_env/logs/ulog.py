@@ -68,11 +68,16 @@ def px4_signals(path: Path) -> dict[str, Signal]:
             continue
         t = np.asarray(topic.data["timestamp"], float) * 1e-6
         order = np.argsort(t, kind="stable")
-        for field, values in topic.data.items():
-            if np.issubdtype(np.asarray(values).dtype, np.number) and field != "timestamp":
-                signals[f"{topic.name}.{field}"] = (t[order], np.asarray(values, float)[order])
-        if topic.name == "vehicle_attitude" and all(f"q[{k}]" in topic.data for k in range(4)):
-            q = np.stack([np.asarray(topic.data[f"q[{k}]"], float)[order] for k in range(4)], 1)
+        with np.errstate(invalid="ignore"):  # a damaged log may have signalling NaNs
+            doubles = {
+                field: np.asarray(values, float)[order]
+                for field, values in topic.data.items()
+                if np.issubdtype(np.asarray(values).dtype, np.number) and field != "timestamp"
+            }
+        for field, values in doubles.items():
+            signals[f"{topic.name}.{field}"] = (t[order], values)
+        if topic.name == "vehicle_attitude" and all(f"q[{k}]" in doubles for k in range(4)):
+            q = np.stack([doubles[f"q[{k}]"] for k in range(4)], 1)
             angles = attitude(q, "body to NED")
             for name, angle in zip(("phi", "theta", "psi"), angles, strict=True):
                 signals[f"vehicle_attitude.{name}"] = (t[order], angle)
