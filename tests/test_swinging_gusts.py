@@ -22,7 +22,7 @@ from coax_env.estimation.helicopter_noise import AXES, GUST_AXES
 from coax_env.estimation.lasting_errors import ErringModel
 from coax_env.estimation.rotor_jitter import JitteryModel
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.swinging_gusts import SwingingModel, clearest, swinging_at, swings
+from coax_env.estimation.swinging_gusts import SwingingModel, clearly_swinging, swinging_at, swings
 from coax_env.model import dynamics
 from coax_env.model import parameters as P
 from coax_env.model import state as S
@@ -186,7 +186,14 @@ def test_a_spectrum_shows_at_what_frequency_a_gust_comes(offset):
     t, rng = 0.01 * np.arange(4500), np.random.default_rng(1)
     wave = np.sin(2.0 * np.pi * 0.8 * t) + 0.3 * rng.standard_normal(t.size) + offset
     assert swings(passes(wave), 0.01) == pytest.approx([0.0, 0.8, 0.0, 0.0, 0.0, 0.0])
-    assert clearest(passes(wave), 0.01) == "force_xy"
+    assert clearly_swinging(passes(wave), 0.01) == ["force_xy"]
+
+
+def test_the_clearest_group_of_gusts_is_asked_first(monkeypatch):
+    """By its clearest axis; what is not clear is not asked."""
+    clear = [2.0, 7.0, 30.0, 4.9, 0.0, 9.0]
+    monkeypatch.setattr(swinging_gusts, "_strongest_of_all", lambda passes, row: ([0.5] * 6, clear))
+    assert clearly_swinging([], 0.01) == ["force_z", "moment_z", "force_xy"]
 
 
 def test_a_gust_that_only_fades_has_none():
@@ -200,22 +207,24 @@ def test_a_gust_that_only_fades_has_none():
 
 
 @pytest.mark.parametrize(
-    ("peak", "times", "alone", "gain", "used"),
+    ("clear", "times", "alone", "gain", "used"),
     [
-        (0.8, 2.1, 60.0, 100.0, True),
-        (0.0, 2.1, 60.0, 100.0, False),  # no swings
-        (0.8, 1.9, 60.0, 100.0, False),  # hardly more than the least that gusts may be
-        (0.8, 2.1, 5.0, 100.0, False),  # none where they are clearest
-        (0.8, 2.1, 60.0, 10.0, False),  # not worth the threshold
+        ("force_z", 2.1, 60.0, 100.0, True),
+        ("", 2.1, 60.0, 100.0, False),  # no swings
+        ("force_z", 1.9, 60.0, 100.0, False),  # hardly more than the least that gusts may be
+        ("force_z", 2.1, 5.0, 100.0, False),  # none where they are clear
+        ("moment_z force_z", 2.1, 60.0, 100.0, True),  # what is named has taken the clearest up
+        ("moment_z", 2.1, 60.0, 100.0, False),
+        ("force_z", 2.1, 60.0, 10.0, False),  # not worth the threshold
     ],
 )
-def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, peak, times, alone, gain, used):
+def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, clear, times, alone, gain, used):
     """The fits are stand-ins, which gain at once what they may; gusts are so many times their floor."""
     floor = {"force_z": NOISE.level("force_z") / times}
     fit = Fit((), {}, replace(NOISE, floor=floor), objective=500.0)
     gained = lambda problem, fit: replace(fit, objective=500.0 - gain)  # noqa: E731
-    monkeypatch.setattr(asking, "swings", lambda passes, row: [peak] * 6)
-    monkeypatch.setattr(asking, "clearest", lambda passes, row: "force_z")
+    monkeypatch.setattr(asking, "swings", lambda passes, row: [0.8] * 6)
+    monkeypatch.setattr(asking, "clearly_swinging", lambda passes, row: clear.split())
     monkeypatch.setattr(asking, "_gained_by", lambda p, f, at, axes: alone * (axes == "force_z"))
     monkeypatch.setattr(asking, "fitted", gained)
     monkeypatch.setattr(asking, "noise_fitted", gained)

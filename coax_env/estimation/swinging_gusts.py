@@ -193,9 +193,14 @@ def swings(passes: Sequence[RunPass], row: float, least: float = STANDS_OUT) -> 
     return [f if by > least else 0.0 for f, by in zip(frequencies, clear, strict=True)]
 
 
-def clearest(passes: Sequence[RunPass], row: float) -> str:
-    """The group of axes, one of AXES, in whose gusts a swing stands out most."""
-    return GUST_AXES[int(np.argmax(_strongest_of_all(passes, row)[1]))]
+def clearly_swinging(passes: Sequence[RunPass], row: float) -> list[str]:
+    """Groups of axes, of AXES, in whose gusts a swing stands out CLEARLY, the clearest first."""
+    clear = _strongest_of_all(passes, row)[1]
+    of_group: dict[str, float] = {}
+    for axes, by in zip(GUST_AXES, clear, strict=True):
+        of_group[axes] = max(by, of_group.get(axes, 0.0))
+    found = [axes for axes, by in of_group.items() if by > CLEARLY]
+    return sorted(found, key=lambda axes: -of_group[axes])
 
 
 def _strongest_of_all(passes: Sequence[RunPass], row: float) -> tuple[list[float], list[float]]:
