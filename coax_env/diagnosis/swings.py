@@ -5,10 +5,10 @@ makes false names all the same. Spectra of the filter's own gusts show where eac
 (estimation/swinging_gusts.py). Spectra peak by chance, too: where no clear group of axes is felt and
 gains more than a tie by swinging alone, nothing else is asked. All clear ones are, the clearest first:
 what was named may have taken one up, as a motor's droop had the yaw's (-40 nats alone, the forces' 631,
-all together 2,127; **synthetic**, clean). From there frequencies, noise levels and numbers are fitted in
-turns, frequencies by the likelihood itself, since they change the filter's gains. Gusts that swing have
-no fast part, so that white noise is asked for once more. What a model lacks may look like a swing as
-well: after a search with them nothing may be coloured, or none is used (searches/unrest.py).
+all together 2,127; **synthetic**, clean). From there frequencies, noise levels and numbers are fitted
+in turns, frequencies by the likelihood itself, since they change the filter's gains. Gusts that swing
+have no fast part, so that white noise is asked for once more. What a model lacks may look like a swing
+as well: after a search with them nothing may be coloured, or none is used (searches/unrest.py).
 """
 
 import math
@@ -24,7 +24,13 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.helicopter_noise import AXES, GUST_AXES, GUST_LEVELS, MEMORIES
 from coax_env.estimation.noise_levels import evenly_picked
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.swinging_gusts import CLEARLY, FASTEST, clearly_swinging, swinging_at, swings
+from coax_env.estimation.swinging_gusts import (
+    CLEARLY,
+    FASTEST,
+    clearly_swinging,
+    swinging_at,
+    swings,
+)
 from coax_env.plain_words import and_list
 
 TURNS = 3

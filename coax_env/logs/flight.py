@@ -82,6 +82,7 @@ from coax_env.logs.card import CARD, Card, read_card
 from coax_env.logs.card_columns import Column, Quaternion
 from coax_env.logs.clock import on_even_clock
 from coax_env.logs.csv_log import CsvLog, read_csv
+from coax_env.logs.derived import without_derived
 from coax_env.logs.frames import place
 from coax_env.logs.repairs import repaired
 from coax_env.logs.smoothed import read_apart
@@ -233,6 +234,7 @@ def read_flight(path: str | Path) -> Flight:
         unread |= dict.fromkeys(log.unknown)
         logs.append(repaired(log, card.noise, counts, card.holds))
     _check_columns(folder, card, renamed, unread)
+    logs = without_derived(logs, counts, card.holds)
     logs = read_apart(on_even_clock(logs, counts), counts, card.holds)
     runs = tuple(
         Run(

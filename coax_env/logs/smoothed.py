@@ -62,7 +62,7 @@ def read_apart(
         counts: what was repaired -> how often; what is left out is added.
         holds: channel -> what the card says; one that never holds stays as it is.
     """
-    pieces = {c: _pieces(runs, c) for c in MOTION if holds.get(c) is not False}
+    pieces = {c: pieces_of(runs, c) for c in MOTION if holds.get(c) is not False}
     near = {c: _nearby(*own) for c, own in pieces.items()}
     steep = [c for c, times in near.items() if max(times) > STEEP]
     rows = max((_apart(*pieces[c], near[c]) for c in steep), default=1)
@@ -89,7 +89,7 @@ def are_steep(runs: Sequence[Repaired]) -> bool:
     Args:
         runs: of one flight.
     """
-    return any(max(_nearby(*_pieces(runs, channel))) > STEEP for channel in MOTION)
+    return any(max(_nearby(*pieces_of(runs, channel))) > STEEP for channel in MOTION)
 
 
 def _nearby(pieces: Sequence[np.ndarray], step: float) -> list[float]:
@@ -122,7 +122,7 @@ def _apart(pieces: Sequence[np.ndarray], step: float, near: Sequence[float]) -> 
     return 1
 
 
-def _pieces(runs: Sequence[Repaired], channel: str) -> tuple[list[np.ndarray], float]:
+def pieces_of(runs: Sequence[Repaired], channel: str) -> tuple[list[np.ndarray], float]:
     """Readings of a channel between which none is missing, and the usual time between two [s]."""
     steps, series = [], []
     for run in runs:
@@ -145,20 +145,31 @@ def _pieces(runs: Sequence[Repaired], channel: str) -> tuple[list[np.ndarray], f
 def steepness(pieces: Sequence[np.ndarray], rows: int) -> float:
     """Density of a spectrum in the MIDDLE of its band over that at the TOP; 0 where it is too short.
 
-    Of second differences, which keep slow motion out of the window's leakage, and back.
+    Args:
+        pieces: readings, one after the other. rows: of which every so many-th is taken.
+    """
+    middle, top = densities(pieces, rows)
+    return middle / top if top > 0.0 else 0.0
+
+
+def densities(pieces: Sequence[np.ndarray], rows: int) -> tuple[float, float]:
+    """Of a spectrum in the MIDDLE of its band and at the TOP, per share of the rate; 0 where too short.
+
+    Of second differences, which keep slow motion out of the window's leakage, and back. Medians over
+    pieces, whatever outliers do: white noise has ln 2 times twice its variance.
 
     Args:
         pieces: readings, one after the other. rows: of which every so many-th is taken.
     """
     taken = [np.diff(piece[::rows], 2) for piece in pieces if piece[::rows].size >= PIECE + 2]
     if sum(piece.size for piece in taken) < PIECES * PIECE:
-        return 0.0
+        return 0.0, 0.0
     windows = np.vstack([sliding_window_view(piece, PIECE)[:: PIECE // 2] for piece in taken])
     frequency, spectra = periodogram(windows, window="hann")
-    frequency, density = frequency[1:], np.median(spectra, axis=0)[1:]  # whatever outliers do
+    frequency, density = frequency[1:], np.median(spectra, axis=0)[1:]
     density = density / (2.0 * np.sin(np.pi * frequency)) ** 4
     middle, top = (
         float(np.mean(density[(frequency > low) & (frequency < high)]))
         for low, high in (MIDDLE, TOP)
     )
-    return middle / top if top > 0.0 else 0.0
+    return middle, top
