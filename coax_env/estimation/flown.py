@@ -2,6 +2,7 @@
 
 - A gap: the last command is held for so long, and no longer; a new part begins behind it. So it does
   where a command jumped in a gap of some rows: nobody knows when.
+- A position, height or heading that was set anew (logs/resets.py): a new part begins behind the jump.
 - Commands that freeze, where they otherwise change all the time: the machine obeys others, or none.
 - Rotors that carry less than half the weight: it stands on the ground, or is carried.
 - What lasts long is flown in equal parts, so that an hour takes the memory of some minutes.
@@ -22,8 +23,10 @@ from coax_env.logs.held import MISSING
 from coax_env.logs.held_signal import integral_of_held
 from coax_env.logs.packets import stretches
 from coax_env.logs.repairs import GAP, hold_last
+from coax_env.logs.resets import reset_rows
 from coax_env.model.layout import RPM_PER_RAD_S
 from coax_env.model.vehicle import Vehicle
+from coax_env.plain_words import and_list, channel_name
 
 LONGEST_BELIEVED = 0.25
 """Time [s] for which the last command is believed, and not less than BELIEVED_STEPS usual steps.
@@ -102,6 +105,12 @@ def _parts(
     step = np.diff(run.t)
     long = np.concatenate([[False], step > longest_believed(run.t)])
     gap = long | jumped
+    set_anew = reset_rows(run)
+    for row in sorted({row for rows in set_anew.values() for row in rows.tolist()} - {0}):
+        if not gap[row] and not left_out[row - 1 : row + 1].any():
+            which = and_list([channel_name(c) for c, rows in set_anew.items() if row in rows])
+            notes.append(f"{run.name}: cut at {run.t[row]:.1f} s, where {which} jumped and stayed")
+            counts["jumps of position, height or heading at which a run is cut"] += 1
     for row in np.flatnonzero(gap):
         if not left_out[row - 1 : row + 1].any():
             why = "" if long[row] else ", in which a command jumped"
@@ -109,6 +118,7 @@ def _parts(
                 f"{run.name}: cut at a gap of {step[row - 1]:.2f} s, {run.t[row]:.1f} s{why}"
             )
             counts["gaps at which a run is cut"] += 1
+    gap[np.concatenate([np.empty(0, int), *set_anew.values()])] = True
     if not (gap.any() or left_out.any() or _equal_parts(run.t) > 1):
         return [run]
     pieces = np.cumsum(gap | np.diff(left_out, prepend=left_out[:1]))
