@@ -396,6 +396,23 @@ def test_channels_that_are_likelier_without_a_cause_speak_against_it(
     assert found.against == (pytest.approx({"az": without / inflation}) if against else {})
 
 
+@pytest.mark.parametrize(("others", "against"), [(-600.0, {}), (-400.0, {"psi": 500.0})])
+def test_readings_speak_together_of_what_is_theirs_alone(others, against):
+    """A late attitude: the heading's levels are others without it, and the others' no less."""
+    nats = {"with": np.zeros(len(CHANNELS)), "without": np.zeros(len(CHANNELS))}
+    for channel, gained in (("psi", 500.0), ("phi", others), ("p", -5000.0)):
+        nats["without"][CHANNELS.index(channel)] = gained
+    problem: Any = SimpleNamespace(
+        settings=SETTINGS, model=SimpleNamespace(channels=CHANNELS),
+        engine=SimpleNamespace(likelihood_by_channel=lambda values, noise: nats[values["is"]]),
+    )  # fmt: skip
+    fit = Fit(("attitude_delay",), {"is": "with"}, Noise({}))  # type: ignore[dict-item]
+    rest = fit.at({"is": "without"})  # type: ignore[dict-item]
+    removal = evidence.Removal(Evidence(5000.0, 1.0), rest)
+    found = evidence.beside_channels(problem, fit, {"attitude_delay": removal})
+    assert found["attitude_delay"].against == against
+
+
 def test_a_number_is_as_unsure_as_the_commands_would_have_it_elsewhere():
     """Both in quadrature: 3 apart and a std of 4, of a variance that colour makes 4 times as large."""
     problem: Any = SimpleNamespace(free_names=lambda active: ["mass", "wind.north", "wind.east"])
