@@ -205,8 +205,40 @@ def test_of_a_low_pass_that_was_found_the_time_alone_is_looked_for_anew(monkeypa
     fit = Fit((), {}, levels)
     found, _ = sensor_low_pass.likeliest(problem, fit, levels, ["p"], {"p": had})
     assert found.order == order and found.time == pytest.approx(0.013, rel=0.02)
-    assert begun[:fits] == [1.0, 2.0, 3.0, 4.0, 1.0, 2.0, 3.0, 4.0][:fits]
-    assert len(begun) == fits + 2  # at the likeliest time, and without
+    assert begun[: fits + 1] == [1.0, 1.0, 2.0, 3.0, 4.0, 1.0, 2.0, 3.0, 4.0][: fits + 1]
+    assert len(begun) == fits + 2  # without first, and at the likeliest time
+
+
+def test_no_longer_low_pass_is_tried_once_two_were_worse_than_the_last(monkeypatch):
+    """Of first order, from a first that is no better than none; of second order two are better."""
+    tried: list[LowPass] = []
+    worth = {1: (-1.0, -2.0, 50.0, 60.0), 2: (5.0, 20.0, 19.0, 18.0)}
+
+    def engine(model: Any, records: Any, threads: int) -> SimpleNamespace:
+        at = records[0]
+        k = min(range(4), key=lambda k: abs(sensor_low_pass.TIMES[k] * 0.01 - at.time))
+        nats = 0.0 if at == NONE else worth[at.order][k]
+        return SimpleNamespace(low_pass=at, log_likelihood=lambda values, noise: nats)
+
+    monkeypatch.setattr(
+        sensor_low_pass, "before_low_pass", lambda record, channels, passes: (passes["p"], 0.0)
+    )
+    monkeypatch.setattr(sensor_low_pass, "Engine", engine)
+    monkeypatch.setattr(
+        sensor_low_pass,
+        "fit_noise",
+        lambda at, values, noise, *rest: tried.append(at.low_pass) or noise,
+    )
+    problem: Any = SimpleNamespace(
+        row=0.01, settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
+        engine=SimpleNamespace(records=["logged"], threads=1),
+        model=SimpleNamespace(channels=("p",)),
+    )  # fmt: skip
+    levels = Noise({"force_xy": 1.0}, {"p": 0.1})
+    found, _ = sensor_low_pass.likeliest(problem, Fit((), {}, levels), levels, ["p"], {})
+    asked = [(x.order, round(x.time / 0.01, 3)) for x in tried[1:-1]]
+    assert tried[0] == NONE and found.order == 2
+    assert asked == [(1, 0.4), (1, 0.65), (2, 0.4), (2, 0.65), (2, 1.1), (2, 1.8)]
 
 
 @pytest.mark.slow

@@ -43,6 +43,8 @@ are tried; chance reaches it once in 4,000 flights. A low-pass of 20 Hz makes 7 
 -13.7 of yaw rate; a servo's delay of 7,186 nats was not named on that **synthetic** flight.)"""
 TIMES = (0.4, 0.65, 1.1, 1.8)
 """Of a row, that are tried: 40 to 9 Hz at 100 Hz; ours."""
+FALLS = 2
+"""Times, each less likely than the one before it, after which no longer one is tried; ours."""
 BOUNDS = (0.2, 3.0)
 """Of a row: less is not seen in the next one, more is no sensor's; ours."""
 TURNS = 2
@@ -188,22 +190,32 @@ def likeliest(
             {c: factor * levels.reading[c] for c in group if c in levels.reading}
         )
 
-    def likelier_of(low_pass: LowPass, levels: Noise) -> tuple[float, Noise]:
-        """From these levels, and from those of the search."""
-        starts = [levels] if fit.noise is noise else [levels, scaled(fit.noise, had, low_pass)]
-        return max((fitted_at(low_pass, start) for start in starts), key=lambda fit: fit[0])
+    def likelier_of(low_pass: LowPass, fitted_so: tuple[float, Noise]) -> tuple[float, Noise]:
+        """As fitted, or from the levels of the search."""
+        if fit.noise is noise:
+            return fitted_so
+        return max(
+            fitted_so,
+            fitted_at(low_pass, scaled(fit.noise, had, low_pass)),
+            key=lambda fit: fit[0],
+        )
 
     had = others.get(group[0], NONE)
+    without = fitted_at(NONE, scaled(noise, had, NONE))
     tried: dict[tuple[int, int], tuple[LowPass, float, Noise]] = {}
     orders, places = [1, 2], list(range(len(TIMES)))
     if had != NONE:
         orders, places = [had.order], [_nearest(had.time / row)]
     for order in orders:
         near, levels = had, noise  # a fit begins where the one before it ended
+        last, falls = without[0], 0
         for k in places:
             trial = LowPass(TIMES[k] * row, order)
             nats, levels = fitted_at(trial, scaled(levels, near, trial))
             tried[order, k], near = (trial, nats, levels), trial
+            last, falls = nats, falls + 1 if nats < last else 0
+            if falls == FALLS:
+                break
     order, k = max(tried, key=lambda place: tried[place][1])
     best, _, levels = tried[order, k]
     bounds = (BOUNDS[0], *TIMES, BOUNDS[1])
@@ -217,8 +229,8 @@ def likeliest(
         cost, bounds=(bounds[k], bounds[k + 2]), method="bounded", options={"xatol": WITHIN}
     )
     found = LowPass(float(least.x) * row, order)
-    nats, levels = likelier_of(found, scaled(levels, best, found))
-    gained = nats - likelier_of(NONE, scaled(noise, had, NONE))[0]
+    nats, levels = likelier_of(found, fitted_at(found, scaled(levels, best, found)))
+    gained = nats - likelier_of(NONE, without)[0]
     problem.report(
         f"a low-pass of {found.cut_off:.0f} Hz, order {found.order}, of {', '.join(group)}:"
         f" {gained:.1f} nats"
