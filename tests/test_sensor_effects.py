@@ -92,6 +92,16 @@ HIDDEN = {
 }
 
 
+@pytest.mark.parametrize(
+    ("channels", "seen"), [("p q vn ve h", False), ("r vn", True), ("psi", True), ("p q psi", True)]
+)
+def test_what_only_turns_the_heading_is_asked_where_that_is_read(channels, seen):
+    """Or its rate; velocities alone show where gusts have turned it."""
+    yaw = {"torque_balance", "yaw_inertia", "yaw_damping", "spin_up_reaction"}
+    found = yaw & set(namable((), LAMA, flight_with(channels, turn=4.0)))
+    assert found == (yaw if seen else set())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", HIDDEN)
 def test_a_sensor_or_body_effect_is_named_alone(tmp_path, monkeypatch, case):
