@@ -159,6 +159,15 @@ def test_poses_with_holes_are_asked_around_them():
     assert list(derived([cut])) == [*VELOCITIES, *RATES]
 
 
+def test_poses_that_were_set_anew_afterwards_are_asked_beside_their_jumps():
+    """By 0.3 m and 1 rad: a few slopes of 50 m/s would be all that weights are fitted to."""
+    run = computed("savgol", 0.1, 9)
+    for channel in POSES:
+        run.measured[channel][400:] += 0.3
+        run.measured[channel][900:] -= 1.0
+    assert list(derived([run])) == [*VELOCITIES, *RATES]
+
+
 def test_a_flight_is_read_without_them(tmp_path):
     """And says so; slower ones, in every third row of the poses, too."""
     run = computed("savgol", 0.0, 7)

@@ -47,6 +47,9 @@ integral of white noise has 1.9; **synthetic** motion captures 0.9 to 1.2, headi
 CoaX 1.2; ours."""
 FAR = 6.0
 """Times its usual size from which what is left in a row is an outlier's; ours."""
+JUMPS = 30.0
+"""Times the median change of slope from which a reading of the pose is none of its motion or noise, of
+which the largest of a million has 8; ours."""
 
 OF_POSITION: Mapping[str, str] = {"vn": "pn", "ve": "pe", "vd": "h"}
 """Velocity -> the reading whose slope it may be, up to the sign."""
@@ -159,7 +162,10 @@ def _compared(run: Repaired, reading: np.ndarray, pose: str, as_even: bool) -> C
     at, step = run.measured[pose][rows], np.diff(run.t[rows])
     usual = float(np.median(step))
     slopes = np.diff(np.unwrap(at) if pose in ANGLES else at) / (usual if as_even else step)
+    bends = np.abs(np.diff(slopes))
+    jumped = np.flatnonzero(bends > JUMPS * np.median(bends))  # set anew, or an outlier
     slopes[step > LOST * usual] = np.nan
+    slopes[jumped] = slopes[jumped + 1] = np.nan
     around = sliding_window_view(slopes, 2 * REACH)
     there = reading[rows[REACH : REACH + around.shape[0]]]
     usable = np.flatnonzero(np.isfinite(there) & np.isfinite(around).all(axis=1))
