@@ -396,21 +396,26 @@ def test_channels_that_are_likelier_without_a_cause_speak_against_it(
     assert found.against == (pytest.approx({"az": without / inflation}) if against else {})
 
 
-@pytest.mark.parametrize(("others", "against"), [(-600.0, {}), (-400.0, {"psi": 500.0})])
-def test_readings_speak_together_of_what_is_theirs_alone(others, against):
-    """A late attitude: the heading's levels are others without it, and the others' no less."""
-    nats = {"with": np.zeros(len(CHANNELS)), "without": np.zeros(len(CHANNELS))}
-    for channel, gained in (("psi", 500.0), ("phi", others), ("p", -5000.0)):
-        nats["without"][CHANNELS.index(channel)] = gained
+@pytest.mark.parametrize(("held", "against"), [(-20.0, False), (20.0, True)])
+def test_a_channel_that_other_levels_make_likelier_says_nothing(held, against):
+    """A yaw rate without a motor's droop, where jitter of the rotors has taken that up."""
+    place = CHANNELS.index("r")
+
+    def by_channel(values: Any, noise: Any) -> np.ndarray:
+        nats = np.zeros(len(CHANNELS))
+        if values["is"] == "without":
+            nats[place] = 154.0 if noise == "other levels" else held
+        return nats
+
     problem: Any = SimpleNamespace(
         settings=SETTINGS, model=SimpleNamespace(channels=CHANNELS),
-        engine=SimpleNamespace(likelihood_by_channel=lambda values, noise: nats[values["is"]]),
+        engine=SimpleNamespace(likelihood_by_channel=by_channel),
     )  # fmt: skip
-    fit = Fit(("attitude_delay",), {"is": "with"}, Noise({}))  # type: ignore[dict-item]
-    rest = fit.at({"is": "without"})  # type: ignore[dict-item]
-    removal = evidence.Removal(Evidence(5000.0, 1.0), rest)
-    found = evidence.beside_channels(problem, fit, {"attitude_delay": removal})
-    assert found["attitude_delay"].against == against
+    fit = Fit(("motor_droop",), {"is": "with"}, "levels")  # type: ignore[dict-item, arg-type]
+    rest = replace(fit.at({"is": "without"}), noise="other levels")  # type: ignore[dict-item, arg-type]
+    removal = evidence.Removal(Evidence(1814.0, 1.0), rest)
+    found = evidence.beside_channels(problem, fit, {"motor_droop": removal})
+    assert found["motor_droop"].against == ({"r": 20.0} if against else {})
 
 
 def test_a_number_is_as_unsure_as_the_commands_would_have_it_elsewhere():

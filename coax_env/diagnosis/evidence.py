@@ -54,7 +54,6 @@ from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, is_large, loss, threshold
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import is_white, whiteness
-from coax_env.model.effect_registry import SENSOR
 from coax_env.model.effects import CATALOGUE
 from coax_env.model.layout import ACCELEROMETERS
 
@@ -181,9 +180,9 @@ def beside_channels(
     look like a cause in its own readings and in no other's: rotor speeds that were averaged over 50 ms
     were a motor lag of 21 ms, sure, for 10,000 nats, that the vertical acceleration was 276 nats
     likelier without. In other channels, by what the filter makes of it, true ones lost up to 203.
-    An effect of the readings themselves shows in these alone, and its rest has other noise levels: an
-    attitude late by 54 ms, 12,769 nats, left heading 527 likelier without. All that should show it
-    must be, together.
+    A rest has other noise levels, by which one channel may gain what another loses: heading 527 nats
+    without an attitude that is late by 54 ms and worth 12,769, a yaw rate 154 without a motor's droop
+    of 1,814 beside rotors that jitter. So a channel must be likelier at the levels with the cause, too.
 
     Args:
         problem, fit: with the causes. removals: of each.
@@ -193,13 +192,12 @@ def beside_channels(
     found = {}
     for effect, removal in removals.items():
         rest, worth = removal.rest, removal.evidence
-        lost = problem.engine.likelihood_by_channel(rest.values, rest.noise) - with_it
+        gained = np.minimum(
+            *(problem.engine.likelihood_by_channel(rest.values, n) for n in (rest.noise, fit.noise))
+        )
         least = max(chosen.evidence, chosen.against_share * worth.lost) * worth.inflation
-        named = dict(zip(problem.model.channels, lost.tolist(), strict=True))
-        should = CATALOGUE[effect].channels
-        shown = [c for c in should if named.get(c, 0.0) > least]
-        if CATALOGUE[effect].stage == SENSOR and sum(named.get(c, 0.0) for c in should) < 0.0:
-            shown = []
+        named = dict(zip(problem.model.channels, (gained - with_it).tolist(), strict=True))
+        shown = [c for c in CATALOGUE[effect].channels if named.get(c, 0.0) > least]
         against = {c: named[c] / worth.inflation for c in shown}
         found[effect] = replace(worth, against=against)
     return found
