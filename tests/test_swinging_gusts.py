@@ -244,6 +244,33 @@ def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, clear, times,
         assert found[0] is problem and found[1] == pytest.approx(levels)
 
 
+@pytest.mark.parametrize(("lost", "asked"), [(990.0, True), (1010.0, False)])
+def test_swings_that_lose_far_more_at_first_than_one_gained_are_not_fitted(
+    monkeypatch, lost, asked
+):
+    """Ten times what one group gained alone, 100 nats; the real first CoaX lost 124 times."""
+    fit = Fit((), {}, NOISE, objective=500.0)
+    turns = []
+    monkeypatch.setattr(asking, "swings", lambda passes, row: [0.8] * 6)
+    monkeypatch.setattr(asking, "clearly_swinging", lambda passes, row: ["force_z"])
+    monkeypatch.setattr(asking, "_gained_by", lambda *of: 100.0)
+    monkeypatch.setattr(asking, "fitted", lambda p, trial: replace(trial, objective=500.0 + lost))
+    monkeypatch.setattr(asking, "noise_fitted", lambda p, trial: trial)
+    monkeypatch.setattr(asking, "with_latent_noise", lambda problem, fit: None)
+    monkeypatch.setattr(asking, "_swinging", lambda problem, frequencies: problem)
+    monkeypatch.setattr(
+        asking, "_likeliest", lambda part, trial, found, *how: turns.append(1) or (found, trial)
+    )
+    monkeypatch.setattr(asking, "evenly_picked", lambda records, seconds: records)
+    problem: Any = SimpleNamespace(
+        engine=SimpleNamespace(filter=lambda values, noise: [], records=[]), row=0.01,
+        settings=SETTINGS, noise_fit_seconds=60.0,
+        report=lambda text: None, with_records=lambda records: None,
+    )  # fmt: skip
+    assert asking.with_swings(problem, fit) is None
+    assert bool(turns) == asked
+
+
 @pytest.mark.parametrize(("peak", "asked"), [(0.8, False), (0.71, True), (2.3, True), (0.0, False)])
 def test_a_swing_far_from_its_spectrums_peak_is_fitted_from_there(monkeypatch, peak, asked):
     """It swings at 0.29 times, or 2 to 2.9 times the peak's frequency, but not at 1.6 times."""
