@@ -145,6 +145,9 @@ def test_too_little_to_say(rows):
     )
     empty = Repaired(run.t, run.command, {c: np.full(ROWS, np.nan) for c in run.measured}, None)
     bare = Repaired(run.t, run.command, {}, None)
+    still = Repaired(run.t, run.command, {c: np.zeros(ROWS) for c in run.measured}, None)
+    stuck = Repaired(run.t, run.command, {**run.measured, "vn": np.zeros(ROWS)}, None)
+    assert derived([still]) == {} and "vn" not in derived([stuck])
     assert derived([short]) == derived([empty]) == derived([bare]) == derived([]) == {}
 
 

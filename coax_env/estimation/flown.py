@@ -106,7 +106,7 @@ def _parts(
     long = np.concatenate([[False], step > longest_believed(run.t)])
     gap = long | jumped
     set_anew = reset_rows(run)
-    for row in sorted({row for rows in set_anew.values() for row in rows.tolist()} - {0}):
+    for row in sorted({row for rows in set_anew.values() for row in rows.tolist()}):
         if not gap[row] and not left_out[row - 1 : row + 1].any():
             which = and_list([channel_name(c) for c, rows in set_anew.items() if row in rows])
             notes.append(f"{run.name}: cut at {run.t[row]:.1f} s, where {which} jumped and stayed")

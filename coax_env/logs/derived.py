@@ -147,7 +147,8 @@ def _left(
     of_readings = (np.append(0.0, weights) - np.append(weights, 0.0)) / step
     second = np.zeros(2 * known[0].stride + 1)
     second[[0, known[0].stride, -1]] = 1.0, -2.0, 1.0
-    return float(np.mean(left**2) / np.sum(np.convolve(of_readings, second) ** 2))
+    gained = float(np.sum(np.convolve(of_readings, second) ** 2))
+    return float(np.mean(left**2)) / gained if gained > 0.0 else math.inf
 
 
 def _compared(run: Repaired, reading: np.ndarray, pose: str, as_even: bool) -> Compared | None:
