@@ -141,6 +141,25 @@ def test_a_low_pass_is_asked_for_where_it_shows_or_what_looks_like_it_is_named(
     assert sensor_low_pass.low_passes(problem, fit, Noise({})) == {} and tried == asked
 
 
+def of_stand_ins(
+    monkeypatch: pytest.MonkeyPatch,
+    engine: Any,
+    fit_noise: Any,
+    before: Any = lambda record, channels, passes: (passes["p"], 0.0),
+) -> Any:
+    """A problem with one record, what `before` makes of that and `engine` of this; no fits."""
+    monkeypatch.setattr(sensor_low_pass, "before_low_pass", before)
+    monkeypatch.setattr(
+        sensor_low_pass, "Engine", lambda model, records, threads: engine(records[0])
+    )
+    monkeypatch.setattr(sensor_low_pass, "fit_noise", fit_noise)
+    return SimpleNamespace(
+        row=0.01, settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
+        engine=SimpleNamespace(records=["logged"], threads=1),
+        model=SimpleNamespace(channels=("p",)),
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(("from_search", "found"), [(-40.0, True), (-60.0, False)])
 def test_a_low_pass_is_worth_what_it_is_at_the_likeliest_levels(monkeypatch, from_search, found):
     """Noise levels are fitted from two starts, which end 50 nats apart without a low-pass: what it is
@@ -155,16 +174,8 @@ def test_a_low_pass_is_worth_what_it_is_at_the_likeliest_levels(monkeypatch, fro
     def before(record: Any, channels: Any, passes: Any) -> tuple[str, float]:
         return ("none" if set(passes.values()) <= {NONE} else "some"), 0.0
 
-    monkeypatch.setattr(sensor_low_pass, "before_low_pass", before)
-    monkeypatch.setattr(
-        sensor_low_pass, "Engine", lambda model, records, threads: Stand(kind=records[0])
-    )
-    monkeypatch.setattr(sensor_low_pass, "fit_noise", lambda engine, values, noise, *rest: noise)
-    problem: Any = SimpleNamespace(
-        row=0.01, settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
-        engine=SimpleNamespace(records=["logged"], threads=1),
-        model=SimpleNamespace(channels=("p",)),
-    )  # fmt: skip
+    as_it_is = lambda engine, values, noise, *rest: noise  # noqa: E731
+    problem = of_stand_ins(monkeypatch, lambda at: Stand(kind=at), as_it_is, before)
     low_pass, noise = sensor_low_pass.likeliest(problem, Fit((), {}, searched), first, ["p"], {})
     assert (low_pass != NONE) == found
     assert noise.level("force_xy") == (1.0 if found else 2.0)
@@ -189,18 +200,7 @@ def test_of_a_low_pass_that_was_found_the_time_alone_is_looked_for_anew(monkeypa
         begun.append(noise.level("force_xy"))
         return noise.with_levels({"force_xy": noise.level("force_xy") + 1.0})
 
-    monkeypatch.setattr(
-        sensor_low_pass, "before_low_pass", lambda record, channels, passes: (passes["p"], 0.0)
-    )
-    monkeypatch.setattr(
-        sensor_low_pass, "Engine", lambda model, records, threads: Stand(low_pass=records[0])
-    )
-    monkeypatch.setattr(sensor_low_pass, "fit_noise", fit_noise)
-    problem: Any = SimpleNamespace(
-        row=0.01, settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
-        engine=SimpleNamespace(records=["logged"], threads=1),
-        model=SimpleNamespace(channels=("p",)),
-    )  # fmt: skip
+    problem = of_stand_ins(monkeypatch, lambda at: Stand(low_pass=at), fit_noise)
     levels = Noise({"force_xy": 1.0}, {"p": 0.1})
     fit = Fit((), {}, levels)
     found, _ = sensor_low_pass.likeliest(problem, fit, levels, ["p"], {"p": had})
@@ -214,26 +214,16 @@ def test_no_longer_low_pass_is_tried_once_two_were_worse_than_the_last(monkeypat
     tried: list[LowPass] = []
     worth = {1: (-1.0, -2.0, 50.0, 60.0), 2: (5.0, 20.0, 19.0, 18.0)}
 
-    def engine(model: Any, records: Any, threads: int) -> SimpleNamespace:
-        at = records[0]
+    def engine(at: LowPass) -> SimpleNamespace:
         k = min(range(4), key=lambda k: abs(sensor_low_pass.TIMES[k] * 0.01 - at.time))
         nats = 0.0 if at == NONE else worth[at.order][k]
         return SimpleNamespace(low_pass=at, log_likelihood=lambda values, noise: nats)
 
-    monkeypatch.setattr(
-        sensor_low_pass, "before_low_pass", lambda record, channels, passes: (passes["p"], 0.0)
-    )
-    monkeypatch.setattr(sensor_low_pass, "Engine", engine)
-    monkeypatch.setattr(
-        sensor_low_pass,
-        "fit_noise",
-        lambda at, values, noise, *rest: tried.append(at.low_pass) or noise,
-    )
-    problem: Any = SimpleNamespace(
-        row=0.01, settings=SETTINGS, noise_fit_seconds=60.0, report=lambda text: None,
-        engine=SimpleNamespace(records=["logged"], threads=1),
-        model=SimpleNamespace(channels=("p",)),
-    )  # fmt: skip
+    def fit_noise(at: Any, values: Any, noise: Noise, *rest: Any) -> Noise:
+        tried.append(at.low_pass)
+        return noise
+
+    problem = of_stand_ins(monkeypatch, engine, fit_noise)
     levels = Noise({"force_xy": 1.0}, {"p": 0.1})
     found, _ = sensor_low_pass.likeliest(problem, Fit((), {}, levels), levels, ["p"], {})
     asked = [(x.order, round(x.time / 0.01, 3)) for x in tried[1:-1]]

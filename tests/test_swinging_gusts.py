@@ -206,6 +206,26 @@ def test_a_gust_that_only_fades_has_none():
     assert not np.any(found)
 
 
+def of_stand_ins(monkeypatch: pytest.MonkeyPatch, clear: list[str], **others: Any) -> Any:
+    """A problem whose clear gusts swing at 0.8 Hz, and whose fits change nothing but by `others`."""
+    stand_ins: dict[str, Any] = {
+        "swings": lambda passes, row: [0.8] * 6,
+        "clearly_swinging": lambda passes, row: clear,
+        "with_latent_noise": lambda problem, fit: None,
+        "noise_fitted": lambda problem, fit: fit,
+        "_swinging": lambda problem, frequencies: problem,
+        "_likeliest": lambda part, trial, found, *how: (found, trial),
+        "evenly_picked": lambda records, seconds: records,
+    }
+    for name, stand_in in {**stand_ins, **others}.items():
+        monkeypatch.setattr(asking, name, stand_in)
+    return SimpleNamespace(
+        engine=SimpleNamespace(filter=lambda values, noise: [], records=[]), row=0.01,
+        model=SimpleNamespace(channels=()), settings=SETTINGS, noise_fit_seconds=60.0,
+        report=lambda text: None, with_records=lambda records: None,
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("clear", "times", "alone", "gain", "used"),
     [
@@ -223,21 +243,11 @@ def test_swings_are_asked_for_where_they_are_worth_it(monkeypatch, clear, times,
     floor = {"force_z": NOISE.level("force_z") / times}
     fit = Fit((), {}, replace(NOISE, floor=floor), objective=500.0)
     gained = lambda problem, fit: replace(fit, objective=500.0 - gain)  # noqa: E731
-    monkeypatch.setattr(asking, "swings", lambda passes, row: [0.8] * 6)
-    monkeypatch.setattr(asking, "clearly_swinging", lambda passes, row: clear.split())
-    monkeypatch.setattr(asking, "_gained_by", lambda p, f, at, axes: alone * (axes == "force_z"))
-    monkeypatch.setattr(asking, "fitted", gained)
-    monkeypatch.setattr(asking, "noise_fitted", gained)
-    monkeypatch.setattr(asking, "with_latent_noise", lambda problem, fit: None)
-    monkeypatch.setattr(asking, "_swinging", lambda problem, frequencies: problem)
-    monkeypatch.setattr(asking, "_likeliest", lambda part, trial, found, *how: (found, trial))
-    monkeypatch.setattr(asking, "evenly_picked", lambda records, seconds: records)
-    problem = SimpleNamespace(
-        engine=SimpleNamespace(filter=lambda values, noise: [], records=[]), row=0.01,
-        model=SimpleNamespace(channels=()), settings=SETTINGS, noise_fit_seconds=60.0,
-        report=lambda text: None, with_records=lambda records: None,
+    problem = of_stand_ins(
+        monkeypatch, clear.split(), fitted=gained, noise_fitted=gained,
+        _gained_by=lambda p, f, at, axes: alone * (axes == "force_z"),
     )  # fmt: skip
-    found = asking.with_swings(problem, fit)  # type: ignore[arg-type]
+    found = asking.with_swings(problem, fit)
     assert (found is not None) == used
     if found is not None:
         levels = {**LEVELS, **{f"memory_{axes}": 1.25 for axes in AXES}}  # one swing at 0.8 Hz
@@ -251,21 +261,11 @@ def test_swings_that_lose_far_more_at_first_than_one_gained_are_not_fitted(
     """Ten times what one group gained alone, 100 nats; the real first CoaX lost 124 times."""
     fit = Fit((), {}, NOISE, objective=500.0)
     turns = []
-    monkeypatch.setattr(asking, "swings", lambda passes, row: [0.8] * 6)
-    monkeypatch.setattr(asking, "clearly_swinging", lambda passes, row: ["force_z"])
-    monkeypatch.setattr(asking, "_gained_by", lambda *of: 100.0)
-    monkeypatch.setattr(asking, "fitted", lambda p, trial: replace(trial, objective=500.0 + lost))
-    monkeypatch.setattr(asking, "noise_fitted", lambda p, trial: trial)
-    monkeypatch.setattr(asking, "with_latent_noise", lambda problem, fit: None)
-    monkeypatch.setattr(asking, "_swinging", lambda problem, frequencies: problem)
-    monkeypatch.setattr(
-        asking, "_likeliest", lambda part, trial, found, *how: turns.append(1) or (found, trial)
-    )
-    monkeypatch.setattr(asking, "evenly_picked", lambda records, seconds: records)
-    problem: Any = SimpleNamespace(
-        engine=SimpleNamespace(filter=lambda values, noise: [], records=[]), row=0.01,
-        settings=SETTINGS, noise_fit_seconds=60.0,
-        report=lambda text: None, with_records=lambda records: None,
+    problem = of_stand_ins(
+        monkeypatch, ["force_z"],
+        _gained_by=lambda *of: 100.0,
+        fitted=lambda p, trial: replace(trial, objective=500.0 + lost),
+        _likeliest=lambda part, trial, found, *how: turns.append(1) or (found, trial),
     )  # fmt: skip
     assert asking.with_swings(problem, fit) is None
     assert bool(turns) == asked

@@ -21,6 +21,7 @@ import numpy as np
 
 from coax_env.estimation.state_space import Record
 from coax_env.logs.flight import Run
+from coax_env.logs.frames import euler_rates
 from coax_env.model.layout import ANGLES, GYROS, MOTION
 from coax_env.plain_words import and_list, plain, seconds
 
@@ -129,11 +130,8 @@ def _turns(run: Run, angle: str, begin: float, end: float) -> Turns | None:
 
 def _rate(run: Run, angle: str) -> np.ndarray:
     """How fast an angle turns by the gyros, (n,) [rad/s]."""
-    p, q, r, phi, theta = (_filled(run, c) for c in (*GYROS, "phi", "theta"))
-    across = np.sin(phi) * q + np.cos(phi) * r
-    if angle == "phi":
-        return p + np.tan(theta) * across
-    return across / np.cos(theta) if angle == "psi" else np.cos(phi) * q - np.sin(phi) * r
+    *gyros, phi, theta = (_filled(run, c) for c in (*GYROS, "phi", "theta"))
+    return euler_rates(gyros, phi, theta)[ANGLES.index(angle)]
 
 
 def _filled(run: Run, channel: str) -> np.ndarray:

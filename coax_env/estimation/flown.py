@@ -106,7 +106,7 @@ def _parts(
     long = np.concatenate([[False], step > longest_believed(run.t)])
     gap = long | jumped
     set_anew = reset_rows(run)
-    for row in sorted({row for rows in set_anew.values() for row in rows.tolist()}):
+    for row in sorted(set().union(*(rows.tolist() for rows in set_anew.values()))):
         if not gap[row] and not left_out[row - 1 : row + 1].any():
             which = and_list([channel_name(c) for c, rows in set_anew.items() if row in rows])
             notes.append(f"{run.name}: cut at {run.t[row]:.1f} s, where {which} jumped and stayed")
@@ -118,7 +118,8 @@ def _parts(
                 f"{run.name}: cut at a gap of {step[row - 1]:.2f} s, {run.t[row]:.1f} s{why}"
             )
             counts["gaps at which a run is cut"] += 1
-    gap[np.concatenate([np.empty(0, int), *set_anew.values()])] = True
+    for rows in set_anew.values():
+        gap[rows] = True
     if not (gap.any() or left_out.any() or _equal_parts(run.t) > 1):
         return [run]
     pieces = np.cumsum(gap | np.diff(left_out, prepend=left_out[:1]))

@@ -18,13 +18,14 @@ band as at the top, where a motion capture's noise is flat.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from coax_env.logs.frames import euler_rates
 from coax_env.logs.repairs import Repaired
 from coax_env.logs.smoothed import LOST, densities, pieces_of, steepness
 from coax_env.model.layout import ANGLES, GYROS
@@ -80,7 +81,8 @@ def without_derived(
     for poses, words in ((tuple(OF_POSITION.values()), "positions"), (ANGLES, "attitudes")):
         gone = [channel for channel, pose in found.items() if pose in poses]
         if gone:
-            number = sum(int(np.isfinite(own).sum()) for own in _columns(runs, gone))
+            own = (run.measured[c] for run in runs for c in gone if c in run.measured)
+            number = sum(int(np.isfinite(values).sum()) for values in own)
             counts[f"{and_list(gone)} computed from the logged {words}, left out"] += number
     return [
         replace(run, measured={c: own for c, own in run.measured.items() if c not in found})
@@ -100,7 +102,10 @@ def derived(runs: Sequence[Repaired]) -> dict[str, str]:
         if _is_computed(own, pose):
             found[channel] = pose
     turning = [run for run in runs if run.measured.keys() >= {*GYROS, *ANGLES}]
-    rates = [_euler_rates(run) for run in turning]
+    rates = [
+        euler_rates([run.measured[c] for c in GYROS], run.measured["phi"], run.measured["theta"])
+        for run in turning
+    ]
     if all(
         _is_computed([(run, own[k]) for run, own in zip(turning, rates, strict=True)], angle)
         for k, angle in enumerate(ANGLES)
@@ -108,10 +113,6 @@ def derived(runs: Sequence[Repaired]) -> dict[str, str]:
         found |= dict(zip(GYROS, ANGLES, strict=True))
     flat = any(steepness(pieces_of(runs, pose)[0], 1) < FLAT for pose in found.values())
     return found if flat else {}
-
-
-def _columns(runs: Iterable[Repaired], channels: Sequence[str]) -> list[np.ndarray]:
-    return [run.measured[c] for run in runs for c in channels if c in run.measured]
 
 
 def _is_computed(readings: Sequence[tuple[Repaired, np.ndarray]], pose: str) -> bool:
@@ -181,15 +182,4 @@ def _compared(run: Repaired, reading: np.ndarray, pose: str, as_even: bool) -> C
         there[before] - 2.0 * there[middle] + there[after],
         around[before] - 2.0 * around[middle] + around[after],
         stride,
-    )
-
-
-def _euler_rates(run: Repaired) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rates of the three angles as gyros and attitudes say, (n,) each [rad/s]; eq. (38)-(40)."""
-    p, q, r, phi, theta = (run.measured[c] for c in (*GYROS, "phi", "theta"))
-    across = np.sin(phi) * q + np.cos(phi) * r
-    return (
-        p + np.tan(theta) * across,
-        np.cos(phi) * q - np.sin(phi) * r,
-        across / np.cos(theta),
     )

@@ -5,6 +5,8 @@ angles that turn
 the earth's axes into the body's.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from coax_env.errors import InputError
@@ -64,6 +66,19 @@ def attitude(q: np.ndarray, frames: str) -> tuple[np.ndarray, np.ndarray, np.nda
     theta = np.arcsin(np.clip(-ours[:, 2, 0], -1.0, 1.0))
     psi = np.arctan2(ours[:, 1, 0], ours[:, 0, 0])
     return phi, theta, psi
+
+
+def euler_rates(
+    gyros: Sequence[np.ndarray], phi: np.ndarray, theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rates of phi, theta, psi (n,) [rad/s] where gyros p, q, r turn the body; eq. (38)-(40).
+
+    Args:
+        gyros: p, q, r, (n,) each [rad/s]. phi, theta: (n,) [rad].
+    """
+    p, q, r = gyros
+    across = np.sin(phi) * q + np.cos(phi) * r
+    return p + np.tan(theta) * across, np.cos(phi) * q - np.sin(phi) * r, across / np.cos(theta)
 
 
 def turned_to_earth(q: np.ndarray, body: np.ndarray) -> np.ndarray:
