@@ -14,7 +14,7 @@ To hide something new: a field of ``Hidden``, its off-value the default; an entr
 - commands, before motors and servos: ``_acting`` (late ones: ``_late_row``, and ``_is_late``);
 - motors and servos: ``_actuate``, ``_follow_at_once``; a state more: ``N_STATE``;
 - forces, moments, flaps, mass: ``_derivative``;
-- readings of another time: ``_fly_run``, which has all rows, those before the log too (``_late_rows``);
+- readings of another time: ``_fly_run``, which has all rows, those before the log too (``_late``);
 - what a sensor makes of a reading, and another channel: ``_read``.
 
 Its usual sizes belong in ``scripts/study/plan.py``.
@@ -27,6 +27,7 @@ import copy
 import json
 import math
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,6 +59,7 @@ from injector_sensors import (
     thin,
 )
 from numba import njit
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 RPM = 30.0 / math.pi
@@ -1046,13 +1048,13 @@ def _fly_run(
     columns["delta_lon"], columns["delta_lat"] = commands[first:, 2:].T
     for i, channel in enumerate(("p", "q", "r", "ax", "ay", "az")):
         columns[channel] = logged[:, 2 + i]
-    past = _late_rows(first, rows, hidden.attitude_delay + hidden.pose_delay, sensors.step)
-    columns["phi"], columns["theta"], columns["psi"] = readings[past, 8:11].T
-    past = _late_rows(first, rows, hidden.sonar_delay + hidden.pose_delay, sensors.step)
-    columns["h"] = -readings[past, 13] * (1.0 + hidden.sonar_tilt * (1.0 / logged[:, 17] - 1.0))
+    late = partial(_late, times[:-1], first)
+    attitude = late(readings[:, 8:11], hidden.attitude_delay + hidden.pose_delay)
+    columns["phi"], columns["theta"], columns["psi"] = attitude.T
+    height = -late(readings[:, 13], hidden.sonar_delay + hidden.pose_delay)
+    columns["h"] = height * (1.0 + hidden.sonar_tilt * (1.0 / logged[:, 17] - 1.0))
     columns["vn"], columns["ve"], columns["vd"] = logged[:, 14:17].T
-    past = _late_rows(first, rows, hidden.pose_delay, sensors.step)
-    columns["pn"], columns["pe"] = readings[past, 11:13].T
+    columns["pn"], columns["pe"] = late(readings[:, 11:13], hidden.pose_delay).T
     if hidden.per_volt > 0.0:
         product = commands[first:, 0] * commands[first:, 1]
         rotors = rotors_of(craft)
@@ -1086,9 +1088,11 @@ def _arrives(rows: int, lost: float, rng: np.random.Generator) -> np.ndarray:
     return arrives
 
 
-def _late_rows(first: int, rows: int, delay: float, step: float) -> np.ndarray:
-    """The rows that a sensor shows, `delay` s late, at each logged row."""
-    return np.maximum(np.arange(first, rows) - int(round(delay / step)), 0)
+def _late(times: np.ndarray, first: int, shown: np.ndarray, delay: float) -> np.ndarray:
+    """What a sensor shows at the logged rows, from `first` on, of what was there `delay` s before."""
+    if delay == 0.0:
+        return shown[first:]
+    return CubicSpline(times, shown)(np.maximum(times[first:] - delay, times[0]))
 
 
 def _on(pushes: np.ndarray, times: np.ndarray, step: float) -> np.ndarray:

@@ -329,6 +329,18 @@ def test_readings_between_two_are_straight_lines_or_the_last_one(tmp_path: Path)
         assert np.diff(pieces[:, 0]).std() > 0.1
 
 
+def test_late_readings_are_of_as_many_seconds_before_between_rows_too() -> None:
+    """Of even rows and of uneven ones; whole rows late they are those of these rows."""
+    rng = np.random.default_rng(0)
+    even = 0.01 * np.arange(-50, 300)
+    for times in (even, even + rng.uniform(-0.002, 0.002, even.size)):
+        shown = np.column_stack([np.sin(5.0 * times), np.cos(7.0 * times)])
+        then = times[50:] - 0.0245
+        expected = np.column_stack([np.sin(5.0 * then), np.cos(7.0 * then)])
+        np.testing.assert_allclose(injector._late(times, 50, shown, 0.0245), expected, atol=1e-6)
+    np.testing.assert_allclose(injector._late(even, 50, even, 0.03), even[47:-3], atol=1e-12)
+
+
 def test_a_motion_captures_software_steadies_without_delay(tmp_path: Path) -> None:
     """10 Hz of second order, forwards and back: white noise is a fifth as steep and less, and where the
     machine is is said when it is there. As logged: the package reads one in five."""

@@ -938,6 +938,7 @@ def test_low_passes_are_fitted_once_more_beside_errors_that_last(
         problem_module, "records_before", lambda logged, channels, those: (logged, those)
     )
     stand_in(monkeypatch, "low_passes", low_passes)
+    stand_in(monkeypatch, "moved_as_in", lambda problem, records: records)
     found = of(given.behind({**had, **OF_ROTORS}, "logged"), levels)
     stand_in(monkeypatch, "searched_once", of)
     stand_in(monkeypatch, "lost", lambda problem, it: 50.0 if it is found else lost)

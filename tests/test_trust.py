@@ -534,6 +534,28 @@ def test_by_poses_alone_little_evidence_speaks_against_a_name(poses_alone, nats,
     assert without_name({"yaw_damping": of}, SETTINGS) == (set() if named else {"yaw_damping"})
 
 
+@pytest.mark.parametrize(
+    ("nats", "falls", "named"), [(17.0, True, False), (17.0, False, True), (50.0, True, True)]
+)
+def test_what_a_low_pass_too_fast_to_be_seen_would_do_needs_more_evidence(nats, falls, named):
+    """A thrust exponent of 17 nats, of accelerometers behind 79 Hz (**synthetic**)."""
+    of = known_of(nats=nats, falls_at=("half of all",) * falls, smoothed=True)
+    found = without_name({"thrust_exponent": of}, SETTINGS)
+    assert found == (set() if named else {"thrust_exponent"})
+
+
+@pytest.mark.parametrize(
+    ("none", "moved", "named"),
+    [(True, ("inertia_xx",), False), (True, (), True), (False, ("inertia_xx",), True)],
+)
+def test_what_may_be_none_beside_a_number_that_went_too_far_has_no_name(none, moved, named):
+    """Of poses alone, a clean flight: a late command of 100 nats, 2 std from none, beside two inertias
+    4 std too small (**synthetic**).
+    """
+    of = known_of(may_be_none=none, beside_moved=moved)
+    assert without_name({"command_delay": of}, SETTINGS) == (set() if named else {"command_delay"})
+
+
 @pytest.mark.parametrize(("share", "doubted"), [(0.5, False), (0.6, True)])
 def test_nothing_is_sure_where_the_model_leaves_colour_in_most_channels(share, doubted):
     """Though what shows the effect is white; it keeps its name."""

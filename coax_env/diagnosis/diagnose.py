@@ -40,6 +40,7 @@ from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
 from coax_env.diagnosis.gain import TOO_SHORT, flies_worse, gain_of, likelier_without
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.input_innovations import engine_as_fitted
+from coax_env.diagnosis.late_readings import with_late
 from coax_env.diagnosis.model_check import model_check
 from coax_env.diagnosis.onsets.moment import moments_of
 from coax_env.diagnosis.onsets.search import beside_onsets, with_onsets
@@ -230,10 +231,11 @@ def diagnose(
     unnamed = findings.without_a_name(evidence, trust, white["after"])
     unexplained = described + unnamed + findings.unexplained(white["after"], speaking_for)
     report("asking whether the fitted model makes such flights")
-    check = model_check(problem, fit, passes_after)
+    check = model_check(problem.as_logged, fit, passes_after)
     report("refitting the corrected model on everything")
     inflations = {e: weighed.inflation for e, weighed in evidence.items()}
     inflations |= unlisted.inflations(problem, fit, quadratic, terms)
+    held = [with_late(r, problem.late) for r in held]
     corrected = corrected_vehicle(problem, fit, quadratic, held, inflations, new_lines, flight)
     alarms = calibrated(settings.evidence, class_of(flight, vehicle, fit))
     by_evidence = [c["effect"] for c in causes if c["effect"] in found]

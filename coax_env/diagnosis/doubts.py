@@ -154,12 +154,13 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
     standing_in = {e: of for e, of in against.items() if of.stands_for_something_else(chosen)}
 
     def voices(effect: str, of: Against) -> int:
-        unseen = bool(of.coloured) or of.poses_alone
+        unseen = bool(of.coloured) or of.poses_alone or of.smoothed
         weak = unseen and of.nats < chosen.sure_evidence
         beside = any(_shows_beside(effect, of, standing_in))
         parts = of.is_gone_on_parts(chosen)
         seen = (bool(of.coloured), bool(of.falls_at), of.may_be_none, of.flies_worse)
-        return sum((*seen, of.within_form, of.may_be_shock(chosen), weak, parts, beside))
+        torn = of.may_be_none and bool(of.beside_moved)
+        return sum((*seen, of.within_form, of.may_be_shock(chosen), weak, parts, beside, torn))
 
     return {
         effect

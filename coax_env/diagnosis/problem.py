@@ -22,7 +22,7 @@ from coax_env.estimation.helicopter_noise import GUST_LEVELS
 from coax_env.estimation.joint_gusts import SHARES
 from coax_env.estimation.low_pass import LowPass, records_before
 from coax_env.estimation.parted_engine import AT
-from coax_env.estimation.state_space import FreeParameter, Noise, Record
+from coax_env.estimation.state_space import FreeParameter, Late, Noise, Record
 from coax_env.model import effects
 from coax_env.model import parameters as P
 from coax_env.model.layout import INERTIAL, ROTOR_SPEEDS
@@ -199,6 +199,16 @@ class Problem:
         """
         before = records_before(records, self.model.channels, passes)
         return replace(self.with_records(before), low_passes={**self.low_passes, **passes})
+
+    @property
+    def late(self) -> Late | None:
+        """Which readings are moved back where they are late, if any."""
+        return self.engine.records[0].late
+
+    @property
+    def as_logged(self) -> "Problem":
+        """With no readings moved back."""
+        return self.with_records([replace(r, late=None) for r in self.engine.records])
 
     def with_clock_error(self, std: float) -> "Problem":
         """With readings of motion as good as the rows' times are, whose std is this [s]."""

@@ -319,6 +319,10 @@ class ChangingModel(HeliModel):
         own = np.concatenate([k * self._size + self._places for k in range(count)])
         return np.append(own, count * self._size + np.arange(2 * count))
 
+    def in_blocks(self, place: int) -> np.ndarray:
+        """A place in the model's parameter vector, in every block."""
+        return np.arange(2 * len(self._changes)) * self._size + place
+
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """The model's inputs with each row's parameters, and which these are, (n, nu + 1)."""
         count = (vector.size - 1) // (self._size + 2)

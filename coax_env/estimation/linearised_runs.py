@@ -8,6 +8,7 @@ import numpy as np
 
 from coax_env.estimation import frozen_gains
 from coax_env.estimation.beginnings import Asked, Beginning, Moved, Sums, beginnings_pass
+from coax_env.estimation.late_readings import rest_of
 from coax_env.estimation.pass_data import Path, RunData
 from coax_env.estimation.run_passes import Buffers, RunPass, RunPasses, gains_of, trace_of
 from coax_env.estimation.sparse import add_gram, aligned, padded
@@ -144,7 +145,8 @@ def signatures_of(
     if not columns.size:
         return lambda portion, J, kept: None
     columns = columns[np.argsort(~moves.reading_only[columns], kind="stable")]
-    vectors = [moves.vectors[k] for k in columns]
+    p = rest_of(runs.model, run.record, p)
+    vectors = [rest_of(runs.model, run.record, moves.vectors[k]) for k in columns]
     sets, which = [run.inputs], np.zeros(columns.size, np.int64)
     for k, vector in enumerate(vectors):
         inputs = _inputs(runs, run, p, vector)
@@ -210,6 +212,8 @@ def _moved_innovations(
             yield e[there] if runs.frozen(i, run, vector, e) else np.full(there.sum(), np.nan)
         return
     data, gains = RunData(runs.intervals[i], run.inputs, run.record.z), gains_of(run)
+    p = rest_of(runs.model, run.record, p)
+    vectors = [rest_of(runs.model, run.record, vector) for vector in vectors]
     for first in range(0, len(vectors), SIMD_WIDTH):
         some = vectors[first : first + SIMD_WIDTH]
         lanes = [*some, *[p] * (SIMD_WIDTH - len(some))]

@@ -12,6 +12,7 @@ import numpy as np
 
 from coax_env.estimation import frozen_gains, kalman
 from coax_env.estimation.compiled_model import CompiledModel
+from coax_env.estimation.late_readings import as_flown, rest_of
 from coax_env.estimation.pass_data import Covariances, Gains, Path, RunData, Trace, Variances
 from coax_env.estimation.state_space import Model, Noise, Record
 
@@ -91,7 +92,6 @@ class RunPasses:
         self.starts = [model.start(r) for r in self.records]
         self.intervals = [np.append(np.diff(r.t), 0.0) for r in self.records]
         self.refresh = [_rows_between_jacobians(dt) for dt in self.intervals]
-        self._readings = [int((~np.isnan(r.z)).sum()) for r in self.records]
         self._buffers: list[Buffers] = []  # that no thread works with
 
     def each(self, work: Callable[[int], Any], which: Sequence[int] | None = None) -> list[Any]:
@@ -135,7 +135,7 @@ class RunPasses:
             start_rows: rows at which to keep the filtered covariance.
             decaying: states whose rows of the covariance are stored with these.
         """
-        record = self.records[i]
+        record, p = as_flown(self.model, self.records[i], p)
         n, m = record.z.shape
         q, decay = self.model.process_noise(noise, p)
         R = self._reading_variances(noise)
@@ -146,7 +146,7 @@ class RunPasses:
         blur = np.zeros((1, 0)) if record.blur is None else np.ascontiguousarray(record.blur)
         e = np.full((n, m), np.nan)
         states = np.zeros((n, nx))
-        count, rows, buffers = (0, 0, Buffers()) if keep is None else (self._readings[i], n, keep)
+        count, rows, buffers = (0, 0, Buffers()) if keep is None else (_readings(record), n, keep)
         K = buffers.array("K", (count, nx), np.float32)
         per_sigma = buffers.array("per_sigma", (count,))
         H = buffers.array("H", (math.ceil(rows / self.refresh[i]), m, nx), np.float32)
@@ -169,6 +169,8 @@ class RunPasses:
             Variances(x0, P0, R, q, decay), p, GATE, self.refresh[i],
             Trace(states, e, gains, path), Covariances(P, slots),
         )  # fmt: skip
+        if record.late is not None:
+            log_likelihood += record.late.nats
         if not np.isfinite(log_likelihood):
             K[:], per_sigma[:], H[:] = 0.0, 0.0, 0.0
         run = RunPass(
@@ -189,11 +191,17 @@ class RunPasses:
         Returns:
             False where the mean diverged.
         """
+        p = rest_of(self.model, run.record, p)
         u = self.model.inputs(run.record, p)
         return frozen_gains.mean_pass(
             self.compiled, RunData(self.intervals[i], u, run.record.z), self.starts[i][0], p,
             gains_of(run), self.refresh[i], out,
         )  # fmt: skip
+
+
+def _readings(record: Record) -> int:
+    """How many readings a record has."""
+    return int((~np.isnan(record.z)).sum())
 
 
 def _rows_between_jacobians(dt: np.ndarray) -> int:

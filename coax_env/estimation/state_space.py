@@ -49,6 +49,23 @@ STEADY = Strength(np.zeros(0, np.int64), np.zeros((0, 0)))
 """Process noise of one level from the first row to the last."""
 
 
+class Late(NamedTuple):
+    """Whose readings are late, and by how many whole rows they are moved back (late_readings.py).
+
+    place: of the delay in the parameter vector. channels: (m,) True where readings are late by it.
+    rows, seconds: how far they are moved. rates: (n, m) [1/s] of the record's readings. nats:
+    log-likelihood of those that have no row to go to. done: whether the record's were moved.
+    """
+
+    place: int
+    channels: np.ndarray
+    rows: int
+    seconds: float
+    rates: np.ndarray = np.zeros((0, 0))
+    nats: float = 0.0
+    done: bool = False
+
+
 @dataclass(frozen=True)
 class Record:
     """One run as the engine sees it.
@@ -61,6 +78,7 @@ class Record:
     (input_innovations.py). battery: (n,) its voltage [V], or None. strength: of its process noise.
     blur: (n, m) variance of each reading beyond its level's (clock_errors.py), or None.
     air: level of the process noise -> times which it is on this run (run_air.py).
+    late: which readings can be moved back, or None.
     """
 
     name: str
@@ -74,6 +92,7 @@ class Record:
     strength: Strength = STEADY
     blur: np.ndarray | None = None
     air: Mapping[str, float] = field(default_factory=dict)
+    late: Late | None = None
 
     @property
     def whole(self) -> str:
@@ -96,6 +115,7 @@ def part(record: Record, rows: np.ndarray) -> Record:
         battery=of(record.battery),
         strength=record.strength.part(rows),
         blur=of(record.blur),
+        late=None if record.late is None else record.late._replace(rates=record.late.rates[rows]),
     )
 
 
@@ -157,7 +177,8 @@ class Model(Protocol):
     adds to the state, to first order at least, and the readings at its start. A run's last row has 0.
     A model may have `side_by_side`: pointers to `step`, `measure` and `drift_and_readings` of
     SIMD_WIDTH states, inputs and parameter vectors at once, a column each, (.., SIMD_WIDTH);
-    `input_places`: the places in the parameter vector of all that `inputs` follows; and `of_noise`:
+    `input_places`: the places in the parameter vector of all that `inputs` follows; `in_blocks`: the
+    places of a parameter in a vector that has it more than once; and `of_noise`:
     (nx,) True of states that are nothing, and move nothing, but for the noise that shakes them.
     """
 

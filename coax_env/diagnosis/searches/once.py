@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from scipy.optimize import minimize_scalar
 
+from coax_env.diagnosis import late_readings
 from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.problem import Fit, Problem
@@ -20,6 +21,8 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import are_white, whiteness
 
+MOST_MOVES = 3
+"""Times that late readings are moved, each by the delay found with the rows before; ours."""
 READ_WITHIN = 0.02
 """Of a row, to which the delay of the commands that readings see is looked for; ours."""
 
@@ -90,7 +93,24 @@ def searched_from(
         problem = late  # without a delay it is as it was: `refitted` stays
         problem.report("searching again with readings that see late commands at their own delay")
         fit, quadratic = search(problem, refitted)
+    problem, fit, quadratic = _with_readings_moved_back(problem, fit, quadratic)
     return Searched(problem, bare, refitted, fit, quadratic, coarse)
+
+
+def _with_readings_moved_back(
+    problem: Problem, fit: Fit, quadratic: Quadratic
+) -> tuple[Problem, Fit, Quadratic]:
+    """The search again with late readings where they belong, as long as their delay stays."""
+    for _ in range(MOST_MOVES):
+        moved = late_readings.moved_back(problem, fit)
+        if moved is None:
+            break
+        problem.report("searching again with late readings where they belong")
+        other, other_quadratic = search(*moved)
+        if late_readings.delay_in(other.active) is None:
+            break
+        problem, fit, quadratic = moved[0], other, other_quadratic
+    return problem, fit, quadratic
 
 
 def likelier(best: Searched, found: Fit) -> Searched:

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from coax_env.diagnosis.clock_errors import with_clock_errors
+from coax_env.diagnosis.late_readings import moved_as_in
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.rotor_jitter import with_share_anew
@@ -95,7 +96,7 @@ def behind_other_low_passes(problem: Problem, found: Searched, noise: Noise) -> 
     ]
     if not behind:
         return found
-    logged = problem.engine.records
+    logged = moved_as_in(found.problem, problem.engine.records)
     passes = low_passes(found.problem.with_records(logged), found.fit, noise, behind)
     if _are_nearly(passes, _inertial(found.problem.low_passes)):
         return found
