@@ -27,6 +27,7 @@ from coax_env.design.loop_oscillation import remark as oscillation_remark
 from coax_env.diagnosis import (
     confounding,
     findings,
+    late_commands,
     late_rotor_speeds,
     onboard_filter,
     sensor_low_pass,
@@ -195,6 +196,9 @@ def diagnose(
         unasked = set(candidates) - set(first.problem.candidates)
         of_sensors.append(sensor_low_pass.remark(passes, unasked))
     problem, bare, refitted = first.problem, first.bare, first.refitted
+    if problem.commands_late > 0.0:
+        of_sensors.append(late_commands.remark(problem.commands_late))
+        held = late_commands.acting_sooner(held, problem.commands_late)
     held = records_before(held, CHANNELS, passes)
     held = with_clock_error(held, problem.clock_error)
     held = slow_commands.on_the_way(held, first.of_next)

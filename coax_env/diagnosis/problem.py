@@ -115,6 +115,7 @@ class Problem:
         errors_left: what errors of readings that last are worth beside what was found, where they
             explain too little to be in the model [nats] (sensor_errors.py).
         clock_error: std of the rows' times [s], 0 where they are right (clock_errors.py).
+        commands_late: s by which commands were taken to act sooner than is written (late_commands.py).
     """
 
     model: HeliModel
@@ -129,6 +130,7 @@ class Problem:
     of_onboard_filter: bool = False
     errors_left: float = 0.0
     clock_error: float = 0.0
+    commands_late: float = 0.0
 
     @classmethod
     def of(

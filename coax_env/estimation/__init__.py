@@ -30,6 +30,7 @@ helicopter.py        the compiled kernel as such a model, its parameters with pr
 helicopter_noise.py  its noise levels, with units, bounds and where they start
 rotor_jitter.py      rotor speeds that jitter, with a memory
 swinging_gusts.py    gusts with a frequency
+late_readings.py     late readings at the rows to which they belong
 low_pass.py          readings as they were before a sensor's low-pass
 run_air.py           gusts of another strength and memory from run to run
 gust_strength.py     gusts in single shocks: a strength for each block of time

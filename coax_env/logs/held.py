@@ -162,7 +162,7 @@ def interpolated(t: np.ndarray, values: np.ndarray, angle: bool = False) -> np.n
     if present.size < 3 * FEWEST:
         return found
     y = values[present]
-    grid = _grid(y)
+    grid = grid_of(y)
     rounding = max(_rounding(y), grid, 1e-9 * float(np.abs(y).max()))
     y = np.unwrap(y) if angle else y
     inside = _on_lines_or_cubics(t[present], present, y, rounding)
@@ -241,7 +241,7 @@ def _on_coarse_lines(rows: np.ndarray, y: np.ndarray, grid: float) -> np.ndarray
     return np.zeros(y.size, bool)
 
 
-def _grid(y: np.ndarray) -> float:
+def grid_of(y: np.ndarray) -> float:
     """Step between the numbers of a coarse sensor, rounded or not; 0 where there is none."""
     levels = np.unique(y)
     whole = float(np.ptp(levels))

@@ -11,6 +11,7 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.logs.clipped import clipped
+from coax_env.logs.coarse import at_changes
 from coax_env.logs.columns import advice, time_advice
 from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
 from coax_env.logs.held import interpolated, repeats
@@ -230,6 +231,12 @@ def _without_repeats(
             if between.any():
                 counts[f"interpolated samples of {channel}, no readings"] += int(between.sum())
                 found[channel] = np.where(between, np.nan, values)
+            changes = at_changes(found[channel], data.get(f"{channel}_cmd"))
+            if changes is not None:
+                counts[f"readings of {channel} in coarse steps, of use as they change"] += int(
+                    np.isfinite(changes).sum()
+                )
+                found[channel] = changes
     return found
 
 

@@ -3,6 +3,7 @@
 A search may leave innovations coloured, or name what another noise explains. So it is asked in this
 order what the log has, and where it has that, the search is done again with it:
 
+- commands that are written later than they act (late_commands.py)
 - what moves the rotors, alone; rotor speeds that come late, or jitter (rotors.py): nothing else touches
   these readings
 - air of each run's own (unrest.py): noise of one level makes many names
@@ -18,6 +19,7 @@ Where they stay so in the end, the gusts as they are then are asked there, too: 
 
 from collections.abc import Mapping
 
+from coax_env.diagnosis import late_commands
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.rotor_jitter import share_of
 from coax_env.diagnosis.searches.once import Searched, is_coloured, searched_once
@@ -49,6 +51,11 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     """
     given = noise
     first, noise = rotors_first(problem, noise) or (searched_once(problem, noise), noise)
+    late_by = late_commands.written_late(first.problem, first.refitted)
+    if late_by > 0.0:
+        problem = late_commands.with_commands_sooner(problem, late_by)
+        problem.report("searching again with commands when they act")
+        first, noise = rotors_first(problem, given) or (searched_once(problem, given), given)
     late = with_late_speeds(problem, first.problem, first.fit, given)
     if late is None and (is_coloured(first, ROTOR_SPEEDS) or is_lag_unshown(first)):
         first, noise = jittery(first, noise)

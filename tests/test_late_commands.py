@@ -1,0 +1,114 @@
+"""Commands that a log has later than they act: when that is seen, and what is done."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import injector
+import numpy as np
+import pytest
+from injector_craft import COAX
+from numpy.testing import assert_allclose
+
+from coax_env import diagnose
+from coax_env.diagnosis.late_commands import acting_sooner, remark, written_late
+from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation.state_space import Noise, Record
+from coax_env.logs.flight import read_flight
+
+ROW = 0.01
+FIT = Fit((), {}, Noise({}))
+
+
+def stairs(seconds: float = 0.0) -> Record:
+    """Commands held from each row to the next, written so much later than they act."""
+    t = ROW * np.arange(40)
+    acting = np.sin(3.0 * np.floor((t - seconds) / ROW + 1e-9))
+    return Record("a", t, np.column_stack([acting, 2.0 * acting]), np.zeros((t.size, 1)))
+
+
+@pytest.mark.parametrize("rows", [0, 1, 3])
+def test_commands_so_many_rows_sooner_are_those_that_were_written_later(rows):
+    """The last ones, which nobody has seen, are the last that was written."""
+    late = stairs(rows * ROW)
+    (found,) = acting_sooner([late], rows * ROW)
+    stop = late.t.size - rows
+    assert_allclose(found.command[:stop], stairs().command[:stop], atol=1e-9)
+    assert_allclose(found.command[stop:], late.command[-1:].repeat(rows, 0), atol=1e-9)
+    assert found.z is late.z and found.t is late.t
+
+
+def test_between_rows_a_command_is_its_mean_over_the_row():
+    (found,) = acting_sooner([stairs()], 0.4 * ROW)
+    command = stairs().command
+    assert_allclose(found.command[:-1], 0.6 * command[:-1] + 0.4 * command[1:], atol=1e-9)
+
+
+def problem_of(likelihood: Any, row: float = ROW) -> Any:
+    """A stand-in whose readings are so likely with commands so much sooner [s]."""
+
+    def with_records(records: Any) -> Any:
+        sooner = float(
+            np.interp(records[0].command[0, 0], np.arange(100.0), row * np.arange(100.0))
+        )
+        return SimpleNamespace(
+            engine=SimpleNamespace(log_likelihood=lambda values, noise: likelihood(sooner))
+        )
+
+    t = row * np.arange(100)
+    ramp = Record("a", t, np.arange(100.0)[:, None], np.zeros((100, 1)))
+    return SimpleNamespace(
+        row=row, settings=SETTINGS, report=lambda text: None, with_records=with_records,
+        engine=SimpleNamespace(records=[ramp]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("true", "nats", "row", "found"),
+    [
+        (0.03, 500.0, 0.01, 0.03),
+        (0.06, 500.0, 0.01, 0.06),
+        (0.11, 500.0, 0.01, 0.11),
+        (0.035, 5e4, 0.01, 0.035),  # between rows
+        (0.03, 40.0, 0.01, 0.0),  # worth too little
+        (-0.03, 500.0, 0.01, 0.0),  # they act late, as delays and lags have it
+        (0.04, 500.0, 0.04, 0.04),
+        (0.9, 500.0, 0.6, 0.0),  # no log has rows that far apart
+    ],
+)
+def test_commands_act_as_much_sooner_as_is_likeliest(true, nats, row, found):
+    """The likelihood is a parabola about the truth."""
+
+    def likelihood(seconds: float) -> float:
+        return nats * (1.0 - ((seconds - true) / true) ** 2)
+
+    assert written_late(problem_of(likelihood, row), FIT) == pytest.approx(found, abs=0.1 * row)
+
+
+def written_later(folder: Any, rows: int) -> Any:
+    """A flight whose commands are written so many rows later."""
+    for path in folder.glob("*.csv"):
+        head, *body = path.read_text().splitlines()
+        names, cells = head.split(","), [line.split(",") for line in body]
+        for name in ("rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat"):
+            place = names.index(name)
+            column = [row[place] for row in cells]
+            for row, value in zip(cells, [*column[:1] * rows, *column[:-rows]], strict=True):
+                row[place] = value
+        path.write_text("\n".join([head, *(",".join(row) for row in cells)]) + "\n")
+    return read_flight(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sensors", "craft"), [("onboard", None), ("pose", COAX)])
+def test_a_clean_flight_whose_commands_are_written_late_has_no_cause(tmp_path, sensors, craft):
+    """By all sensors it had three, of 598 nats at most. What was done is said."""
+    more = {} if craft is None else {"craft": craft, "sensors": sensors}
+    runs = ("lon_3211", "yaw_3211", "heave_3211")
+    injector.fly(tmp_path / "flight", {}, gusts=True, seed=11, runs=runs, **more)
+    result = diagnose(written_later(tmp_path / "flight", 6), hold_out=[])
+    assert result.findings["causes"] == []
+    late = 6 * (0.01 if craft is None else 1.0 / 150.0)
+    said = [text for text in result.remarks if "later than they act" in text]
+    assert len(said) == 1 and float(said[0].split()[3]) == pytest.approx(late, abs=0.008)
+    assert remark(0.03).startswith("commands are written 0.03 s later")
