@@ -48,6 +48,12 @@ def _steady_rotors(monkeypatch):
     stand_in(monkeypatch, "with_late_speeds", lambda *asked, coloured=False: None)
 
 
+@pytest.fixture(autouse=True)
+def _commands_on_time(monkeypatch):
+    """Written when they act, but where a test says otherwise."""
+    stand_in(monkeypatch, "written_late", lambda problem, fit: 0.0)
+
+
 def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
     """Twice as fine and more; those that are coarser already are left alone."""
     reading = {"phi": 0.0029, "theta": 0.0031, "h": 0.0024, "q": 0.5}
@@ -896,6 +902,37 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     found = searched.searched("as given", levels, {})  # type: ignore[arg-type]
     assert found.problem.name == taken  # type: ignore[attr-defined]
     assert asked == (["again", (True, True)] if erring else [(False, False)])
+
+
+def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
+    """From the levels that were given, and from there on that problem is the one as given."""
+    levels, asked = Noise({}, {"phi": 0.1}), []
+
+    def once_more(problem: Any, noise: Noise) -> Searched:
+        asked.append((problem.name, noise))
+        fit = Fit((), {}, noise)
+        return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
+
+    def of(name: str) -> Any:
+        return SimpleNamespace(name=name, report=lambda text: None, smoothed=False)
+
+    stand_in(monkeypatch, "rotors_first", lambda problem, noise: None)
+    stand_in(monkeypatch, "searched_once", once_more)
+    stand_in(
+        monkeypatch, "written_late", lambda problem, fit: 0.03 if problem.name == "logged" else 0.0
+    )
+    stand_in(
+        monkeypatch, "with_commands_sooner", lambda problem, seconds: of(f"{seconds:g} sooner")
+    )
+    stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
+    stand_in(monkeypatch, "is_lag_unshown", lambda found: False)
+    stand_in(monkeypatch, "with_true_times", lambda first, noise: first)
+    stand_in(monkeypatch, "before_low_passes", lambda first, noise: None)
+    stand_in(monkeypatch, "with_errors", lambda found, noise, clock: (found, noise))
+    stand_in(monkeypatch, "in_unrest", lambda best, noise, clock, erring: best)
+    found = searched.searched(of("logged"), levels, {})
+    assert found.problem.name == "0.03 sooner"  # type: ignore[attr-defined]
+    assert asked == [("logged", levels), ("0.03 sooner", levels)]
 
 
 HAD = {"p": LowPass(0.01)}

@@ -19,7 +19,7 @@ Where they stay so in the end, the gusts as they are then are asked there, too: 
 
 from collections.abc import Mapping
 
-from coax_env.diagnosis import late_commands
+from coax_env.diagnosis.late_commands import with_commands_sooner, written_late
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.rotor_jitter import share_of
 from coax_env.diagnosis.searches.once import Searched, is_coloured, searched_once
@@ -51,9 +51,9 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     """
     given = noise
     first, noise = rotors_first(problem, noise) or (searched_once(problem, noise), noise)
-    late_by = late_commands.written_late(first.problem, first.refitted)
+    late_by = written_late(first.problem, first.refitted)
     if late_by > 0.0:
-        problem = late_commands.with_commands_sooner(problem, late_by)
+        problem = with_commands_sooner(problem, late_by)
         problem.report("searching again with commands when they act")
         first, noise = rotors_first(problem, given) or (searched_once(problem, given), given)
     late = with_late_speeds(problem, first.problem, first.fit, given)
