@@ -1,23 +1,29 @@
 """Commands between slow rows: held, or on straight lines, and what that makes of the numbers."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from coax_env import load_vehicle
 from coax_env.diagnosis import slow_commands as module
-from coax_env.diagnosis.problem import Fit
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.remarks import _seen_late
 from coax_env.diagnosis.searches.once import Searched
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.diagnosis.slow_commands import (
     ON_LINES,
     SHARES,
     beside_straight_lines,
+    between_known,
     likelier_on_the_way,
     on_the_way,
 )
+from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.state_space import Noise, Record
+from coax_env.model.layout import CHANNELS
 
 LAG = "motor_lag"
 
@@ -123,3 +129,25 @@ def test_where_commands_are_held_the_other_fit_is_in_the_std(monkeypatch):
     for problem, same in ((problem_of(slow=False), fit), (problem_of(), fit_of())):
         assert beside_straight_lines(problem, same, quadratic, {}) is same
     assert len(asked) == 1
+
+
+@pytest.mark.parametrize("every", [1, 2, 5, 10])
+def test_commands_on_straight_lines_are_known_where_they_bend(every):
+    """Of a log whose commands came at another rate; all are, where each row has its own."""
+    rng = np.random.default_rng(0)
+    t = 0.01 * np.arange(1201)
+    knots = rng.standard_normal((t[::every].size, 4))
+    command = np.column_stack([np.interp(t, t[::every], column) for column in knots.T])
+    found = between_known([Record("a", t, np.round(command, 6), np.zeros((t.size, 1)))] * 2)
+    assert found == pytest.approx(0.01 * every if every > 1 else 0.0, rel=0.02)
+
+
+@pytest.mark.parametrize(("between", "rows", "unseen"), [(0.05, 0.01, True), (0.02, 0.01, False)])
+def test_what_commands_did_between_seldom_ones_is_unseen(between, rows, unseen):
+    model = HeliModel(load_vehicle("lama400d"))
+    z = np.zeros((50, len(CHANNELS)))
+    made = Problem.of(model, [Record("a", rows * np.arange(50), np.ones((50, 4)), z)])
+    made = replace(made, between_commands=between)
+    assert made.answers_unseen == unseen and not made.has_slow_rows
+    said = [text for text in _seen_late(made) if "straight lines" in text]
+    assert len(said) == unseen and all("50 ms" in text for text in said)

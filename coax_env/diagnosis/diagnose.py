@@ -185,7 +185,11 @@ def diagnose(
     used, held = split(model, records, noise, hold_out, candidates, settings)
 
     problem = Problem.of(model, used, candidates, settings, report)
-    problem = replace(problem, of_onboard_filter=circular)
+    problem = replace(
+        problem,
+        of_onboard_filter=circular,
+        between_commands=slow_commands.between_known(problem.engine.records),
+    )
     clock = clock_of(flight.runs)
     first = slow_commands.likelier_on_the_way(searched(problem, noise, clock))
     if first.problem.aboard.isdisjoint(ROTOR_SPEEDS) and not problem.aboard.isdisjoint(ROTOR_SPEEDS):

@@ -115,6 +115,8 @@ class Problem:
         errors_left: what errors of readings that last are worth beside what was found, where they
             explain too little to be in the model [nats] (sensor_errors.py).
         clock_error: std of the rows' times [s], 0 where they are right (clock_errors.py).
+        between_commands: s from one known command to the next, where those between are on straight
+            lines (slow_commands.py); 0: every row's is known.
         commands_late: s by which commands were taken to act sooner than is written (late_commands.py).
     """
 
@@ -130,6 +132,7 @@ class Problem:
     of_onboard_filter: bool = False
     errors_left: float = 0.0
     clock_error: float = 0.0
+    between_commands: float = 0.0
     commands_late: float = 0.0
 
     @classmethod
@@ -278,8 +281,11 @@ class Problem:
     @property
     def answers_unseen(self) -> bool:
         """Whether commands may answer what the filter has not seen by then: readings that are seldom,
-        gusts that are not as it has them, what is left of a sensor's low-pass."""
-        return self.reads_seldom or self.unlike_gusts or self.smoothed
+        commands that are not known between some, gusts that are not as it has them, what is left of a
+        sensor's low-pass.
+        """
+        seldom = max(self.between_readings, self.between_commands) > self.settings.slow_rows
+        return seldom or self.unlike_gusts or self.smoothed
 
     @property
     def unseen_times(self) -> float:

@@ -171,6 +171,9 @@ def held_out_before(
 def _seen_late(problem: Problem) -> list[str]:
     if problem.has_slow_rows:
         why = f"rows {1e3 * problem.row:.0f} ms apart: what the commands did between them is not known"
+    elif problem.between_commands > problem.settings.slow_rows:
+        apart = 1e3 * problem.between_commands
+        why = f"commands on straight lines, {apart:.0f} ms long: what they did there is not known"
     elif problem.reads_seldom:
         apart = 1e3 * problem.between_readings
         why = f"readings {apart:.0f} ms apart: commands may answer what none has shown yet"
