@@ -852,6 +852,18 @@ def test_rolling_rms_and_autocorrelation():
     )
 
 
+def test_no_line_joins_predictions_across_what_was_cut_out():
+    """Of a run from whose middle five seconds are gone, and one without a hole."""
+    t = np.r_[np.arange(0.0, 5.0, 0.25), np.arange(10.0, 14.0, 0.25)]
+    at, line, error = figures._broken(t, 2.0 * t, 0.0 * t)
+    assert np.flatnonzero(np.isnan(line)).tolist() == np.flatnonzero(np.isnan(error)).tolist() == [20]
+    np.testing.assert_array_equal(np.delete(at, 20), t)
+    np.testing.assert_array_equal(np.delete(line, 20), 2.0 * t)
+    whole = figures._broken(t[:20], t[:20])
+    np.testing.assert_array_equal(whole, [t[:20], t[:20]])
+    assert [values.size for values in figures._broken(t[:1], t[:1])] == [1, 1]
+
+
 def test_figures_are_plotly_figures():
     go = pytest.importorskip("plotly.graph_objects")
     t = np.arange(0.0, 5.0, 0.01)

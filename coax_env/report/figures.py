@@ -158,11 +158,25 @@ def prediction(
         predicted.items(), (BEFORE, AFTER), strict=False
     ):
         kept = thinned(len(times), points)
-        data.append(curve(times[kept], values[kept], name, colour))
-        data.append(curve(times[kept], error[kept], name, colour, 2, showlegend=False))
+        at, line, below = _broken(times[kept], values[kept], error[kept])
+        data.append(curve(at, line, name, colour))
+        data.append(curve(at, below, name, colour, 2, showlegend=False))
     if noise:
         layout["shapes"] = [horizontal_band(-noise, noise, "y2")]
     return figure_of(data, 400, **layout)
+
+
+BREAK = 4.0
+"""Usual times between two predictions from which on no line joins them: something was cut out; ours."""
+
+
+def _broken(t: np.ndarray, *lines: np.ndarray) -> list[np.ndarray]:
+    """Times and lines (n,) with a hole wherever much more time than usual passes between two."""
+    steps = np.diff(t)
+    moving = steps[steps > 0.0]
+    usual = float(np.median(moving)) if moving.size else 0.0
+    behind = 1 + np.flatnonzero(steps > BREAK * usual)
+    return [np.insert(t, behind, t[behind]), *(np.insert(y, behind, np.nan) for y in lines)]
 
 
 def gain_bars(channels: Mapping[str, Mapping[str, Any]]) -> Figure:
