@@ -59,7 +59,7 @@ def problem_of(likelihood: Any, row: float = ROW) -> Any:
     ramp = Record("a", t, np.arange(100.0)[:, None], np.zeros((100, 1)))
     return SimpleNamespace(
         row=row, settings=SETTINGS, report=lambda text: None, with_records=with_records,
-        engine=SimpleNamespace(records=[ramp]),
+        engine=SimpleNamespace(records=[ramp], log_likelihood=lambda values, noise: likelihood(0.0)),
     )  # fmt: skip
 
 
@@ -83,6 +83,17 @@ def test_commands_act_as_much_sooner_as_is_likeliest(true, nats, row, found):
         return nats * (1.0 - ((seconds - true) / true) ** 2)
 
     assert written_late(problem_of(likelihood, row), FIT) == pytest.approx(found, abs=0.1 * row)
+
+
+def test_where_commands_a_row_sooner_are_less_likely_no_more_is_asked():
+    asked: list[float] = []
+
+    def likelihood(seconds: float) -> float:
+        asked.append(seconds)
+        return -1e4 * seconds
+
+    assert written_late(problem_of(likelihood), FIT) == 0.0
+    assert asked == [0.0, pytest.approx(ROW)]
 
 
 def written_later(folder: Any, rows: int) -> Any:

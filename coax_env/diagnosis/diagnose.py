@@ -45,7 +45,7 @@ from coax_env.diagnosis.late_readings import with_late
 from coax_env.diagnosis.model_check import model_check
 from coax_env.diagnosis.onsets.moment import moments_of
 from coax_env.diagnosis.onsets.search import beside_onsets, with_onsets
-from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.problem import WEAK_OR_LATE, Fit, Problem
 from coax_env.diagnosis.remarks import (
     answered_gusts,
     held_out_before,
@@ -184,12 +184,12 @@ def diagnose(
         records, candidates = onboard_filter.read_seldom(records, CHANNELS), asked
     used, held = split(model, records, noise, hold_out, candidates, settings)
 
+    between = slow_commands.between_known(used)
+    if between > settings.unknown_commands:
+        of_sensors.append(slow_commands.of_seldom(between))
+        candidates = tuple(e for e in candidates if e not in WEAK_OR_LATE)
     problem = Problem.of(model, used, candidates, settings, report)
-    problem = replace(
-        problem,
-        of_onboard_filter=circular,
-        between_commands=slow_commands.between_known(problem.engine.records),
-    )
+    problem = replace(problem, of_onboard_filter=circular, between_commands=between)
     clock = clock_of(flight.runs)
     first = slow_commands.likelier_on_the_way(searched(problem, noise, clock))
     if first.problem.aboard.isdisjoint(ROTOR_SPEEDS) and not problem.aboard.isdisjoint(ROTOR_SPEEDS):

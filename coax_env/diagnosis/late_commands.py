@@ -74,8 +74,12 @@ def written_late(problem: Problem, fit: Fit) -> float:
         sooner = problem.with_records(acting_sooner(problem.engine.records, seconds))
         return sooner.engine.log_likelihood(fit.values, fit.noise)
 
-    known = likelihood(0.0)
-    nats = {rows: likelihood(rows * row) - known for rows in FIRST if rows * row <= MOST}
+    known = problem.engine.log_likelihood(fit.values, fit.noise)
+    nats: dict[int, float] = {}
+    for rows in FIRST:
+        if rows * row > MOST or min(nats.values(), default=0.0) < -problem.settings.tie:
+            break
+        nats[rows] = likelihood(rows * row) - known
     rows = max(nats, key=lambda rows: nats[rows], default=0)
     if not nats or not nats[rows] > problem.settings.sure_evidence:
         return 0.0

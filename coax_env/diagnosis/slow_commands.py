@@ -56,6 +56,18 @@ def between_known(records: Sequence[Record]) -> float:
     return float(np.median(found))
 
 
+def of_seldom(between: float) -> str:
+    """That commands are known too seldom for some effects, for who reads the findings.
+
+    Args:
+        between: one known command and the next [s].
+    """
+    return (
+        f"commands are known every {1e3 * between:.0f} ms only, with straight lines between: what looks"
+        " like a weak or late answer to them was not asked for. Log them as they are sent"
+    )
+
+
 def remark(share: float) -> str:
     """What was done between the rows, for who reads the findings.
 
