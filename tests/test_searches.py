@@ -50,8 +50,12 @@ def _steady_rotors(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def _commands_on_time(monkeypatch):
-    """Written when they act, but where a test says otherwise."""
+    """Written when they act, gyros on time, but where a test says otherwise."""
     stand_in(monkeypatch, "written_late", lambda problem, fit: 0.0)
+    stand_in(monkeypatch, "with_imu_on_time", lambda first, smoothed, noise: None)
+
+
+IMU_ON_TIME = readings.with_imu_on_time
 
 
 def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
@@ -933,6 +937,62 @@ def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
     found = searched.searched(of("logged"), levels, {})
     assert found.problem.name == "0.03 sooner"  # type: ignore[attr-defined]
     assert asked == [("logged", levels), ("0.03 sooner", levels)]
+
+
+@pytest.mark.parametrize(
+    ("active", "coloured", "rows", "behind", "after", "taken"),
+    [
+        (("wind",), False, {"gyros": 2}, None, 40.0, True),
+        ((), True, {"gyros": 2}, None, 40.0, True),
+        (
+            (),
+            False,
+            {"gyros": 2},
+            None,
+            0.0,
+            False,
+        ),  # nothing is named, and all is white: not asked
+        (("wind",), True, {}, None, 0.0, False),  # none comes late
+        (("wind",), True, {"gyros": 2}, 20.0, 0.0, False),  # a low-pass explains more
+        (("wind",), True, {"gyros": 2}, 60.0, 40.0, True),
+        (("wind",), True, {"gyros": 2}, None, 70.0, False),  # the search did not end as likely
+    ],
+)
+def test_gyros_that_come_late_are_moved_back_where_that_is_likelier(
+    monkeypatch, active, coloured, rows, behind, after, taken
+):
+    """Cost 100 as logged; moved they are worth 60 nats at that fit, and lose 5 that cannot be moved."""
+    levels = Noise({})
+
+    def of(name: str) -> Any:
+        return SimpleNamespace(
+            name=name, row=0.01, settings=SETTINGS, report=lambda text: None, late_imu={},
+            model=SimpleNamespace(channels=("p",)), engine=SimpleNamespace(records="logged"),
+        )  # fmt: skip
+
+    def one(problem: Any, cost: float) -> Any:
+        fit = Fit(active, {}, levels)
+        return SimpleNamespace(problem=problem, fit=fit, cost=cost)
+
+    imu = readings.late_imu
+    monkeypatch.setattr(imu, "rows_late", lambda problem, fit: (rows, 60.0 if rows else 0.0))
+    monkeypatch.setattr(imu, "on_time", lambda records, rows, row: "moved")
+    monkeypatch.setattr(imu, "worth_left_out", lambda problem, fit, rows: 5.0)
+    monkeypatch.setattr(readings, "replace", lambda problem, late_imu: problem)
+    stand_in(monkeypatch, "is_coloured", lambda found, channels: coloured)
+    stand_in(monkeypatch, "lost", lambda problem, found: found.cost)
+    asked: list[Any] = []
+    stand_in(
+        monkeypatch,
+        "searched_once",
+        lambda problem, noise: asked.append(problem) or one(problem, after),
+    )
+    logged = of("logged")
+    logged.with_records = lambda records: of(records)
+    smoothed = None if behind is None else one(logged, behind)
+    found = IMU_ON_TIME(one(logged, 100.0), smoothed, levels)
+    assert (found is not None) == taken
+    assert [problem.name for problem in asked] == ["moved"] * (taken or after == 70.0)
 
 
 HAD = {"p": LowPass(0.01)}

@@ -28,6 +28,7 @@ from coax_env.diagnosis import (
     confounding,
     findings,
     late_commands,
+    late_imu,
     late_rotor_speeds,
     onboard_filter,
     sensor_low_pass,
@@ -203,6 +204,9 @@ def diagnose(
     if problem.commands_late > 0.0:
         of_sensors.append(late_commands.remark(problem.commands_late))
         held = late_commands.acting_sooner(held, problem.commands_late)
+    if problem.late_imu:
+        of_sensors.append(late_imu.remark(problem.late_imu, problem.row))
+        held = late_imu.on_time(held, problem.late_imu, problem.row)
     held = records_before(held, CHANNELS, passes)
     held = with_clock_error(held, problem.clock_error)
     held = slow_commands.on_the_way(held, first.of_next)

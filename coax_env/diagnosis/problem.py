@@ -117,6 +117,7 @@ class Problem:
         clock_error: std of the rows' times [s], 0 where they are right (clock_errors.py).
         between_commands: s from one known command to the next, where those between are on straight
             lines (slow_commands.py); 0: every row's is known.
+        late_imu: rows by which gyros or accelerometers were moved back (late_imu.py).
         commands_late: s by which commands were taken to act sooner than is written (late_commands.py).
     """
 
@@ -133,6 +134,7 @@ class Problem:
     errors_left: float = 0.0
     clock_error: float = 0.0
     between_commands: float = 0.0
+    late_imu: Mapping[str, int] = field(default_factory=dict)
     commands_late: float = 0.0
 
     @classmethod

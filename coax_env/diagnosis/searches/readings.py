@@ -2,7 +2,8 @@
 
 Where motion stays coloured it is asked whether the times of the log's rows are wrong
 (clock_errors.py), and the search done again with readings that are as good as these. Where gyros or
-accelerometers are read through a low-pass (sensor_low_pass.py) it is done again with what was before
+accelerometers come later than all else (late_imu.py) it is done again with them moved back; where they
+are read through a low-pass (sensor_low_pass.py) it is done again with what was before
 it; where errors of readings last (sensor_errors.py), with these in it. Low-passes are then fitted once
 more, and what motors make of jitter is asked anew for readings as they are then.
 """
@@ -10,12 +11,13 @@ more, and what motors make of jitter is asked anew for readings as they are then
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from coax_env.diagnosis import late_imu
 from coax_env.diagnosis.clock_errors import with_clock_errors
 from coax_env.diagnosis.late_readings import moved_as_in
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.rotor_jitter import with_share_anew
-from coax_env.diagnosis.searches.once import Searched, likelier, searched_once
+from coax_env.diagnosis.searches.once import Searched, is_coloured, likelier, searched_once
 from coax_env.diagnosis.sensor_errors import lasting_errors
 from coax_env.diagnosis.sensor_low_pass import GROUPS, LIKE, hidden_behind, low_passes
 from coax_env.estimation.changing_model import Lap
@@ -23,6 +25,7 @@ from coax_env.estimation.low_pass import LowPass, before_low_pass
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.estimation.whiteness import is_white
 from coax_env.model.layout import INERTIAL
+from coax_env.plain_words import and_list
 
 NEAR = 0.3
 """Share of what errors that last are worth that one change in flight must be by its score, to be asked
@@ -57,6 +60,29 @@ def before_low_passes(first: Searched, noise: Noise) -> Searched | None:
         return None
     problem.report("searching again with readings as they were before a low-pass")
     return _searched_before(first, problem.engine.records, smoothed, noise)
+
+
+def with_imu_on_time(first: Searched, smoothed: Searched | None, noise: Noise) -> Searched | None:
+    """The search with gyros or accelerometers moved back, where they come later than all else.
+
+    Args:
+        first: the search in readings as logged. noise: levels to start from.
+        smoothed: behind low-passes, which make readings late, too.
+    """
+    problem, fit = first.problem, first.fit
+    if not fit.active and not is_coloured(first, problem.model.channels):
+        return None
+    rows, nats = late_imu.rows_late(problem, fit)
+    behind = first.cost - lost(problem, smoothed) if smoothed is not None else 0.0
+    if not nats > behind:
+        return None
+    problem.report(f"{and_list(list(rows))} come late: {nats:.1f} nats")
+    records = late_imu.on_time(problem.engine.records, rows, problem.row)
+    moved = replace(problem.with_records(records), late_imu=rows)
+    problem.report("searching again with readings moved back to when they were")
+    other = searched_once(moved, noise)
+    gained = first.cost - other.cost + late_imu.worth_left_out(problem, fit, rows)
+    return other if gained > problem.settings.sure_evidence else None
 
 
 def with_errors(found: Searched, noise: Noise, clock: Mapping[str, Lap]) -> tuple[Searched, Noise]:

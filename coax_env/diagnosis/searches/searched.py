@@ -7,8 +7,8 @@ order what the log has, and where it has that, the search is done again with it:
 - what moves the rotors, alone; rotor speeds that come late, or jitter (rotors.py): nothing else touches
   these readings
 - air of each run's own (unrest.py): noise of one level makes many names
-- wrong times of rows, where motion stays coloured; low-passes of gyros and accelerometers, since
-  errors that last would take a part of them up; errors that last (readings.py)
+- wrong times of rows, where motion stays coloured; gyros and accelerometers that come late, or through
+  low-passes, since errors that last would take a part of them up; errors that last (readings.py)
 - shocks, swings, jitter that no rotor speed shows, joint gusts; last, readings believed less
   (unrest.py)
 
@@ -28,6 +28,7 @@ from coax_env.diagnosis.searches.readings import (
     behind_other_low_passes,
     lost,
     with_errors,
+    with_imu_on_time,
     with_true_times,
 )
 from coax_env.diagnosis.searches.rotors import (
@@ -64,8 +65,11 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     if late is not None:
         first, noise = late, given
     first = with_true_times(in_own_air(first, noise), noise)
-    problem = first.problem
     smoothed = before_low_passes(first, noise)
+    moved = with_imu_on_time(first, smoothed, noise)
+    if moved is not None:
+        first, smoothed = moved, before_low_passes(moved, noise)
+    problem = first.problem
     of_smoothed = share_of(smoothed.fit, noise) if smoothed is not None else noise
     best, begun = with_errors(smoothed or first, of_smoothed, clock)
     erring = begun is not of_smoothed
