@@ -27,11 +27,8 @@ from coax_env.design.loop_oscillation import remark as oscillation_remark
 from coax_env.diagnosis import (
     confounding,
     findings,
-    late_commands,
-    late_imu,
-    late_rotor_speeds,
+    log_faults,
     onboard_filter,
-    sensor_low_pass,
     slow_commands,
     unlisted,
     vibration,
@@ -61,12 +58,10 @@ from coax_env.diagnosis.shocks import engine_of
 from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
 from coax_env.estimation.changing_model import clock_of
-from coax_env.estimation.clock_errors import with_clock_error
 from coax_env.estimation.fitted_vehicle import double_counting
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import sensor_std, starting_noise
-from coax_env.estimation.low_pass import records_before
 from coax_env.estimation.prediction import RunReplay, gusts_of, replay_runs
 from coax_env.estimation.state_space import Record
 from coax_env.estimation.whiteness import Whiteness, whiteness
@@ -193,23 +188,9 @@ def diagnose(
     problem = replace(problem, of_onboard_filter=circular, between_commands=between)
     clock = clock_of(flight.runs)
     first = slow_commands.likelier_on_the_way(searched(problem, noise, clock))
-    if first.problem.aboard.isdisjoint(ROTOR_SPEEDS) and not problem.aboard.isdisjoint(ROTOR_SPEEDS):
-        of_sensors.append(late_rotor_speeds.REMARK)
-        held = late_rotor_speeds.without_rotor_speeds(held, CHANNELS)
-    passes = first.problem.low_passes
-    if passes:
-        unasked = set(candidates) - set(first.problem.candidates)
-        of_sensors.append(sensor_low_pass.remark(passes, unasked))
+    of_sensors += log_faults.remarks(problem, first)
+    held = log_faults.undone(held, problem, first)
     problem, bare, refitted = first.problem, first.bare, first.refitted
-    if problem.commands_late > 0.0:
-        of_sensors.append(late_commands.remark(problem.commands_late))
-        held = late_commands.acting_sooner(held, problem.commands_late)
-    if problem.late_imu:
-        of_sensors.append(late_imu.remark(problem.late_imu, problem.row))
-        held = late_imu.on_time(held, problem.late_imu, problem.row)
-    held = records_before(held, CHANNELS, passes)
-    held = with_clock_error(held, problem.clock_error)
-    held = slow_commands.on_the_way(held, first.of_next)
     passes_before = problem.engine.filter(bare.values, bare.noise)
     state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
@@ -284,7 +265,6 @@ def diagnose(
             *([vibration_removed(lines)] if lines else []),
             *of_sensors,
             *([oscillation_remark(swinging)] if swinging else []),
-            *([slow_commands.remark(first.of_next)] if first.of_next else []),
             *remarks(problem, fit, quadratic, {e: found[e] for e in found if trust[e].named}),
             *([TOO_SHORT] if held and gain is None else []),
             *lost_in_noise(gain),
