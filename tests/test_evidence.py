@@ -540,6 +540,7 @@ def test_gyros_and_accelerometers_feel_gusts_in_time_but_between_slow_rows(aboar
     [
         ("motor_lag", {}, 2.0, 2.0),
         ("motor_lag", {"reads_seldom"}, 2.0, 6.0),
+        ("motor_lag", {"knows_commands_seldom"}, 2.0, 6.0),
         ("motor_lag", {"unlike_gusts"}, 2.0, 6.0),
         ("motor_lag", {"smoothed", "sees_poses_alone"}, 2.0, 6.0),
         ("motor_lag", {"sees_poses_alone"}, 1.0, 3.0),
@@ -553,7 +554,9 @@ def test_gyros_and_accelerometers_feel_gusts_in_time_but_between_slow_rows(aboar
 def test_what_looks_like_a_late_answer_must_be_worth_more_where_gusts_are_seen_late(
     monkeypatch, effect, unseen, colour, factor
 ):
-    conditions = ("reads_seldom", "unlike_gusts", "smoothed", "sees_poses_alone")
+    conditions = (
+        "reads_seldom", "knows_commands_seldom", "unlike_gusts", "smoothed", "sees_poses_alone",
+    )  # fmt: skip
     problem = SimpleNamespace(settings=SETTINGS, **{name: name in unseen for name in conditions})
     for of_all in ("answers_unseen", "unseen_times"):
         setattr(problem, of_all, getattr(Problem, of_all).fget(problem))

@@ -276,6 +276,11 @@ class Problem:
         return self.between_readings > self.settings.slow_rows
 
     @property
+    def knows_commands_seldom(self) -> bool:
+        """Whether commands may have answered something between those that are known."""
+        return self.between_commands > self.settings.slow_rows
+
+    @property
     def smoothed(self) -> bool:
         """Whether readings of gyros or accelerometers were taken back through a low-pass."""
         return not self.low_passes.keys().isdisjoint(INERTIAL)
@@ -286,7 +291,7 @@ class Problem:
         commands that are not known between some, gusts that are not as it has them, what is left of a
         sensor's low-pass.
         """
-        seldom = max(self.between_readings, self.between_commands) > self.settings.slow_rows
+        seldom = self.reads_seldom or self.knows_commands_seldom
         return seldom or self.unlike_gusts or self.smoothed
 
     @property

@@ -171,7 +171,7 @@ def held_out_before(
 def _seen_late(problem: Problem) -> list[str]:
     if problem.has_slow_rows:
         why = f"rows {1e3 * problem.row:.0f} ms apart: what the commands did between them is not known"
-    elif problem.between_commands > problem.settings.slow_rows:
+    elif problem.knows_commands_seldom:
         apart = 1e3 * problem.between_commands
         why = f"commands on straight lines, {apart:.0f} ms long: what they did there is not known"
     elif problem.reads_seldom:
