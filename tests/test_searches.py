@@ -953,6 +953,7 @@ def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
             False,
         ),  # nothing is named, and all is white: not asked
         (("wind",), True, {}, None, 0.0, False),  # none comes late
+        (("wind",), True, {}, 120.0, 0.0, False),  # though low-passes made things worse
         (("wind",), True, {"gyros": 2}, 20.0, 0.0, False),  # a low-pass explains more
         (("wind",), True, {"gyros": 2}, 60.0, 40.0, True),
         (("wind",), True, {"gyros": 2}, None, 70.0, False),  # the search did not end as likely

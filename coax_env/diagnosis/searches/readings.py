@@ -74,7 +74,7 @@ def with_imu_on_time(first: Searched, smoothed: Searched | None, noise: Noise) -
         return None
     rows, nats = late_imu.rows_late(problem, fit)
     behind = first.cost - lost(problem, smoothed) if smoothed is not None else 0.0
-    if not nats > behind:
+    if not rows or not nats > behind:
         return None
     problem.report(f"{and_list(list(rows))} come late: {nats:.1f} nats")
     records = late_imu.on_time(problem.engine.records, rows, problem.row)
