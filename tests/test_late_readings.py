@@ -172,6 +172,8 @@ def fits(monkeypatch):
         (0.0561, 90.0, None, 6),
         (0.0561, 96.0, None, None),  # a tie is 6
         (0.004, 0.0, None, None),  # less than half a row
+        (0.0561, math.nan, None, None),  # a filter diverges
+        (0.0561, math.nan, LATE._replace(rows=5, seconds=0.05), None),
         (0.0561, 0.0, LATE, None),  # they are
         (0.0561, 99.0, LATE._replace(rows=5, seconds=0.05), 6),
     ],

@@ -6,6 +6,7 @@ coloured, and the delay doubtful; moved back, all was explained in a third of th
 So the search is done again from the delay alone.
 """
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
@@ -66,8 +67,8 @@ def moved_back(problem: Problem, fit: Fit) -> tuple[Problem, Fit] | None:
     trial = fitted(moving, noise_fitted(moving, fitted(moving, fit)))
     gained = fit.objective - trial.objective
     problem.report(f"late readings moved back by {rows} rows: {gained:.1f} nats")
-    if problem.late is None and gained < problem.settings.tie:
-        return None
+    if not math.isfinite(gained) or (problem.late is None and gained < problem.settings.tie):
+        return None  # no likelier, or a filter that diverges
     return moving, fitted(moving, noise_fitted(moving, only(moving, trial, {delay})))
 
 
