@@ -147,10 +147,12 @@ def problem_of(logged: float, moved: float, late: Late | None = None) -> Any:
             own={"attitude_delay": (TIME,)}, report=lambda text: None, with_records=with_records,
             cost=logged if records[0].late is None else moved,
         )  # fmt: skip
-        made.as_logged = SimpleNamespace(
-            engine=SimpleNamespace(records=[replace(r, late=None) for r in records])
-        )
         of_run = SimpleNamespace(log_likelihood=float(np.isfinite(records[0].z).sum()))
+        made.as_logged = SimpleNamespace(
+            engine=SimpleNamespace(
+                records=[replace(r, late=None) for r in records], filter=lambda *at: [of_run]
+            )
+        )
         made.engine = SimpleNamespace(records=records, filter=lambda values, noise: [of_run])
         return made
 

@@ -944,14 +944,7 @@ def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
     [
         (("wind",), False, {"gyros": 2}, None, 40.0, True),
         ((), True, {"gyros": 2}, None, 40.0, True),
-        (
-            (),
-            False,
-            {"gyros": 2},
-            None,
-            0.0,
-            False,
-        ),  # nothing is named, and all is white: not asked
+        ((), False, {"gyros": 2}, None, 0.0, False),  # nothing named or coloured: not asked
         (("wind",), True, {}, None, 0.0, False),  # none comes late
         (("wind",), True, {}, 120.0, 0.0, False),  # though low-passes made things worse
         (("wind",), True, {"gyros": 2}, 20.0, 0.0, False),  # a low-pass explains more

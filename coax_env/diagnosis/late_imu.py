@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation.clock_errors import rates
 from coax_env.estimation.late_readings import left_out, moved_back
 from coax_env.estimation.state_space import Late, Record
 from coax_env.model.layout import ACCELEROMETERS, CHANNELS, GYROS
@@ -82,24 +81,27 @@ def worth_left_out(problem: Problem, fit: Fit, rows: Rows) -> float:
     Args:
         problem, fit: as logged. rows: by which they are moved.
     """
-    records = list(problem.engine.records)
-    for group, count in rows.items():
-        records = [
-            replace(left_out(_late(r, group, count, problem.row)), late=r.late) for r in records
-        ]
-    likelihood = problem.with_records(records).engine.log_likelihood(fit.values, fit.noise)
-    return problem.engine.log_likelihood(fit.values, fit.noise) - likelihood
+    return problem.engine.log_likelihood(fit.values, fit.noise) - _unmoved(problem, fit, rows)
 
 
 def _gained(problem: Problem, fit: Fit, group: str, rows: int) -> float:
     """nats by which a group's readings are likelier moved back by so many rows, at a fit."""
     records, row = problem.engine.records, problem.row
     moved = problem.with_records(on_time(records, {group: rows}, row)).engine
-    likelihood = problem.engine.log_likelihood(fit.values, fit.noise)
-    unmoved = likelihood - worth_left_out(problem, fit, {group: rows})
-    return moved.log_likelihood(fit.values, fit.noise) - unmoved
+    return moved.log_likelihood(fit.values, fit.noise) - _unmoved(problem, fit, {group: rows})
+
+
+def _unmoved(problem: Problem, fit: Fit, rows: Rows) -> float:
+    """Log-likelihood of the readings that can be moved back by so many rows, as logged [nats]."""
+    records = list(problem.engine.records)
+    for group, count in rows.items():
+        records = [
+            replace(left_out(_late(r, group, count, problem.row)), late=r.late) for r in records
+        ]
+    return problem.with_records(records).engine.log_likelihood(fit.values, fit.noise)
 
 
 def _late(record: Record, group: str, rows: int, row: float) -> Record:
+    """The record with a group late by whole rows, by no parameter; of no motion, thus without rates."""
     channels = np.isin(CHANNELS, GROUPS[group])
-    return replace(record, late=Late(0, channels, rows, rows * row, rates(record)))
+    return replace(record, late=Late(0, channels, rows, rows * row, np.zeros(record.z.shape)))

@@ -83,12 +83,10 @@ def _moving_back(problem: Problem, fit: Fit, late: Late) -> Problem:
     Args:
         problem, fit: with the delay. late: what is moved.
     """
-    logged = problem.as_logged.engine.records
-    records = [with_late(r, late) for r in logged]
-    of_all, of_moved = (
-        problem.with_records(some).engine.filter(fit.values, fit.noise)
-        for some in (logged, [replace(left_out(r), late=None) for r in records])
-    )
+    as_logged = problem.as_logged
+    logged = as_logged.engine.records
+    left = problem.with_records([replace(left_out(with_late(r, late)), late=None) for r in logged])
+    of_all, of_moved = (p.engine.filter(fit.values, fit.noise) for p in (as_logged, left))
     return problem.with_records(
         [
             with_late(r, late._replace(nats=a.log_likelihood - b.log_likelihood))

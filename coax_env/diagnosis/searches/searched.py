@@ -51,12 +51,12 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         clock: of all runs in the order in which they were flown.
     """
     given = noise
-    first, noise = rotors_first(problem, noise) or (searched_once(problem, noise), noise)
+    first, noise = _first(problem, given)
     late_by = written_late(first.problem, first.refitted)
     if late_by > 0.0:
         problem = with_commands_sooner(problem, late_by)
         problem.report("searching again with commands when they act")
-        first, noise = rotors_first(problem, given) or (searched_once(problem, given), given)
+        first, noise = _first(problem, given)
     late = with_late_speeds(problem, first.problem, first.fit, given)
     if late is None and (is_coloured(first, ROTOR_SPEEDS) or is_lag_unshown(first)):
         first, noise = jittery(first, noise)
@@ -87,6 +87,11 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     if found.problem.smoothed and not erring and is_coloured(found, INERTIAL):
         return _without_low_passes(first, found, noise, clock)
     return found
+
+
+def _first(problem: Problem, noise: Noise) -> tuple[Searched, Noise]:
+    """The first search, and the levels that it started from."""
+    return rotors_first(problem, noise) or (searched_once(problem, noise), noise)
 
 
 def _without_low_passes(
