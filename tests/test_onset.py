@@ -458,7 +458,7 @@ def test_a_step_that_leaves_most_of_the_colour_is_no_change(
 def test_what_begins_in_flight_is_named_with_its_moment(tmp_path):
     """In still air: in gusts this torque is worth 8 nats."""
     constant, later = (
-        {"motor_lag": {"upper": 0.1, "lower": 0.1}},
+        {"gyro_bias": {"x": 0.03}},
         {"torque_balance": {"scale": 0.07}},
     )
     injector.fly(tmp_path, constant, gusts=False, seed=8, runs=RUNS,

@@ -380,7 +380,6 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
             19, {"randomize": [LAMA, FOUR, LATE, "skybotix_coax"]}, marks=pytest.mark.slow
         ),
         pytest.param(11, {"vehicle": NINE}, marks=SLOW),
-        pytest.param(11, {"vehicle": NINE, "randomize": "posterior"}, marks=SLOW),
         pytest.param(
             11,
             {
@@ -397,7 +396,7 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
         "one group", "and three more", "fewer than a group", "own vehicles", "waypoints",
         "five effects", "five, paper", "five, state", "five, mocap",
         "nine effects, each their own, in turbulence, late sensors", "a list",
-        "nine effects", "nine effects, own vehicles", "ranges in wind",
+        "nine effects", "ranges in wind",
     ],
 )  # fmt: skip
 def test_rows_in_a_simd_batch_fly_as_rows_one_by_one(monkeypatch, count, arguments):
