@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.state_space import Record
-from coax_env.logs.held_signal import integral_of_held
+from coax_env.logs.held_signal import row_means
 
 MOST = 0.5
 """s by which commands are taken to act sooner at most; ours."""
@@ -33,7 +33,8 @@ def remark(seconds: float) -> str:
     return (
         f"commands are written {seconds:.3g} s later than they act: the machine answers before them."
         " They were taken to act so much sooner; look for a clock that is late, or an echo that was"
-        " logged"
+        f" logged. For identify, replay and compare write late = {seconds:.3g} on the commands' lines"
+        " of the card, under [columns]"
     )
 
 
@@ -47,11 +48,7 @@ def acting_sooner(records: Sequence[Record], seconds: float) -> list[Record]:
         return list(records)
     found = []
     for record in records:
-        edges = np.append(record.t, 2.0 * record.t[-1] - record.t[-2])
-        sooner = [
-            np.diff(integral_of_held(record.t, column)(edges + seconds)) / np.diff(edges)
-            for column in record.command.T
-        ]
+        sooner = [row_means(record.t, column, seconds) for column in record.command.T]
         found.append(replace(record, command=np.column_stack(sooner)))
     return found
 

@@ -35,9 +35,11 @@ def remark(rows: Rows, row: float) -> str:
         rows: by which they are late. row: between two [s].
     """
     said = [f"{group} {seconds(count * row)}" for group, count in rows.items()]
+    lines = [f"late = {count * row:.3g} on {'/'.join(GROUPS[g])}" for g, count in rows.items()]
     return (
         f"read later than all else: {and_list(said)}. They were moved back; the simulation has them on"
-        " time. Look for another clock, or a queue"
+        " time. Look for another clock, or a queue. For identify, replay and compare write"
+        f" {and_list(lines)} of the card, under [columns]"
     )
 
 

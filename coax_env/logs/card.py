@@ -18,12 +18,13 @@ from coax_env.files import read_toml
 from coax_env.logs.card_columns import (
     COLUMN_KEYS,
     LARGEST_SCALE,
+    LATEST,
     SMALLEST_SCALE,
     Column,
     Quaternion,
 )
 from coax_env.logs.frames import frames_of
-from coax_env.logs.units import LOG_UNITS, PLACE_UNITS, factor_to_canonical
+from coax_env.logs.units import LOG_UNITS, PLACE_UNITS, PLACES, factor_to_canonical
 from coax_env.model.layout import CHANNELS
 
 CARD = "card.toml"
@@ -74,6 +75,12 @@ class Card:
     def holds(self) -> dict[str, bool]:
         """Channels of which the card says whether their repeats are new readings."""
         return {c: column.hold for c, column in self.columns.items() if column.hold is not None}
+
+    @property
+    def late(self) -> dict[str, float]:
+        """Channels and commands that are written late, and by how much [s]."""
+        late = {c: column.late for c, column in self.columns.items() if column.late}
+        return {PLACES.get(c, c): seconds for c, seconds in late.items()}
 
 
 def read_card(path: Path) -> Card:
@@ -216,9 +223,19 @@ def _column(table: _Table, channel: str, entry: dict[str, Any], where: str) -> C
         raise table.fault(
             f"{where}: a calibration says what scale and offset would: leave them out"
         )
+    late = _late(table, channel, entry, where)
     return Column(
-        name, unit.strip(), factor, int(sign), float(scale), offset, calibration, hold
+        name, unit.strip(), factor, int(sign), float(scale), offset, calibration, hold, late
     )  # fmt: skip
+
+
+def _late(table: _Table, channel: str, entry: dict[str, Any], where: str) -> float:
+    late = table.number(entry.get("late", 0.0), f"{where} late")
+    if late and channel == "t":
+        raise table.fault(f"{where}: time itself is not late: say it of the columns that are")
+    if not 0.0 <= late <= LATEST:
+        raise table.fault(f"{where} late should be seconds, 0 to {LATEST:g}, found {shown(late)}")
+    return late
 
 
 def _calibration(table: _Table, points: Any, where: str) -> tuple[tuple[float, float], ...]:
@@ -274,7 +291,7 @@ def _check_taken_once(
                 raise table.fault(f"[columns] has both quaternion and {channel}: leave one out")
     if ("lat" in columns) != ("lon" in columns):
         raise table.fault("[columns] lat and lon make a position together: name both")
-    for place, channel in (("lat", "pn"), ("lon", "pe")):
+    for place, channel in PLACES.items():
         if place in columns and channel in columns:
             raise table.fault(f"[columns] has both {place} and {channel}: leave one out")
 

@@ -8,7 +8,9 @@ from coax_env.logs.units import LOG_UNITS, PLACE_UNITS
 
 SMALLEST_SCALE, LARGEST_SCALE = 1e-12, 1e12
 """Between them lies the size of any factor that a card may ask for."""
-COLUMN_KEYS = ("name", "unit", "sign", "offset", "scale", "calibration", "hold")
+COLUMN_KEYS = ("name", "unit", "sign", "offset", "scale", "calibration", "hold", "late")
+LATEST = 1.0
+"""s by which a column may be written late: more is another log's clock; ours."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class Column:
         calibration: points (raw, value in `unit`) in place of scale and offset; straight lines
             between them and beyond.
         hold: whether a repeat is no new reading; None: as the pattern of repeats says (held.py).
+        late: by which it is written later than it happened [s] (late.py).
     """
 
     name: str
@@ -36,6 +39,7 @@ class Column:
     offset: float = 0.0
     calibration: tuple[tuple[float, float], ...] = ()
     hold: bool | None = None
+    late: float = 0.0
 
     @classmethod
     def own(cls, channel: str) -> "Column":
@@ -71,6 +75,8 @@ class Column:
             words.append(f"calibration = [{points}]")
         if self.hold is not None:
             words.append(f"hold = {str(self.hold).lower()}")
+        if self.late:
+            words.append(f"late = {self.late:g}")
         return f"{channel} = {{ {', '.join(words) or f'name = {quoted(self.name)}'} }}"
 
 

@@ -15,7 +15,7 @@ from coax_env.files import read_text
 from coax_env.logs.card_columns import Column, Quaternion
 from coax_env.logs.columns import advice, header_of
 from coax_env.logs.frames import attitude
-from coax_env.logs.units import LOG_UNITS, PLACE_UNITS
+from coax_env.logs.units import LOG_UNITS, PLACE_UNITS, PLACES
 
 BEYOND_ALL = 1e20
 """No reading in any unit is larger; what is, is a bit error and dropped."""
@@ -112,7 +112,7 @@ def _asked(columns: Mapping[str, Column], quaternion: Quaternion | None) -> dict
     asked = dict(columns)
     if quaternion is not None:
         claimed |= {*quaternion.names, "phi", "theta", "psi"}
-    for place, channel in (("lat", "pn"), ("lon", "pe")):
+    for place, channel in PLACES.items():
         if place in columns:
             claimed.add(channel)
     for channel in LOG_UNITS:

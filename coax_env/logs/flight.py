@@ -49,6 +49,7 @@ The card says the vehicle, the runs, and how the columns differ from that. One w
     h = { name = "range_mm", unit = "mm", offset = -35 } # sign * scale * (raw + offset), then the unit
     battery_v = { name = "adc", scale = 0.0123 }
     psi = { name = "yaw", hold = true }                  # a repeat is no reading; false: each is one
+    r = { name = "gyro_z", late = 0.02 }                 # written 0.02 s later than it was read
     lat = "gps_lat"                                      # in place of pn and pe, in deg
     lon = "gps_lon"
 
@@ -84,6 +85,7 @@ from coax_env.logs.clock import on_even_clock
 from coax_env.logs.csv_log import CsvLog, read_csv
 from coax_env.logs.derived import without_derived
 from coax_env.logs.frames import place
+from coax_env.logs.late import in_their_place
 from coax_env.logs.repairs import repaired
 from coax_env.logs.smoothed import read_apart
 from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS, without
@@ -232,7 +234,8 @@ def read_flight(path: str | Path) -> Flight:
         hashes[entry.file] = _hash(file)
         renamed |= log.renamed
         unread |= dict.fromkeys(log.unknown)
-        logs.append(repaired(log, card.noise, counts, card.holds))
+        read = repaired(log, card.noise, counts, card.holds)
+        logs.append(in_their_place(read, card.late, counts))
     _check_columns(folder, card, renamed, unread)
     logs = without_derived(logs, counts, card.holds)
     logs = read_apart(on_even_clock(logs, counts), counts, card.holds)

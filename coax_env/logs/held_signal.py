@@ -1,4 +1,4 @@
-"""A signal held from each row to the next, as commands are: its integral at any time."""
+"""A signal held from each row to the next, as commands are: its integral, and means over rows."""
 
 from collections.abc import Callable
 
@@ -20,3 +20,15 @@ def integral_of_held(t: np.ndarray, values: np.ndarray) -> Callable[[np.ndarray]
         return np.interp(at, t, area) + beyond + before
 
     return integral
+
+
+def row_means(t: np.ndarray, values: np.ndarray, sooner: float) -> np.ndarray:
+    """Mean over each row of what is held, (n,), had it come sooner.
+
+    Args:
+        t: (n,) time [s], increasing.
+        values: (n,) held.
+        sooner: by how much it comes before it is written [s].
+    """
+    edges = np.append(t, 2.0 * t[-1] - t[-2])
+    return np.diff(integral_of_held(t, values)(edges + sooner)) / np.diff(edges)

@@ -32,8 +32,10 @@ LOG_UNITS: dict[str, str] = {
 }
 """Canonical unit of every column a flight can have."""
 
-PLACE_UNITS: dict[str, str] = {"lat": "deg", "lon": "deg"}
-"""Latitude and longitude: columns that a card may name in place of pn and pe, and their unit."""
+PLACES: dict[str, str] = {"lat": "pn", "lon": "pe"}
+"""Latitude and longitude, which a card may name -> the channel that they are in place of."""
+PLACE_UNITS: dict[str, str] = dict.fromkeys(PLACES, "deg")
+"""Canonical unit of each."""
 
 _RPM = 30.0 / pi
 _LENGTH = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "in": 0.0254}
