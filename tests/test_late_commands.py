@@ -1,6 +1,5 @@
 """Commands that a log has later than they act: when that is seen, and what is done."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import injector
@@ -10,14 +9,14 @@ from injector_craft import COAX
 from numpy.testing import assert_allclose
 
 from coax_env import diagnose
-from coax_env.diagnosis.late_commands import acting_sooner, remark, written_late
-from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation import late_commands
+from coax_env.estimation.late_commands import acting_sooner, remark, written_late
 from coax_env.estimation.state_space import Noise, Record
+from coax_env.identification.identify import identify
 from coax_env.logs.flight import read_flight
 
 ROW = 0.01
-FIT = Fit((), {}, Noise({}))
 
 
 def stairs(seconds: float = 0.0) -> Record:
@@ -44,23 +43,22 @@ def test_between_rows_a_command_is_its_mean_over_the_row():
     assert_allclose(found.command[:-1], 0.6 * command[:-1] + 0.4 * command[1:], atol=1e-9)
 
 
-def problem_of(likelihood: Any, row: float = ROW) -> Any:
-    """A stand-in whose readings are so likely with commands so much sooner [s]."""
+def found_late(monkeypatch: pytest.MonkeyPatch, likelihood: Any, row: float = ROW) -> float:
+    """`written_late` of readings that are so likely with commands so much sooner [s]."""
 
-    def with_records(records: Any) -> Any:
-        sooner = float(
-            np.interp(records[0].command[0, 0], np.arange(100.0), row * np.arange(100.0))
-        )
-        return SimpleNamespace(
-            engine=SimpleNamespace(log_likelihood=lambda values, noise: likelihood(sooner))
-        )
+    class Likelihood:
+        """A stand-in for an engine, which reads off its commands how much sooner they come."""
 
-    t = row * np.arange(100)
-    ramp = Record("a", t, np.arange(100.0)[:, None], np.zeros((100, 1)))
-    return SimpleNamespace(
-        row=row, settings=SETTINGS, report=lambda text: None, with_records=with_records,
-        engine=SimpleNamespace(records=[ramp], log_likelihood=lambda values, noise: likelihood(0.0)),
-    )  # fmt: skip
+        def __init__(self, model: Any, records: Any, threads: Any = None) -> None:
+            self.model, self.records, self.threads = model, records, threads
+
+        def log_likelihood(self, values: Any, noise: Any) -> float:
+            rows = np.arange(100.0)
+            return likelihood(float(np.interp(self.records[0].command[0, 0], rows, row * rows)))
+
+    monkeypatch.setattr(late_commands, "Engine", Likelihood)
+    ramp = Record("a", row * np.arange(100), np.arange(100.0)[:, None], np.zeros((100, 1)))
+    return written_late(Likelihood(None, [ramp]), {}, Noise({}), lambda text: None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -76,24 +74,28 @@ def problem_of(likelihood: Any, row: float = ROW) -> Any:
         (0.9, 500.0, 0.6, 0.0),  # no log has rows that far apart
     ],
 )
-def test_commands_act_as_much_sooner_as_is_likeliest(true, nats, row, found):
+def test_commands_act_as_much_sooner_as_is_likeliest(monkeypatch, true, nats, row, found):
     """The likelihood is a parabola about the truth."""
 
     def likelihood(seconds: float) -> float:
         return nats * (1.0 - ((seconds - true) / true) ** 2)
 
-    assert written_late(problem_of(likelihood, row), FIT) == pytest.approx(found, abs=0.1 * row)
+    assert found_late(monkeypatch, likelihood, row) == pytest.approx(found, abs=0.1 * row)
 
 
-def test_where_commands_a_row_sooner_are_less_likely_no_more_is_asked():
+def test_where_commands_a_row_sooner_are_less_likely_no_more_is_asked(monkeypatch):
     asked: list[float] = []
 
     def likelihood(seconds: float) -> float:
         asked.append(seconds)
         return -1e4 * seconds
 
-    assert written_late(problem_of(likelihood), FIT) == 0.0
+    assert found_late(monkeypatch, likelihood) == 0.0
     assert asked == [0.0, pytest.approx(ROW)]
+
+
+def test_it_must_be_worth_what_a_sure_cause_is():
+    assert (SETTINGS.sure_evidence, SETTINGS.tie) == (late_commands.ENOUGH, late_commands.TIE)
 
 
 def written_later(folder: Any, rows: int) -> Any:
@@ -120,3 +122,17 @@ def test_a_clean_flight_whose_commands_are_written_late_has_no_cause(tmp_path):
     said = [text for text in result.remarks if "later than they act" in text]
     assert len(said) == 1 and float(said[0].split()[3]) == pytest.approx(6.0 / 150.0, abs=0.008)
     assert remark(0.03).startswith("commands are written 0.03 s later")
+
+
+@pytest.mark.slow
+def test_numbers_are_identified_with_commands_when_they_act(tmp_path):
+    """As written, 40 ms late, the linkage had nine tenths of its gain, 4 std off; in gusts."""
+    runs = ("lon_3211", "lat_3211")
+    injector.fly(tmp_path / "f", {}, gusts=True, seed=11, runs=runs, longest=12.0)
+    sound = identify(read_flight(tmp_path / "f"))
+    assert not any("later than they act" in text for text in sound.remarks)
+    late = identify(written_later(tmp_path / "f", 4))
+    (said,) = [text for text in late.remarks if "later than they act" in text]
+    assert said.startswith("commands are written 0.04 s later")
+    for name, std in sound.estimate.std.items():
+        assert abs(late.estimate.values[name] - sound.estimate.values[name]) < 0.3 * std, name

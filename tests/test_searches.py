@@ -51,7 +51,7 @@ def _steady_rotors(monkeypatch):
 @pytest.fixture(autouse=True)
 def _commands_on_time(monkeypatch):
     """Written when they act, gyros on time, but where a test says otherwise."""
-    stand_in(monkeypatch, "written_late", lambda problem, fit: 0.0)
+    stand_in(monkeypatch, "commands_late", lambda first: 0.0)
     stand_in(monkeypatch, "with_imu_on_time", lambda first, smoothed, noise: None)
 
 
@@ -918,15 +918,15 @@ def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
     def of(name: str) -> Any:
-        return SimpleNamespace(name=name, report=lambda text: None, smoothed=False)
+        return SimpleNamespace(
+            name=name, report=lambda text: None, smoothed=False,
+            with_commands_sooner=lambda seconds: of(f"{seconds:g} sooner"),
+        )  # fmt: skip
 
     stand_in(monkeypatch, "rotors_first", lambda problem, noise: None)
     stand_in(monkeypatch, "searched_once", once_more)
     stand_in(
-        monkeypatch, "written_late", lambda problem, fit: 0.03 if problem.name == "logged" else 0.0
-    )
-    stand_in(
-        monkeypatch, "with_commands_sooner", lambda problem, seconds: of(f"{seconds:g} sooner")
+        monkeypatch, "commands_late", lambda first: 0.03 if first.problem.name == "logged" else 0.0
     )
     stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
     stand_in(monkeypatch, "is_lag_unshown", lambda found: False)

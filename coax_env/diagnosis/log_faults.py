@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 from coax_env.diagnosis import (
-    late_commands,
     late_imu,
     late_rotor_speeds,
     sensor_low_pass,
@@ -11,6 +10,7 @@ from coax_env.diagnosis import (
 )
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.searches.once import Searched
+from coax_env.estimation import late_commands
 from coax_env.estimation.clock_errors import with_clock_error
 from coax_env.estimation.low_pass import records_before
 from coax_env.estimation.state_space import Record

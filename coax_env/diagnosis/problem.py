@@ -20,6 +20,7 @@ from coax_env.estimation.fitted_vehicle import median_step
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.helicopter_noise import GUST_LEVELS
 from coax_env.estimation.joint_gusts import SHARES
+from coax_env.estimation.late_commands import acting_sooner
 from coax_env.estimation.low_pass import LowPass, records_before
 from coax_env.estimation.parted_engine import AT
 from coax_env.estimation.state_space import FreeParameter, Late, Noise, Record
@@ -118,7 +119,7 @@ class Problem:
         between_commands: s from one known command to the next, where those between are on straight
             lines (slow_commands.py); 0: every row's is known.
         late_imu: rows by which gyros or accelerometers were moved back (late_imu.py).
-        commands_late: s by which commands were taken to act sooner than is written (late_commands.py).
+        commands_late: s by which commands were taken to act sooner than is written.
     """
 
     model: HeliModel
@@ -197,6 +198,11 @@ class Problem:
     def with_records(self, records: Sequence[Record]) -> "Problem":
         """On other records of the same runs."""
         return replace(self, engine=Engine(self.model, records, self.engine.threads))
+
+    def with_commands_sooner(self, seconds: float) -> "Problem":
+        """Whose commands act so much sooner than is written [s]."""
+        records = acting_sooner(self.engine.records, seconds)
+        return replace(self.with_records(records), commands_late=seconds)
 
     def behind(self, passes: Mapping[str, LowPass], records: Sequence[Record]) -> "Problem":
         """With readings of some channels as they were before low-passes.

@@ -25,6 +25,8 @@ from coax_env.estimation.fitted_vehicle import (
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise
+from coax_env.estimation.late_commands import acting_sooner, written_late
+from coax_env.estimation.late_commands import remark as late_commands_remark
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import RunReplay, replay_runs
 from coax_env.estimation.quadratic import Quadratic
@@ -186,6 +188,14 @@ def _by_maximum_likelihood(
     first = fit_noise(engine, bare, start, fitted_levels(start))
     found = own_numbers(engine, free, bare, first, report)
     values = {**model.bare_values, **found.estimate.values}
+    late = written_late(engine, values, found.noise, report)
+    if late > 0.0:
+        report("estimating again with commands when they act")
+        engine = Engine(model, acting_sooner(engine.records, late))
+        first = fit_noise(engine, bare, start, fitted_levels(start))
+        found = own_numbers(engine, free, bare, first, report)
+        values = {**model.bare_values, **found.estimate.values}
+        known = (*known, late_commands_remark(late))
     _, lin = engine.linearise(values, found.noise, found.free)
     quadratic = Quadratic.of(lin, found.free, values)
     names = [f.name for f in found.free]
@@ -195,7 +205,7 @@ def _by_maximum_likelihood(
     dt = median_step(engine.records)
     after = _identified_vehicle(vehicle, found, inflation, apart, dt, flight)
     report("flying the runs open loop")
-    again = Engine(model, [record_of(run) for run in held.runs])
+    again = Engine(model, acting_sooner([record_of(run) for run in held.runs], late))
     return Identification(
         held,
         vehicle,

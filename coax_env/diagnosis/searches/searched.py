@@ -3,7 +3,7 @@
 A search may leave innovations coloured, or name what another noise explains. So it is asked in this
 order what the log has, and where it has that, the search is done again with it:
 
-- commands that are written later than they act (late_commands.py)
+- commands that are written later than they act (estimation/late_commands.py)
 - what moves the rotors, alone; rotor speeds that come late, or jitter (rotors.py): nothing else touches
   these readings
 - air of each run's own (unrest.py): noise of one level makes many names
@@ -19,7 +19,6 @@ Where they stay so in the end, the gusts as they are then are asked there, too: 
 
 from collections.abc import Mapping
 
-from coax_env.diagnosis.late_commands import with_commands_sooner, written_late
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.rotor_jitter import share_of
 from coax_env.diagnosis.searches.once import Searched, is_coloured, searched_once
@@ -39,6 +38,7 @@ from coax_env.diagnosis.searches.rotors import (
 )
 from coax_env.diagnosis.searches.unrest import in_own_air, in_unrest
 from coax_env.estimation.changing_model import Lap
+from coax_env.estimation.late_commands import written_late
 from coax_env.estimation.state_space import Noise
 from coax_env.model.layout import INERTIAL, ROTOR_SPEEDS
 
@@ -52,9 +52,9 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     """
     given = noise
     first, noise = _first(problem, given)
-    late_by = written_late(first.problem, first.refitted)
+    late_by = commands_late(first)
     if late_by > 0.0:
-        problem = with_commands_sooner(problem, late_by)
+        problem = problem.with_commands_sooner(late_by)
         problem.report("searching again with commands when they act")
         first, noise = _first(problem, given)
     late = with_late_speeds(problem, first.problem, first.fit, given)
@@ -92,6 +92,19 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
 def _first(problem: Problem, noise: Noise) -> tuple[Searched, Noise]:
     """The first search, and the levels that it started from."""
     return rotors_first(problem, noise) or (searched_once(problem, noise), noise)
+
+
+def commands_late(first: Searched) -> float:
+    """Time by which commands are written later than they act [s], by the model as given, refitted.
+
+    Args:
+        first: the first search.
+    """
+    problem, refitted, chosen = first.problem, first.refitted, first.problem.settings
+    return written_late(
+        problem.engine, refitted.values, refitted.noise, problem.report,
+        chosen.sure_evidence, chosen.tie,
+    )  # fmt: skip
 
 
 def _without_low_passes(

@@ -6,20 +6,26 @@ droop of 598 and a yaw damping. With commands one row sooner they are 3,500 nats
 are 200 to 10,600 less so. So commands are taken to act as much sooner as is likeliest.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation.state_space import Record
+from coax_env.estimation.engine import Engine
+from coax_env.estimation.fitted_vehicle import median_step
+from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.held_signal import row_means
+from coax_env.progress import Progress
 
 MOST = 0.5
 """s by which commands are taken to act sooner at most; ours."""
 FIRST = (1, 2, 4, 8, 16)
 """Rows by which they are at first; ours."""
+ENOUGH = 42.0
+"""nats that it must be worth: three thresholds of a cause (diagnosis/settings.py)."""
+TIE = 6.0
+"""nats within which times are as likely: odds of 400 to 1, ours."""
 WITHIN = 0.1
 """Rows to which that is looked for, and within which it is whole rows; ours."""
 
@@ -33,8 +39,8 @@ def remark(seconds: float) -> str:
     return (
         f"commands are written {seconds:.3g} s later than they act: the machine answers before them."
         " They were taken to act so much sooner; look for a clock that is late, or an echo that was"
-        f" logged. For identify, replay and compare write late = {seconds:.3g} on the commands' lines"
-        " of the card, under [columns]"
+        f" logged. For replay and compare write late = {seconds:.3g} on the commands' lines of the"
+        " card, under [columns]"
     )
 
 
@@ -53,37 +59,40 @@ def acting_sooner(records: Sequence[Record], seconds: float) -> list[Record]:
     return found
 
 
-def with_commands_sooner(problem: Problem, seconds: float) -> Problem:
-    """The problem whose commands act so much sooner than is written [s]."""
-    records = acting_sooner(problem.engine.records, seconds)
-    return replace(problem.with_records(records), commands_late=seconds)
-
-
-def written_late(problem: Problem, fit: Fit) -> float:
+def written_late(
+    engine: Engine,
+    values: Mapping[str, float],
+    noise: Noise,
+    report: Progress,
+    enough: float = ENOUGH,
+    tie: float = TIE,
+) -> float:
     """Time by which commands are written later than they act [s], 0 where they are not.
 
     Args:
-        problem, fit: the model as given, with its own numbers refitted.
+        engine: model and records. values, noise: the model's own numbers and levels, fitted.
+        report: called with a line of text.
+        enough: nats that it must be worth. tie: nats within which times are as likely.
     """
-    row = problem.row
+    row = median_step(engine.records)
 
     def likelihood(seconds: float) -> float:
-        sooner = problem.with_records(acting_sooner(problem.engine.records, seconds))
-        return sooner.engine.log_likelihood(fit.values, fit.noise)
+        sooner = acting_sooner(engine.records, seconds)
+        return Engine(engine.model, sooner, engine.threads).log_likelihood(values, noise)
 
-    known = problem.engine.log_likelihood(fit.values, fit.noise)
+    known = engine.log_likelihood(values, noise)
     nats: dict[int, float] = {}
     for rows in FIRST:
-        if rows * row > MOST or min(nats.values(), default=0.0) < -problem.settings.tie:
+        if rows * row > MOST or min(nats.values(), default=0.0) < -tie:
             break
         nats[rows] = likelihood(rows * row) - known
     rows = max(nats, key=lambda rows: nats[rows], default=0)
-    if not nats or not nats[rows] > problem.settings.sure_evidence:
+    if not nats or not nats[rows] > enough:
         return 0.0
-    problem.report(f"commands about {rows * row:.3g} s sooner: {nats[rows]:.1f} nats")
+    report(f"commands about {rows * row:.3g} s sooner: {nats[rows]:.1f} nats")
     found = minimize_scalar(
         lambda seconds: -likelihood(seconds), bounds=(0.5 * rows * row, 2.0 * rows * row),
         method="bounded", options={"xatol": WITHIN * row},
     )  # fmt: skip
     whole = max(round(float(found.x) / row), 1) * row
-    return whole if likelihood(whole) > -found.fun - problem.settings.tie else float(found.x)
+    return whole if likelihood(whole) > -found.fun - tie else float(found.x)
