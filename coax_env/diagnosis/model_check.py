@@ -8,7 +8,8 @@ Three things that a right model fixes whoever flies, with their distribution:
   commands move machine and prediction alike), so that the errors over their std have an rms of 1.
 - *Spectrum of the innovations.* Flat: in every band the mean periodogram is that of white noise.
 - *Innovations and commands.* An innovation is what could not be known: it is correlated with no command
-  before it.
+  before it. Where it is foretold by its own past, as coloured ones are, so is what the pilot did about
+  that: only what is beyond its past counts.
 
 That is what a parametric bootstrap of the fitted model flown in closed loop would give, in closed form
 and without a model of the pilot. Starts are so far apart that their errors are independent.
@@ -27,7 +28,7 @@ from coax_env.estimation import compiled_model
 from coax_env.estimation.prediction import TAIL
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import Noise, Record, part
-from coax_env.estimation.whiteness import correlation
+from coax_env.estimation.whiteness import beyond_its_past, correlation
 from coax_env.model.layout import ANGLES, CHANNELS
 from coax_env.plain_words import channel_name
 
@@ -285,14 +286,15 @@ def _answers(passes: Sequence[RunPass]) -> Iterable[dict[str, Any]]:
 
 
 def _correlation(passes: Sequence[RunPass], c: int, k: int, lag: float) -> tuple[float, int]:
-    """Correlation of a channel's innovations with a command's change before, and their number."""
+    """Correlation of a channel's innovations, beyond their own past, with a command's change before;
+    and their number."""
     e, moved = [], []
     for run in passes:
         t = run.record.t
         command = run.record.command[:, k]
         earlier = np.interp(t - lag, t, command) - np.interp(t - lag - LAGS[0], t, command)
         there = (t > t[0] + SEEN) & np.isfinite(run.innovations[:, c])
-        e.append(run.innovations[there, c])
+        e.append(beyond_its_past(run.innovations[there, c]))
         moved.append(earlier[there])
     innovations, changes = np.concatenate(e), np.concatenate(moved)
     return correlation(innovations, changes), innovations.size

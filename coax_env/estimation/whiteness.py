@@ -65,9 +65,8 @@ def _judge(parts: Sequence[tuple[str, np.ndarray]]) -> Whiteness:
     worst = None
     for name, e in parts:
         n = e.size
-        rho = np.array([e[k:] @ e[:-k] for k in range(1, LAGS + 1)]) / (e @ e)
+        rho, predictor = _of_its_past(e)
         q = n * (n + 2) * np.sum(rho**2 / (n - np.arange(1, LAGS + 1)))
-        predictor = solve_toeplitz(np.append(1.0, rho[:-1]), rho)  # Yule-Walker
         share = float(np.clip(predictor @ rho - LAGS / n, 0.0, 1.0))
         p = float(chdtrc(LAGS, q)) * len(parts)
         spread = float(e.std())
@@ -78,6 +77,20 @@ def _judge(parts: Sequence[tuple[str, np.ndarray]]) -> Whiteness:
             worst = judged
     assert worst is not None
     return worst
+
+
+def _of_its_past(e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Correlations of a series (n,) with itself LAGS back and less, and its predictor (Yule-Walker)."""
+    rho = np.array([e[k:] @ e[:-k] for k in range(1, LAGS + 1)]) / (e @ e)
+    return rho, solve_toeplitz(np.append(1.0, rho[:-1]), rho)
+
+
+def beyond_its_past(e: np.ndarray) -> np.ndarray:
+    """A series (n,) less what its own past predicts of it; white where that predicts it well."""
+    if e.size <= 3 * LAGS or not e.any():
+        return e
+    _, predictor = _of_its_past(e)
+    return e - np.convolve(e, np.append(0.0, predictor))[: e.size]
 
 
 def correlation(one: np.ndarray, other: np.ndarray) -> float:
