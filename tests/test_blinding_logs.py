@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 from bundled_flight import BUNDLED, copied
+from csv_edits import Table, rewrite
 from scipy.interpolate import Akima1DInterpolator, CubicSpline, PchipInterpolator
 from scipy.signal import butter, filtfilt
 from shared_flights import read
@@ -33,20 +34,11 @@ RUNS = (RUN, "lon_doublet")
 FIRST, RATE = 400, 100
 """First row at fault, and rows per second of the bundled flight."""
 
-Table = dict[str, list[str]]
-"""Columns of a CSV, as text."""
-
-
 def edited(folder: Path, change: Callable[[Table], None], run: str = RUN) -> Flight:
     """RUNS of the bundled flight, or the one in the folder, with a run's CSV changed cell by cell."""
     if not folder.exists():
         copied(folder, *RUNS)
-    file = folder / f"{run}.csv"
-    header, *lines = (line.split(",") for line in file.read_text().splitlines())
-    table = {name: [line[k] for line in lines] for k, name in enumerate(header)}
-    change(table)
-    rows = zip(*table.values(), strict=True)
-    file.write_text("\n".join([",".join(table), *(",".join(row) for row in rows)]) + "\n")
+    rewrite([folder / f"{run}.csv"], change)
     return read_flight(folder)
 
 

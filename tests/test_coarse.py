@@ -3,6 +3,7 @@
 import injector
 import numpy as np
 import pytest
+from csv_edits import Table, rewrite
 
 from coax_env import diagnose
 from coax_env.logs.coarse import at_changes
@@ -77,14 +78,12 @@ def test_a_clean_flight_whose_rotor_speeds_are_coarse_has_no_cause(tmp_path):
     """A thrust exponent of 63 and 77 nats on two, with a yaw damping of 218 on one."""
     runs = ("heave_3211", "yaw_3211", "lon_3211")
     injector.fly(tmp_path, {}, gusts=True, seed=4, runs=runs)
-    for path in tmp_path.glob("*.csv"):
-        head, *body = path.read_text().splitlines()
-        cells = [line.split(",") for line in body]
+
+    def in_steps(table: Table) -> None:
         for name in ("rpm_upper", "rpm_lower"):
-            place = head.split(",").index(name)
-            for row in cells:
-                row[place] = f"{STEP * round(float(row[place]) / STEP):g}"
-        path.write_text("\n".join([head, *(",".join(row) for row in cells)]) + "\n")
+            table[name] = [f"{STEP * round(float(cell) / STEP):g}" for cell in table[name]]
+
+    rewrite(tmp_path.glob("*.csv"), in_steps)
     notes = read_flight(tmp_path).notes
     assert sum("coarse steps" in note for note in notes) == 2
     assert diagnose(tmp_path, hold_out=[]).findings["causes"] == []

@@ -5,6 +5,7 @@ from typing import Any
 import injector
 import numpy as np
 import pytest
+from csv_edits import written_later
 from injector_craft import COAX
 from numpy.testing import assert_allclose
 
@@ -14,9 +15,10 @@ from coax_env.estimation import late_commands
 from coax_env.estimation.late_commands import acting_sooner, remark, written_late
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.identification.identify import identify
-from coax_env.logs.flight import read_flight
+from coax_env.logs.units import ROTOR_COMMANDS, SWASH_COMMANDS
 
 ROW = 0.01
+COMMANDS = (*ROTOR_COMMANDS, *SWASH_COMMANDS)
 
 
 def stairs(seconds: float = 0.0) -> Record:
@@ -98,26 +100,12 @@ def test_it_must_be_worth_what_a_sure_cause_is():
     assert (SETTINGS.sure_evidence, SETTINGS.tie) == (late_commands.ENOUGH, late_commands.TIE)
 
 
-def written_later(folder: Any, rows: int) -> Any:
-    """A flight whose commands are written so many rows later."""
-    for path in folder.glob("*.csv"):
-        head, *body = path.read_text().splitlines()
-        names, cells = head.split(","), [line.split(",") for line in body]
-        for name in ("rpm_upper_cmd", "rpm_lower_cmd", "delta_lon", "delta_lat"):
-            place = names.index(name)
-            column = [row[place] for row in cells]
-            for row, value in zip(cells, [*column[:1] * rows, *column[:-rows]], strict=True):
-                row[place] = value
-        path.write_text("\n".join([head, *(",".join(row) for row in cells)]) + "\n")
-    return read_flight(folder)
-
-
 @pytest.mark.slow
 def test_a_clean_flight_whose_commands_are_written_late_has_no_cause(tmp_path):
     """By all sensors one had three, of 598 nats at most; here by poses alone. What was done is said."""
     runs = ("lon_3211", "yaw_3211", "heave_3211")
     injector.fly(tmp_path, {}, gusts=True, seed=11, runs=runs, craft=COAX, sensors="pose")
-    result = diagnose(written_later(tmp_path, 6), hold_out=[])
+    result = diagnose(written_later(tmp_path, COMMANDS, 6), hold_out=[])
     assert result.findings["causes"] == []
     said = [text for text in result.remarks if "later than they act" in text]
     assert len(said) == 1 and float(said[0].split()[3]) == pytest.approx(6.0 / 150.0, abs=0.008)
@@ -129,9 +117,9 @@ def test_numbers_are_identified_with_commands_when_they_act(tmp_path):
     """As written, 40 ms late, the linkage had nine tenths of its gain, 4 std off; in gusts."""
     runs = ("lon_3211", "lat_3211")
     injector.fly(tmp_path / "f", {}, gusts=True, seed=11, runs=runs, longest=12.0)
-    sound = identify(read_flight(tmp_path / "f"))
+    sound = identify(tmp_path / "f")
     assert not any("later than they act" in text for text in sound.remarks)
-    late = identify(written_later(tmp_path / "f", 4))
+    late = identify(written_later(tmp_path / "f", COMMANDS, 4))
     (said,) = [text for text in late.remarks if "later than they act" in text]
     assert said.startswith("commands are written 0.04 s later")
     for name, std in sound.estimate.std.items():

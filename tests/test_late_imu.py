@@ -6,6 +6,7 @@ from typing import Any
 import injector
 import numpy as np
 import pytest
+from csv_edits import written_later
 from numpy.testing import assert_array_equal
 
 from coax_env import diagnose
@@ -87,16 +88,7 @@ def test_a_clean_flight_whose_imu_comes_late_has_no_cause(tmp_path):
     """It had a servo's delay at first; what poses show was not explained. What was done is said."""
     runs = ("lon_3211", "yaw_3211")
     injector.fly(tmp_path, {}, gusts=True, seed=5, runs=runs, sensors="lab")
-    for path in tmp_path.glob("*.csv"):
-        head, *body = path.read_text().splitlines()
-        cells = [line.split(",") for line in body]
-        for channel in (*GYROS, *ACCELEROMETERS):
-            place = head.split(",").index(channel)
-            column = ["", "", *(row[place] for row in cells)]
-            for row, value in zip(cells, column, strict=False):
-                row[place] = value
-        path.write_text("\n".join([head, *(",".join(row) for row in cells)]) + "\n")
-    result = diagnose(tmp_path, hold_out=[])
+    result = diagnose(written_later(tmp_path, (*GYROS, *ACCELEROMETERS), 2), hold_out=[])
     assert (result.findings["causes"], result.findings["unexplained"]) == ([], [])
     said = [text for text in result.remarks if "later than all else" in text]
     assert len(said) == 1 and "gyros 0.02 s" in said[0]

@@ -7,6 +7,7 @@ from typing import Any
 import injector
 import numpy as np
 import pytest
+from csv_edits import written_later
 from injector_air import GUSTY
 from numpy.testing import assert_allclose
 from scipy.signal import butter, lfilter
@@ -247,14 +248,8 @@ def test_rotor_speeds_that_come_late_are_no_late_motors(tmp_path, late, effects,
         tmp_path / "flight", effects, gusts=True, sensors=sensors, seed=5, longest=9.0,
         runs=("lon_3211", "heave_3211", "yaw_3211", "climb_descend"),
     )  # fmt: skip
-    for file in folder.glob("*.csv") if late == "rows" else ():
-        head, *rows = [line.split(",") for line in file.read_text().splitlines()]
-        columns = [head.index(channel) for channel in ROTOR_SPEEDS]
-        read = [[row[k] for k in columns] for row in rows]
-        for row, before in zip(rows, [read[0], read[0], *read[:-2]], strict=True):
-            for k, value in zip(columns, before, strict=True):
-                row[k] = value
-        file.write_text("\n".join(",".join(row) for row in [head, *rows]) + "\n")
+    if late == "rows":
+        written_later(folder, ROTOR_SPEEDS, 2)
     found = diagnose(folder, hold_out=[])
     assert [cause["effect"] for cause in found.findings["causes"]] == names
     assert found.findings["unexplained"] == []
