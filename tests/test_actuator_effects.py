@@ -475,6 +475,18 @@ def test_a_delay_is_known_within_a_row_where_speeds_are_measured():
     assert found["verdict"] == "explained"
 
 
+@pytest.mark.slow
+def test_the_interval_of_a_play_reaches_over_its_likelihoods_roughness(tmp_path):
+    """Five std off by the signatures, which see where the plate lets go and not the milliradians."""
+    runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "forward_run", "side_run")
+    truth = {"servo_play": {"width": 0.0265}}
+    injector.fly(tmp_path, truth, gusts=True, seed=5, runs=runs, longest=12.0)
+    (cause,) = diagnose(tmp_path, hold_out=[]).findings["causes"]
+    assert cause["effect"] == "servo_play"
+    width = cause["parameters"]["servo_play.width"]
+    assert abs(width["value"] - 0.0265) < 2.5 * width["std"] < 0.01
+
+
 IN_THE_INJECTOR = {
     "battery": {"battery_voltage": {}},
     "inflow": {"dynamic_inflow": {}},

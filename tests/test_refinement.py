@@ -182,3 +182,81 @@ def test_a_step_twice_too_long_and_more_is_shortened_once():
 def test_a_step_the_wrong_way_gains_nothing():
     _, gained, passes = searched(-1.0)
     assert gained < 0.0 and passes == 2
+
+
+# --- a likelihood that is rough over less than a std ------------------------------------------------
+
+
+@dataclass
+class Rough(Made):
+    """As `Made`, with waves along the second number: `height` nats, `length` from crest to crest."""
+
+    height: float = 1.0
+    length: float = 0.05
+
+    def filter(self, values: dict[str, float], noise: Noise) -> list[SimpleNamespace]:
+        (smooth,) = super().filter(values, noise)
+        wave = self.height * np.cos(2.0 * np.pi * values[NAMES[1]] / self.length)
+        return [SimpleNamespace(log_likelihood=smooth.log_likelihood + wave)]
+
+
+def rough(monkeypatch: pytest.MonkeyPatch, **waves: float) -> tuple[Problem, Fit, float, float]:
+    """A problem whose signatures have nine times the information on a rough number of std 0.14."""
+    monkeypatch.setattr(refinement, "ROUGH", ("gyro_bias",))
+    apart = np.diag([30.0, 50.0, 40.0])
+    made, fit, optimum = problem(apart, np.diag([30.0, 450.0, 360.0]))
+    engine = Rough(**{**vars(made.engine), **waves})
+    made = replace(made, engine=engine)
+    fit = replace(fit.at(dict(zip(NAMES, optimum.tolist(), strict=True))), std_ratio={})
+    std = float((50.0 + PRIOR[1] ** -2.0) ** -0.5)
+    return made, fit, float(optimum[1]), std
+
+
+def std_of(found: Fit) -> float:
+    """Of the rough number."""
+    return found.std_ratio[NAMES[1]] * float((450.0 + PRIOR[1] ** -2.0) ** -0.5)
+
+
+@pytest.mark.parametrize("white", [True, False])
+def test_over_roughness_the_std_is_that_of_a_parabola(monkeypatch, white):
+    """Waves of 0.3 nats have 60 times the curvature of what they stand on; coloured or not."""
+    monkeypatch.setattr(refinement, "is_white", lambda passes, channels: white)
+    monkeypatch.setattr(
+        refinement, "fitted", lambda made, fit, *limits: replace(fit, objective=0.0)
+    )
+    made, fit, _, std = rough(monkeypatch, height=0.3, length=0.02)
+    assert std_of(refinement.refined(made, fit)) == pytest.approx(std, rel=0.25)
+
+
+@pytest.mark.parametrize("off", [-2.0, 1.3, 2.4])
+def test_a_fit_that_is_stuck_in_roughness_leaves_for_what_is_likelier(monkeypatch, off):
+    """From so many std beside the top, on a crest; it ends within a wave and a third of a std of it."""
+    made, fit, top, std = rough(monkeypatch, height=0.2, length=0.03)
+    start = round((top + off * std) / 0.03) * 0.03
+    found = refinement._over_roughness(made, fit.at({NAMES[1]: start}))
+    assert abs(found.values[NAMES[1]] - top) < 0.33 * std + 0.03
+    assert found.objective == pytest.approx(cost(made, found.values), abs=1e-9)
+    assert std_of(found) == pytest.approx(std, rel=0.4)
+
+
+def test_a_fit_that_stays_on_a_spike_is_as_unsure_as_the_top_is_far(monkeypatch):
+    """A spike of 3 nats, narrower than any step: the likeliest place of all, 1.5 std off."""
+    made, fit, top, std = rough(monkeypatch, height=0.0)
+    start = top + 1.5 * std
+    plain = made.engine.filter
+
+    def spiked(values: dict[str, float], noise: Noise) -> list[SimpleNamespace]:
+        (smooth,) = plain(values, noise)
+        on_it = abs(values[NAMES[1]] - start) < 1e-3 * std
+        return [SimpleNamespace(log_likelihood=smooth.log_likelihood + 3.0 * on_it)]
+
+    monkeypatch.setattr(made.engine, "filter", spiked)
+    found = refinement._over_roughness(made, fit.at({NAMES[1]: start}))
+    assert found.values[NAMES[1]] == start
+    assert std_of(found) == pytest.approx(std * np.hypot(1.0, 1.5), rel=0.1)
+
+
+def test_what_is_not_rough_is_left_as_it_was(monkeypatch):
+    made, fit, _, _ = rough(monkeypatch)
+    monkeypatch.setattr(refinement, "ROUGH", ("servo_play",))
+    assert refinement._over_roughness(made, fit) is fit
