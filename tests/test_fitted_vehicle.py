@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from coax_env.diagnosis.findings import stated_std
+from coax_env.diagnosis.problem import Fit
 from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step, with_timing
 from coax_env.estimation.helicopter import HeliModel
-from coax_env.estimation.state_space import FreeParameter, Record
+from coax_env.estimation.state_space import FreeParameter, Noise, Record
 from coax_env.logs.flight import Flight
 from coax_env.model.vehicle_file import load_vehicle
 
@@ -45,3 +47,16 @@ def test_the_usual_step_is_the_median_over_all_runs():
         return Record("run", dt * np.arange(n), np.zeros((n, 4)), np.zeros((n, 1)))
 
     assert median_step([record(0.01, 50), record(0.04, 20)]) == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("battery_sag.rate", 0.002, np.hypot(3e-6, 2e-5)),  # no form is right to better than 1 %
+        ("gyro_bias.x", 1e-4, np.hypot(3e-6, 1e-6)),
+        ("mass", 0.8, 3e-6),  # the vehicle's own are what they are
+    ],
+)
+def test_an_effects_number_is_as_unsure_as_its_form(name, value, expected):
+    fit = Fit((), {name: value}, Noise({}))
+    assert stated_std(fit, FreeParameter(name, 0.0, 1.0), 3e-6, 1.0, 0.01) == pytest.approx(expected)
