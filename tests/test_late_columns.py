@@ -58,6 +58,7 @@ def test_what_is_written_late_is_read_as_if_it_were_not(tmp_path):
     assert np.isnan(found.measured["q"][N - 2 :]).all()
     assert_allclose(found.measured["pn"], run.measured["pn"], atol=1e-8)
     assert "runs in which q was written 0.02 s late, moved back: 1" in flight.notes
+    assert flight.counts["late readings of q without a row of their own, left out"] == 2
     assert all(any(name in note for note in flight.notes) for name in (*COMMANDS, "battery_v"))
 
 

@@ -39,7 +39,10 @@ def in_their_place(log: Repaired, late: Mapping[str, float], counts: Counter[str
         counts[f"runs in which {BATTERY} was written {late[BATTERY]:g} s late, moved back"] += 1
     measured = dict(log.measured)
     for channel in measured.keys() & late.keys():
-        measured[channel] = _moved_back(t, measured[channel], late[channel])
+        measured[channel] = _moved_back(t, log.measured[channel], late[channel])
+        gone = np.isfinite(log.measured[channel]).sum() - np.isfinite(measured[channel]).sum()
+        if gone:
+            counts[f"late readings of {channel} without a row of their own, left out"] += int(gone)
         counts[f"runs in which {channel} was written {late[channel]:g} s late, moved back"] += 1
     return replace(log, command=command, measured=measured, battery=battery)
 
