@@ -34,6 +34,7 @@ RUNS = (RUN, "lon_doublet")
 FIRST, RATE = 400, 100
 """First row at fault, and rows per second of the bundled flight."""
 
+
 def edited(folder: Path, change: Callable[[Table], None], run: str = RUN) -> Flight:
     """RUNS of the bundled flight, or the one in the folder, with a run's CSV changed cell by cell."""
     if not folder.exists():

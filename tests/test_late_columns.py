@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from csv_edits import Table, rewrite
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -94,14 +95,13 @@ def test_latitude_and_longitude_may_be_late(tmp_path):
     run = a_run(0.01 * np.arange(N), np.random.default_rng(5))
     north = np.sin(0.02 * np.arange(N)) + run.measured["pn"]
     write_flight(Flight("lama400d", (run,)), tmp_path)
-    (csv,) = tmp_path.glob("*.csv")
-    head, *rows = csv.read_text().splitlines()
-    head = head.replace("pn", "gone")
-    rows = [
-        f"{row},{x / 111_320.0:.12f},{0.0001 * k:.9f}"
-        for k, (row, x) in enumerate(zip(rows, north, strict=True))
-    ]
-    csv.write_text("\n".join([f"{head},gps_lat,gps_lon", *rows]) + "\n")
+
+    def as_places(table: Table) -> None:
+        table["gone"] = table.pop("pn")
+        table["gps_lat"] = [f"{x / 111_320.0:.12f}" for x in north]
+        table["gps_lon"] = [f"{0.0001 * k:.9f}" for k in range(N)]
+
+    rewrite(tmp_path.glob("*.csv"), as_places)
     card = tmp_path / "card.toml"
 
     def read(late: str) -> Any:

@@ -313,7 +313,7 @@ def test_a_correlation_is_with_what_the_command_did_in_the_twentieth_before():
 
 @pytest.mark.parametrize(("answered", "said"), [(0.0, False), (0.3, True)])
 def test_what_a_pilot_does_about_lasting_innovations_is_no_answer_of_the_model(answered, said):
-    """Innovations of a memory of 0.2 s, to which the stick goes 20 ms late: what comes 50 ms after the
+    """Innovations of a memory of 0.2 s, to which the stick goes 20 ms late: what comes 0.1 s after the
     stick's move was there before it. An answer of the machine beyond that is found all the same."""
     rng = np.random.default_rng(8)
     t = 3.0 + 0.02 * np.arange(4000)

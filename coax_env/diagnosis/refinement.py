@@ -15,6 +15,7 @@ some nats lower.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -143,6 +144,7 @@ def _of_parabola(problem: Problem, fit: Fit, quadratic: Quadratic, number: FreeP
     covariance = quadratic.covariance(quadratic.names)
     std, profile = math.sqrt(covariance[k, k]), covariance[k] / covariance[k, k]
 
+    @cache
     def moved(by: float) -> Fit:
         along = np.clip(quadratic.at + by * profile, quadratic.lower, quadratic.upper)
         there = fit.at(dict(zip(quadratic.names, along.tolist(), strict=True)))

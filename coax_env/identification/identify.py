@@ -15,6 +15,7 @@ import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
+from coax_env.estimation import late_commands
 from coax_env.estimation.engine import Engine, Estimate
 from coax_env.estimation.fitted_vehicle import (
     double_counting,
@@ -25,8 +26,6 @@ from coax_env.estimation.fitted_vehicle import (
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise
-from coax_env.estimation.late_commands import acting_sooner, written_late
-from coax_env.estimation.late_commands import remark as late_commands_remark
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.prediction import RunReplay, replay_runs
 from coax_env.estimation.quadratic import Quadratic
@@ -182,20 +181,23 @@ def _by_maximum_likelihood(
         raise InputError(
             f"vehicle {vehicle.name!r} has no parameter with a std: nothing to identify"
         )
-    report("estimating gusts and noise")
     bare = {**model.bare_values, **{f.name: f.value for f in free}}
     start = starting_noise(flight, vehicle)
-    first = fit_noise(engine, bare, start, fitted_levels(start))
-    found = own_numbers(engine, free, bare, first, report)
-    values = {**model.bare_values, **found.estimate.values}
-    late = written_late(engine, values, found.noise, report)
-    if late > 0.0:
-        report("estimating again with commands when they act")
-        engine = Engine(model, acting_sooner(engine.records, late))
+
+    def fitted(engine: Engine) -> tuple[Noise, OwnNumbers, dict[str, float]]:
+        """Noise of the model as given, its own numbers, and all values with these."""
         first = fit_noise(engine, bare, start, fitted_levels(start))
         found = own_numbers(engine, free, bare, first, report)
-        values = {**model.bare_values, **found.estimate.values}
-        known = (*known, late_commands_remark(late))
+        return first, found, {**model.bare_values, **found.estimate.values}
+
+    report("estimating gusts and noise")
+    first, found, values = fitted(engine)
+    late = late_commands.written_late(engine, values, found.noise, report)
+    if late > 0.0:
+        report("estimating again with commands when they act")
+        engine = Engine(model, late_commands.acting_sooner(engine.records, late))
+        first, found, values = fitted(engine)
+        known = (*known, late_commands.remark(late))
     _, lin = engine.linearise(values, found.noise, found.free)
     quadratic = Quadratic.of(lin, found.free, values)
     names = [f.name for f in found.free]
@@ -205,7 +207,7 @@ def _by_maximum_likelihood(
     dt = median_step(engine.records)
     after = _identified_vehicle(vehicle, found, inflation, apart, dt, flight)
     report("flying the runs open loop")
-    again = Engine(model, acting_sooner([record_of(run) for run in held.runs], late))
+    again = Engine(model, late_commands.acting_sooner([record_of(run) for run in held.runs], late))
     return Identification(
         held,
         vehicle,

@@ -29,21 +29,27 @@ def in_their_place(log: Repaired, late: Mapping[str, float], counts: Counter[str
     """
     t = log.t
     command = log.command.copy()
+    moved = []
     for k, name in enumerate((*ROTOR_COMMANDS, *SWASH_COMMANDS)):
         if name in late:
             command[:, k] = row_means(t, command[:, k], late[name])
-            counts[f"runs in which {name} was written {late[name]:g} s late, moved back"] += 1
+            moved.append(name)
     battery = log.battery
     if battery is not None and BATTERY in late:
         battery = row_means(t, battery, late[BATTERY])
-        counts[f"runs in which {BATTERY} was written {late[BATTERY]:g} s late, moved back"] += 1
+        moved.append(BATTERY)
     measured = dict(log.measured)
-    for channel in measured.keys() & late.keys():
-        measured[channel] = _moved_back(t, log.measured[channel], late[channel])
-        gone = np.isfinite(log.measured[channel]).sum() - np.isfinite(measured[channel]).sum()
-        if gone:
-            counts[f"late readings of {channel} without a row of their own, left out"] += int(gone)
-        counts[f"runs in which {channel} was written {late[channel]:g} s late, moved back"] += 1
+    for channel, readings in log.measured.items():
+        if channel in late:
+            measured[channel] = _moved_back(t, readings, late[channel])
+            moved.append(channel)
+            gone = np.isfinite(readings).sum() - np.isfinite(measured[channel]).sum()
+            if gone:
+                counts[f"late readings of {channel} without a row of their own, left out"] += int(
+                    gone
+                )
+    for name in moved:
+        counts[f"runs in which {name} was written {late[name]:g} s late, moved back"] += 1
     return replace(log, command=command, measured=measured, battery=battery)
 
 
