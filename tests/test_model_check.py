@@ -19,7 +19,8 @@ from coax_env.diagnosis.model_check import (
     ModelCheck,
     _about,
     _answers,
-    _correlation,
+    _changes_before,
+    _correlations,
     _late_rows,
     _power,
     _rows_ahead,
@@ -289,6 +290,13 @@ def test_a_bands_power_is_that_of_its_frequencies():
     assert _power(passed(few, t), c, 0.0, 25.0).size == 0
 
 
+def correlations(*runs):
+    """Of the pitch rate's innovations with changes of the longitudinal swash, by lag; their number."""
+    changes = [_changes_before(run.record) for run in runs]
+    found, count = _correlations(runs, changes, CHANNELS.index("q"))
+    return dict(zip(LAGS, found[2], strict=True)), count
+
+
 def test_a_correlation_is_with_what_the_command_did_in_the_twentieth_before():
     """Innovations that are that change, lag seconds late, of one run; nothing in the other."""
     rng = np.random.default_rng(6)
@@ -296,16 +304,14 @@ def test_a_correlation_is_with_what_the_command_did_in_the_twentieth_before():
     command = np.zeros((t.size, 4))
     command[:, 2] = np.cumsum(rng.standard_normal(t.size))
     late = np.roll(np.diff(command[:, 2], prepend=0.0), 10)
-    found, c = {}, CHANNELS.index("q")
-    for lag in LAGS:
-        found[lag], count = _correlation([passed(late, t, command)], c, 2, lag)
-        assert count == 1000 - 101
+    found, count = correlations(passed(late, t, command))
+    assert count == 1000 - 101
     assert found[0.2] == pytest.approx(1.0, abs=0.02)  # white ones are foretold a little by chance
     assert max(abs(v) for lag, v in found.items() if lag != 0.2) < 0.15
     half = [passed(late, t, command), passed(np.where(t < 0, 1.0, 0.0), t, command)]
-    value, count = _correlation(half, c, 2, 0.2)
-    assert value == pytest.approx(1.0 / math.sqrt(2.0), abs=0.05) and count == 2 * 899
-    assert _correlation([passed(late, t, 0.0 * command)], c, 2, 0.2)[0] == 0.0
+    of_half, count = correlations(*half)
+    assert of_half[0.2] == pytest.approx(1.0 / math.sqrt(2.0), abs=0.05) and count == 2 * 899
+    assert correlations(passed(late, t, 0.0 * command))[0][0.2] == 0.0
     (entry,) = _answers([passed(late, t, command)])
     assert entry.pop("correlation") == pytest.approx(1.0, abs=0.02)
     assert entry == {"channel": "q", "command": "longitudinal swash", "lag_s": 0.2}
@@ -322,7 +328,7 @@ def test_what_a_pilot_does_about_lasting_innovations_is_no_answer_of_the_model(a
     command = np.zeros((t.size, 4))
     command[:, 2] = stick
     e = pushed + answered * np.roll(np.diff(stick, prepend=0.0), 5)
-    found, _ = _correlation([passed(e, t, command)], CHANNELS.index("q"), 2, 0.1)
+    found = correlations(passed(e, t, command))[0][0.1]
     plain = np.corrcoef(e[110:], (np.roll(stick, 5) - np.roll(stick, 6))[110:])[0, 1]
     assert abs(plain) > 0.1 and (abs(found) > 0.1) == said
 
@@ -331,9 +337,11 @@ def test_what_a_pilot_does_about_lasting_innovations_is_no_answer_of_the_model(a
 def test_a_weak_answer_is_said_from_where_it_is_no_chance(size, said, monkeypatch):
     """Of 900 readings a correlation of 0.142 is once in 10^5 by chance."""
     assert norm.isf(1e-5) / math.sqrt(900) == pytest.approx(0.142, abs=0.001)
-    monkeypatch.setattr(
-        model_check_module, "_correlation", lambda passes, c, k, lag: (-size * (k == 1 and c == 4), 900)
-    )  # fmt: skip
+
+    def found(passes, changes, c):
+        return np.where(np.arange(4)[:, None] == 1, -size * (c == 4), np.zeros((4, len(LAGS)))), 900
+
+    monkeypatch.setattr(model_check_module, "_correlations", found)
     assert bool(list(_answers([]))) == said
 
 

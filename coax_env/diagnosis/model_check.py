@@ -271,30 +271,47 @@ def _power(run: RunPass, c: int, low: float, high: float) -> np.ndarray:
 
 def _answers(passes: Sequence[RunPass]) -> Iterable[dict[str, Any]]:
     """Channels whose innovations follow a command, and after what time most."""
+    changes = [_changes_before(run.record) for run in passes]
     for c, channel in enumerate(CHANNELS):
-        for k, command in enumerate(COMMANDS):
-            found = [(_correlation(passes, c, k, lag), lag) for lag in LAGS]
-            (correlation, count), lag = max(found, key=lambda f: abs(f[0][0]))
-            by_chance = norm.isf(CHANCE) / math.sqrt(max(count, 1))
-            if abs(correlation) > max(CORRELATED, by_chance):
+        found, count = _correlations(passes, changes, c)
+        by_chance = norm.isf(CHANCE) / math.sqrt(max(count, 1))
+        for command, of_command in zip(COMMANDS, found, strict=True):
+            most = int(np.argmax(np.abs(of_command)))
+            if abs(of_command[most]) > max(CORRELATED, by_chance):
                 yield {
                     "channel": channel,
                     "command": command,
-                    "lag_s": lag,
-                    "correlation": round(correlation, 3),
+                    "lag_s": LAGS[most],
+                    "correlation": round(float(of_command[most]), 3),
                 }
 
 
-def _correlation(passes: Sequence[RunPass], c: int, k: int, lag: float) -> tuple[float, int]:
-    """Correlation of a channel's innovations, beyond their own past, with a command's change before;
-    and their number."""
-    e, moved = [], []
-    for run in passes:
+def _correlations(
+    passes: Sequence[RunPass], changes: Sequence[np.ndarray], c: int
+) -> tuple[np.ndarray, int]:
+    """Correlations of a channel's innovations, beyond their own past, with each command's changes
+    before them, (4, lags); and their number.
+
+    Args:
+        passes: of the runs. changes: `_changes_before` of each. c: the channel's place.
+    """
+    e, before = [], []
+    for run, change in zip(passes, changes, strict=True):
         t = run.record.t
-        command = run.record.command[:, k]
-        earlier = np.interp(t - lag, t, command) - np.interp(t - lag - LAGS[0], t, command)
         there = (t > t[0] + SEEN) & np.isfinite(run.innovations[:, c])
         e.append(beyond_its_past(run.innovations[there, c]))
-        moved.append(earlier[there])
-    innovations, changes = np.concatenate(e), np.concatenate(moved)
-    return correlation(innovations, changes), innovations.size
+        before.append(change[..., there])
+    innovations = np.concatenate(e)
+    found = np.apply_along_axis(correlation, 2, np.concatenate(before, axis=2), innovations)
+    return found, innovations.size
+
+
+def _changes_before(record: Record) -> np.ndarray:
+    """Each command's change over the first of LAGS, LAGS before each row, (4, lags, n)."""
+    t = record.t
+    return np.array(
+        [
+            [np.interp(t - lag, t, u) - np.interp(t - lag - LAGS[0], t, u) for lag in LAGS]
+            for u in record.command.T
+        ]
+    )

@@ -19,6 +19,7 @@ shaking, it would colour every innovation of attitude and height. So it is taken
 first, segment by segment, and the search sees what is left.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -46,6 +47,7 @@ SMEAR = 0.01
 """Part of the amplitude that phase errors within a segment and clipped peaks take away (measured)."""
 SLIPS = np.linspace(0.985, 1.015, 13)
 """Speeds over the commanded ones that are tried where none is measured: a bench line's error; ours."""
+AT_ONCE = 64  # seconds whose waves are made at once: a megabyte at 100 Hz; ours
 SHOWS = 2.0  # times its neighbours that a line's power must be for a channel to be said to show it
 
 
@@ -100,8 +102,8 @@ def taken_out(flight: Flight, lines: Sequence[Line]) -> Flight:
         for line in lines:
             for channel in (c for c in KINDS[line.kind] if c in measured):
                 values = measured[channel].copy()
-                for second, readings in _Turning(run, line.rotor, line.slip).segments(channel):
-                    values[second.rows] -= second.line(readings)
+                for seconds, readings in _Turning(run, line.rotor, line.slip).segments(channel):
+                    values[seconds.rows] -= seconds.line(readings)
                 measured[channel] = values
         runs.append(replace(run, measured=measured))
     return replace(flight, runs=tuple(runs))
@@ -124,62 +126,55 @@ def without(vehicle: Vehicle) -> Vehicle:
     return replace(vehicle, effects=rest)
 
 
-# --- one segment ------------------------------------------------------------------------------------
+# --- segments ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Second:
-    """Rows of a run, within a second, that a channel or several have readings at.
+class _Seconds:
+    """Seconds of a run in which a channel or several have n readings each.
 
-    t: their times, azimuth: of the rotor then. ahead: how much faster the other rotor turns [Hz].
+    rows: theirs, (s, n). t: their times in the second, azimuth: of the rotor then. ahead: how much
+    faster the other rotor turns in each second, (s,) [Hz]. resolved: whether the readings are more than
+    two per turn of the rotor, by a turn in all. Nearer to two its sine is hardly read, and one reading
+    that is off is a line.
     """
 
     rows: np.ndarray
     t: np.ndarray
     azimuth: np.ndarray
-    ahead: float
-
-    @property
-    def resolved(self) -> bool:
-        """Whether the readings are more than two per turn of the rotor, by a turn in all.
-
-        Nearer to two its sine is hardly read, and one reading that is off is a line.
-        """
-        turns = (self.azimuth[-1] - self.azimuth[0]) / (2.0 * np.pi)
-        return bool(2.0 * (turns + 1.0) < self.t.size - 1)
+    ahead: np.ndarray
+    resolved: bool
 
     def _waves(self, beside: np.ndarray) -> np.ndarray:
-        """Sines and cosines beside the rotor's frequency by so much (f,) [Hz], shape (f, 2, n)."""
-        angle = self.azimuth + 2.0 * np.pi * beside[:, None] * self.t
-        return np.stack([np.sin(angle), np.cos(angle)], axis=1)
-
-    def _trend(self) -> np.ndarray:
-        return np.vander(self.t / SEGMENT, TREND + 1)
+        """Sines and cosines beside the rotor's frequency by so much (f,) [Hz], shape (s, f, 2, n)."""
+        angle = self.azimuth[:, None] + 2.0 * np.pi * beside[:, None] * self.t[:, None]
+        return np.stack([np.sin(angle), np.cos(angle)], axis=2)
 
     @cached_property
     def _beyond_trend(self) -> tuple[np.ndarray, np.ndarray]:
-        """Waves at the rotor's frequency and its NEIGHBOURS without their trend, (f, 2, n), and the
-        inverse of their products, (f, 2, 2).
+        """Waves at the rotor's frequency and its NEIGHBOURS without their trend, (s, f, 2, n), and the
+        inverse of their products, (s, f, 2, 2).
         """
-        trend, _ = np.linalg.qr(self._trend())
+        powers = (self.t[..., None] / SEGMENT) ** np.arange(TREND + 1)
+        trend = np.linalg.qr(powers)[0][:, None]
         waves = self._waves(np.array([0.0, *NEIGHBOURS]))
-        waves -= (waves @ trend) @ trend.T
-        products = waves @ waves.transpose(0, 2, 1)
+        waves -= (waves @ trend) @ trend.swapaxes(2, 3)
+        products = waves @ waves.swapaxes(2, 3)
         return waves, np.linalg.pinv(products, hermitian=True, rcond=1e-9)
 
     def powers(self, y: np.ndarray) -> np.ndarray:
-        """Sums of squares of readings (n,) that waves explain beyond the trend, (f,): at the rotor's
-        frequency, then at its NEIGHBOURS.
+        """Sums of squares of readings (s, n) that waves explain beyond the trend: at the rotor's
+        frequency, then at its NEIGHBOURS, (s, f).
         """
         waves, inverse = self._beyond_trend
-        answer = waves @ y
-        return np.einsum("fi,fij,fj->f", answer, inverse, answer)
+        answer = waves @ y[:, None, :, None]
+        return np.asarray((answer.swapaxes(2, 3) @ inverse @ answer)[..., 0, 0])
 
     def line(self, y: np.ndarray) -> np.ndarray:
-        """The wave at the rotor's frequency itself in readings, (n,)."""
-        waves = self._waves(np.zeros(1))[0].T
-        fit = np.linalg.lstsq(np.column_stack([self._trend(), waves]), y, rcond=None)[0]
-        return waves @ fit[-2:]
+        """The wave at the rotor's frequency itself in readings (s, n), of that shape."""
+        waves, inverse = (part[:, 0] for part in self._beyond_trend)
+        sizes = inverse @ waves @ y[..., None]
+        return np.asarray((sizes.swapaxes(1, 2) @ self._waves(np.zeros(1))[:, 0])[:, 0])
 
 
 class _Turning:
@@ -191,10 +186,10 @@ class _Turning:
             slip * _speed(run, r) for r in (rotor, *(r for r in ROTORS if r != rotor))
         )
         self.azimuth = np.concatenate([[0.0], np.cumsum(self.speed[:-1] * np.diff(run.t))])
-        self._seconds: dict[bytes, list[_Second]] = {}
+        self._seconds: dict[bytes, list[_Seconds]] = {}
 
-    def segments(self, channel: str) -> Iterator[tuple[_Second, np.ndarray]]:
-        """The seconds in which a channel can show a line, with its readings (n,)."""
+    def segments(self, channel: str) -> Iterator[tuple[_Seconds, np.ndarray]]:
+        """The seconds in which a channel can show a line, with its readings (s, n)."""
         values = self.run.measured[channel]
         there = np.isfinite(values)
         if channel in ANGLES:
@@ -202,19 +197,25 @@ class _Turning:
         at = there.tobytes()
         if at not in self._seconds:
             self._seconds[at] = list(self._seconds_of(there))
-        for second in self._seconds[at]:
-            if channel in KINDS["amplitude"] or second.resolved:
-                yield second, values[second.rows]
+        for seconds in self._seconds[at]:
+            if channel in KINDS["amplitude"] or seconds.resolved:
+                yield seconds, values[seconds.rows]
 
-    def _seconds_of(self, there: np.ndarray) -> Iterator[_Second]:
-        t = self.run.t
-        which = np.floor((t - t[0]) / SEGMENT)
-        for k in np.unique(which):
-            rows = np.flatnonzero((which == k) & there)
-            if rows.size >= LEAST_SAMPLES:
-                ahead = float(np.median(self.other[rows] - self.speed[rows])) / (2.0 * np.pi)
-                middle = t[rows[0]] + 0.5 * SEGMENT
-                yield _Second(rows, t[rows] - middle, self.azimuth[rows], ahead)
+    def _seconds_of(self, there: np.ndarray) -> Iterator[_Seconds]:
+        rows = np.flatnonzero(there)
+        which = np.floor((self.run.t[rows] - self.run.t[0]) / SEGMENT)
+        alike = defaultdict(list)
+        for own in np.split(rows, np.flatnonzero(np.diff(which)) + 1):
+            if own.size >= LEAST_SAMPLES:
+                turns = (self.azimuth[own[-1]] - self.azimuth[own[0]]) / (2.0 * np.pi)
+                alike[own.size, bool(2.0 * (turns + 1.0) < own.size - 1)].append(own)
+        for (_, resolved), seconds in alike.items():
+            for k in range(0, len(seconds), AT_ONCE):
+                at = np.array(seconds[k : k + AT_ONCE])
+                t = self.run.t[at]
+                ahead = np.median(self.other[at] - self.speed[at], axis=1) / (2.0 * np.pi)
+                middle = t[:, :1] + 0.5 * SEGMENT
+                yield _Seconds(at, t - middle, self.azimuth[at], ahead, resolved)
 
 
 def _unwrapped(values: np.ndarray, there: np.ndarray) -> np.ndarray:
@@ -260,11 +261,10 @@ def _line_at(flight: Flight, rotor: str, kind: str, slip: float) -> Line | None:
             segments = list(turning.segments(channel))
             powers, level = _powers(segments)
             if level > 0.0:
-                ratio[channel] += [p / level for p in powers]
-                by_run[run.name] += [p / level for p in powers]
-                squares += [
-                    2.0 * (p - level) / y.size for p, (_, y) in zip(powers, segments, strict=True)
-                ]
+                ratio[channel] += (powers / level).tolist()
+                by_run[run.name] += (powers / level).tolist()
+                n = np.concatenate([np.full(len(y), y.shape[1]) for _, y in segments])
+                squares += (2.0 * (powers - level) / n).tolist()
     if len(squares) < 2:
         return None
     amplitude = float(np.sqrt(max(float(np.mean(squares)), 0.0)))
@@ -286,17 +286,17 @@ def _line_at(flight: Flight, rotor: str, kind: str, slip: float) -> Line | None:
     )
 
 
-def _powers(segments: Sequence[tuple[_Second, np.ndarray]]) -> tuple[list[float], float]:
-    """Each segment's power at the rotor's own frequency, and the mean power beside it.
+def _powers(segments: Sequence[tuple[_Seconds, np.ndarray]]) -> tuple[np.ndarray, float]:
+    """Each second's power at the rotor's own frequency, (s,), and the mean power beside it.
 
     Not where the other rotor's line is.
     """
-    powers, beside = [], []
-    for second, readings in segments:
-        own, *rest = second.powers(readings).tolist()
-        powers.append(own)
-        beside += [p for f, p in zip(NEIGHBOURS, rest, strict=True) if abs(f - second.ahead) > 1.0]
-    return powers, float(np.mean(beside)) if beside else 0.0
+    if not segments:
+        return np.empty(0), 0.0
+    powers = np.concatenate([seconds.powers(readings) for seconds, readings in segments])
+    ahead = np.concatenate([seconds.ahead for seconds, _ in segments])
+    beside = powers[:, 1:][np.abs(np.array(NEIGHBOURS) - ahead[:, None]) > 1.0]
+    return powers[:, 0], float(beside.mean()) if beside.size else 0.0
 
 
 def _steady_evidence(ratios: Sequence[float]) -> float:
