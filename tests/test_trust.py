@@ -228,7 +228,7 @@ def line_of(ratios: dict[str, list[float]]) -> Line:
     every = [r for own in ratios.values() for r in own]
     F = float(np.mean(every))
     nats = len(every) * (F - 1.0 - math.log(F))
-    return Line("amplitude", "upper", 1.0, 0.3, 0.01, nats, nats, ("ax",), ratios)
+    return Line("amplitude", "upper", 1, 1.0, 0.3, 0.01, nats, nats, ("ax",), ratios, {})
 
 
 def test_a_line_in_every_run_is_sure_and_one_of_a_single_run_is_not():

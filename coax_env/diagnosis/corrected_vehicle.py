@@ -9,7 +9,7 @@ from coax_env.diagnosis.confounding import of_undecided
 from coax_env.diagnosis.findings import stated_std
 from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.vibration import Line
+from coax_env.diagnosis.vibration import Line, large
 from coax_env.estimation.engine import Engine, objective
 from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step
 from coax_env.estimation.quadratic import Quadratic
@@ -69,8 +69,8 @@ def corrected_vehicle(
     units = {p.name: p.unit for p in CATALOGUE["vibration"].parameters}
     return vehicle.with_parameters(
         {
-            f"vibration.{line.kind}": Parameter(line.amplitude, line.std, units[line.kind], source)
-            for line in lines
+            f"vibration.{kind}": Parameter(amplitude, std, units[kind], source)
+            for kind, (amplitude, std) in large(lines).items()
         }
     )
 

@@ -11,7 +11,7 @@ from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.trust import Trust, of_line
-from coax_env.diagnosis.vibration import Line
+from coax_env.diagnosis.vibration import Line, large
 from coax_env.estimation.changing_model import BEFORE
 from coax_env.estimation.fitted_vehicle import with_timing
 from coax_env.estimation.helicopter_noise import level_unit
@@ -90,7 +90,7 @@ def causes(
             earlier = {f.name: known.get(of_part(f.name, BEFORE)) for f in last}
             entries[-1]["since"] = onsets[effect].entry()
             entries[-1]["before"] = {n: number(f, factor) for n, f in earlier.items() if f}
-    if lines:
+    if large(lines):
         entries.append(_vibration(lines))
     return _in_order(mixtures_as_one(entries))
 
@@ -156,21 +156,23 @@ def stated_std(
 def _vibration(lines: Sequence[Line]) -> dict[str, Any]:
     """The cause that is found by its lines and not by a signature."""
     units = {p.name: p.unit for p in effects.CATALOGUE["vibration"].parameters}
+    sizes = large(lines)
+    own = [line for line in lines if line.kind in sizes]
     return {
         "effect": "vibration",
         "parameters": {
-            f"vibration.{line.kind}": {
-                "value": line.amplitude,
-                "std": line.std,
-                "unit": units[line.kind],
+            f"vibration.{kind}": {
+                "value": amplitude,
+                "std": std,
+                "unit": units[kind],
                 "determined": True,
             }
-            for line in lines
+            for kind, (amplitude, std) in sizes.items()
         },
-        "evidence": sum(line.evidence for line in lines),
+        "evidence": sum(line.evidence for line in own),
         "confusable_with": [],
-        "channels": [c for line in lines for c in line.channels],
-        **of_line(max(lines, key=lambda line: line.evidence)).entries(),
+        "channels": list(dict.fromkeys(c for line in own for c in line.channels)),
+        **of_line(max(own, key=lambda line: line.evidence)).entries(),
     }
 
 

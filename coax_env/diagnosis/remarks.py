@@ -58,12 +58,15 @@ def vibration_removed(lines: Sequence[Line]) -> str:
     """That a vibration was taken out of the readings."""
     units = {p.name: p.unit for p in CATALOGUE["vibration"].parameters}
     sizes = ", ".join(
-        f"{' '.join(line.channels)} by {line.amplitude:.2g} {units[line.kind]}" for line in lines
+        f"{' '.join(line.channels)} by {line.amplitude:.2g} {units[line.kind]}"
+        f" {TIMES[line.order]} a turn of the {line.rotor} rotor"
+        for line in lines
     )
-    return (
-        f"the body shakes at the {lines[0].rotor} rotor's speed: {sizes};"
-        " that line was taken out of these readings before anything else was looked for"
-    )
+    return f"the body shakes: {sizes}; that was taken out before anything else was looked for"
+
+
+TIMES = {1: "once", 2: "twice", 3: "three times", 4: "four times"}
+"""Orders of a line, in words."""
 
 
 def lost_in_noise(gain: Mapping[str, Any] | None) -> list[str]:

@@ -1,53 +1,63 @@
-"""Vibration: a line at rotor speed, and its aliases, in what the body shakes.
+"""Vibration: lines at multiples of the rotor speeds, and their aliases, in what the body shakes.
 
-Its phase drifts with every error of the rotor speed, so it has no signature over a run as other
-effects have. It is looked for in the readings themselves, order-tracked: in segments of a second the
-readings are fitted with sine and cosine of the rotor's azimuth, the phase free in each, at the times
-of the samples, so that aliases need no thought (Fyfe and Munck 1997 for the order tracking; the
-least-squares periodogram of Lomb 1976 for uneven times). The power there is compared with that at
-neighbouring frequencies of the same segments: noise that is merely louder than assumed is louder
-there too, and is no vibration. Where no rotor speed is measured, the commanded one is taken, times the
-one factor near 1 with which the line is strongest.
+A rotor out of balance shakes it once a turn, two to four blades that pass as often as that, and either
+rotor does. The phase drifts with every error of the rotor speed, so there is no signature over a run
+as other effects have. Lines are looked for in the readings themselves, with the phase free in each
+second (order_tracking.py), at the times of the samples, so that aliases need no thought. The power
+there is compared with that at neighbouring frequencies of the same seconds: noise that is merely louder
+than assumed is louder there too, and is no vibration. Where no rotor speed is measured, the commanded
+one is taken, times the one factor near 1 with which the line is strongest.
 
-Accelerometers are shaken far beyond what the body moves, so that there an alias is a line as well.
-Gyros and poses are not: below half of their readings' rate all is motion, and what looks like an alias
-is that.
+The strongest line of each kind of sensor comes first; it is taken out, and the next is looked for in
+what is left, until there is none.
+
+Accelerometers are shaken far beyond what the body moves, and gyros where it cannot follow, so that
+there an alias is a line as well where it does not lie among the motion. In a tracked pose all below
+half of its rate is motion, and what looks like an alias is that.
 
 This comes before the search. A line of usual size would make every accelerometer reading look several
 sigmas off, and something else would be blamed for it; in a tracked pose, whose noise is far below the
 shaking, it would colour every innovation of attitude and height. So it is taken out of the readings
-first, segment by segment, and the search sees what is left.
+first, second by second, and the search sees what is left.
 """
 
+import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 
 import numpy as np
 
+from coax_env.diagnosis.order_tracking import (
+    NEAREST,
+    NEIGHBOURS,
+    ROTORS,
+    Part,
+    Turning,
+    fitted,
+    is_measured,
+    parts,
+)
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter_noise import SHAKEN
-from coax_env.logs.flight import Flight, Run
+from coax_env.logs.flight import Flight
 from coax_env.model.effects import CATALOGUE
-from coax_env.model.layout import ANGLES
 from coax_env.model.vehicle import Vehicle
 
 KINDS = {
     kind: tuple(c for c in SHAKEN if SHAKEN[c] == kind) for kind in dict.fromkeys(SHAKEN.values())
 }
 """Parameter of the effect -> channels that share it as their root mean square."""
-ROTORS = ("upper", "lower")
-SEGMENT = 1.0  # s
-LEAST_SAMPLES = 12  # of a channel in a segment
-TREND = 3  # order of the polynomial that stands for the motion within a segment
-NEIGHBOURS = (-5.0, -4.0, -3.0, -2.0, 2.0, 3.0, 4.0, 5.0)
-"""Frequencies beside the line [Hz]; those nearer than 1 Hz to the other rotor's are left out."""
+MOTION = {"amplitude": 5.0, "rate": 15.0, "tilt": math.inf, "heave": math.inf}
+"""Frequency [Hz] up to which sensors of a kind read motion, and an alias is not told from it; ours. A
+pose is all motion; what a body shakes in it faster than half its rate is too small to see."""
+ORDERS = (1, 2, 3, 4)
+"""Cycles a turn: a rotor out of balance, and two to four blades."""
 SMEAR = 0.01
 """Part of the amplitude that phase errors within a segment and clipped peaks take away (measured)."""
 SLIPS = np.linspace(0.985, 1.015, 13)
 """Speeds over the commanded ones that are tried where none is measured: a bench line's error; ours."""
-AT_ONCE = 64  # seconds whose waves are made at once: a megabyte at 100 Hz; ours
 SHOWS = 2.0  # times its neighbours that a line's power must be for a channel to be said to show it
 
 
@@ -55,15 +65,17 @@ SHOWS = 2.0  # times its neighbours that a line's power must be for a channel to
 class Line:
     """A line found in one kind of channels.
 
-    kind: a key of KINDS. rotor: at whose speed, times slip. amplitude: root mean square over the
-    channels, in their unit, with its std. evidence: nats. steady: nats of all channels, or of the one
-    that shows it best, by their median segment: a rotor shakes in all of them. channels: where it
-    shows, strongest first.
-    ratios: run -> power over its neighbours', segment by segment.
+    kind: a key of KINDS. rotor: at whose speed, times slip; order: of ORDERS. amplitude: root mean
+    square over the channels, in their unit, with its std. evidence: nats. steady: nats of all
+    channels, or of the one that shows it best, by their median second: a rotor shakes in all of
+    them. channels: where it shows, strongest first.
+    ratios: run -> power over its neighbours', second by second. beside: (run, channel) -> mean power
+    of these.
     """
 
     kind: str
     rotor: str
+    order: int
     slip: float
     amplitude: float
     std: float
@@ -71,40 +83,88 @@ class Line:
     steady: float
     channels: tuple[str, ...]
     ratios: Mapping[str, Sequence[float]]
+    beside: Mapping[tuple[str, str], float]
 
     def evidence_of(self, ratios: Sequence[float]) -> float:
-        """Evidence [nats] of some of the segments alone."""
+        """Evidence [nats] of some of the seconds alone."""
         return _evidence(ratios) if ratios else 0.0
+
+    @property
+    def place(self) -> tuple[str, str, int]:
+        """Which of all that may be looked for."""
+        return self.kind, self.rotor, self.order
+
+    def is_no_chance(self, tries: int = 1) -> bool:
+        """Whether there is one, in most seconds, where so many were tried in its place."""
+        return min(self.evidence, self.steady) > SETTINGS.evidence + math.log(tries)
 
 
 def find(flight: Flight) -> tuple[Line, ...]:
-    """The lines at one of the two rotor speeds, where the flight has some that matter, by kind."""
+    """The lines at multiples of the rotor speeds that the flight has, however small, by kind."""
+    found: dict[tuple[str, str, int], Line] = {}
+    rest, asked = flight, set(KINDS)
+    while asked:
+        strongest = {}
+        slips = {x.rotor: x.slip for x in sorted(found.values(), key=lambda x: x.evidence)}
+        for line in sorted(_lines(rest, asked, slips), key=lambda x: x.evidence):
+            if line.place not in found:
+                strongest[line.kind] = line
+        found |= {line.place: line for line in strongest.values()}
+        asked = set(strongest)
+        rest = taken_out(flight, found.values())
+    return tuple(
+        _beside(flight, line, found.values())
+        for line in sorted(found.values(), key=lambda x: list(KINDS).index(x.kind))
+    )
+
+
+def _beside(flight: Flight, line: Line, every: Collection[Line]) -> Line:
+    """A line as it is without the others of its kind, if it still shows then."""
+    others = [other for other in every if other.kind == line.kind and other is not line]
+    if not others:
+        return line
+    again = _lines_at(taken_out(flight, others), line.rotor, line.slip, {line.kind})
+    return next((x for x in again if x.place == line.place and x.is_no_chance()), line)
+
+
+def large(lines: Sequence[Line]) -> dict[str, tuple[float, float]]:
+    """Amplitude of the lines of each kind, as of the one sine that shakes as strongly, and its std.
+
+    Of those kinds alone that shake enough to matter.
+    """
     smallest = {p.name: p.smallest for p in CATALOGUE["vibration"].parameters}
-
-    def of(rotor: str) -> tuple[Line, ...]:
-        lines = (_line(flight, rotor, kind) for kind in KINDS)
-        return tuple(
-            x
-            for x in lines
-            if x
-            and min(x.evidence, x.steady) > SETTINGS.evidence
-            and x.amplitude > smallest[x.kind]
-        )
-
-    return max(map(of, ROTORS), key=lambda lines: sum(x.evidence for x in lines))
+    found = {}
+    for kind in KINDS:
+        own = [line for line in lines if line.kind == kind]
+        amplitude = math.hypot(*(line.amplitude for line in own))
+        if amplitude > smallest[kind]:
+            std = math.hypot(*(line.amplitude * line.std for line in own)) / amplitude
+            found[kind] = amplitude, std
+    return found
 
 
-def taken_out(flight: Flight, lines: Sequence[Line]) -> Flight:
-    """The flight without the lines in its readings."""
+def taken_out(flight: Flight, lines: Collection[Line]) -> Flight:
+    """The flight without the lines in its readings, all of a kind fitted together."""
     runs = []
     for run in flight.runs:
         measured = dict(run.measured)
-        for line in lines:
-            for channel in (c for c in KINDS[line.kind] if c in measured):
-                values = measured[channel].copy()
-                for seconds, readings in _Turning(run, line.rotor, line.slip).segments(channel):
-                    values[seconds.rows] -= seconds.line(readings)
-                measured[channel] = values
+        for kind in dict.fromkeys(line.kind for line in lines):
+            own = [line for line in lines if line.kind == kind]
+            turning = {(x.rotor, x.slip): Turning(run, x.rotor, x.slip) for x in own}
+            for channels, alike in groupby(parts(run, KINDS[kind]), lambda part: part.channels):
+                noise = [
+                    0.5 * min(x.beside.get((run.name, c), math.inf) for x in own) for c in channels
+                ]
+                some = list(alike)
+                angles = [
+                    [turning[x.rotor, x.slip].angle(part, x.order, MOTION[kind]) for x in own]
+                    for part in some
+                ]
+                explained = fitted(some, angles, np.array(noise))
+                for c, channel in enumerate(channels):
+                    measured[channel] = measured[channel].copy()
+                    for part, shaken in zip(some, explained, strict=True):
+                        measured[channel][part.rows] -= shaken[:, c]
         runs.append(replace(run, measured=measured))
     return replace(flight, runs=tuple(runs))
 
@@ -126,177 +186,114 @@ def without(vehicle: Vehicle) -> Vehicle:
     return replace(vehicle, effects=rest)
 
 
-# --- segments ---------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Seconds:
-    """Seconds of a run in which a channel or several have n readings each.
-
-    rows: theirs, (s, n). t: their times in the second, azimuth: of the rotor then. ahead: how much
-    faster the other rotor turns in each second, (s,) [Hz]. resolved: whether the readings are more than
-    two per turn of the rotor, by a turn in all. Nearer to two its sine is hardly read, and one reading
-    that is off is a line.
-    """
-
-    rows: np.ndarray
-    t: np.ndarray
-    azimuth: np.ndarray
-    ahead: np.ndarray
-    resolved: bool
-
-    def _waves(self, beside: np.ndarray) -> np.ndarray:
-        """Sines and cosines beside the rotor's frequency by so much (f,) [Hz], shape (s, f, 2, n)."""
-        angle = self.azimuth[:, None] + 2.0 * np.pi * beside[:, None] * self.t[:, None]
-        return np.stack([np.sin(angle), np.cos(angle)], axis=2)
-
-    @cached_property
-    def _beyond_trend(self) -> tuple[np.ndarray, np.ndarray]:
-        """Waves at the rotor's frequency and its NEIGHBOURS without their trend, (s, f, 2, n), and the
-        inverse of their products, (s, f, 2, 2).
-        """
-        powers = (self.t[..., None] / SEGMENT) ** np.arange(TREND + 1)
-        trend = np.linalg.qr(powers)[0][:, None]
-        waves = self._waves(np.array([0.0, *NEIGHBOURS]))
-        waves -= (waves @ trend) @ trend.swapaxes(2, 3)
-        products = waves @ waves.swapaxes(2, 3)
-        return waves, np.linalg.pinv(products, hermitian=True, rcond=1e-9)
-
-    def powers(self, y: np.ndarray) -> np.ndarray:
-        """Sums of squares of readings (s, n) that waves explain beyond the trend: at the rotor's
-        frequency, then at its NEIGHBOURS, (s, f).
-        """
-        waves, inverse = self._beyond_trend
-        answer = waves @ y[:, None, :, None]
-        return np.asarray((answer.swapaxes(2, 3) @ inverse @ answer)[..., 0, 0])
-
-    def line(self, y: np.ndarray) -> np.ndarray:
-        """The wave at the rotor's frequency itself in readings (s, n), of that shape."""
-        waves, inverse = (part[:, 0] for part in self._beyond_trend)
-        sizes = inverse @ waves @ y[..., None]
-        return np.asarray((sizes.swapaxes(1, 2) @ self._waves(np.zeros(1))[:, 0])[:, 0])
-
-
-class _Turning:
-    """A run with a rotor's azimuth; channels that are read at the same rows share their seconds."""
-
-    def __init__(self, run: Run, rotor: str, slip: float) -> None:
-        self.run = run
-        self.speed, self.other = (
-            slip * _speed(run, r) for r in (rotor, *(r for r in ROTORS if r != rotor))
-        )
-        self.azimuth = np.concatenate([[0.0], np.cumsum(self.speed[:-1] * np.diff(run.t))])
-        self._seconds: dict[bytes, list[_Seconds]] = {}
-
-    def segments(self, channel: str) -> Iterator[tuple[_Seconds, np.ndarray]]:
-        """The seconds in which a channel can show a line, with its readings (s, n)."""
-        values = self.run.measured[channel]
-        there = np.isfinite(values)
-        if channel in ANGLES:
-            values = _unwrapped(values, there)
-        at = there.tobytes()
-        if at not in self._seconds:
-            self._seconds[at] = list(self._seconds_of(there))
-        for seconds in self._seconds[at]:
-            if channel in KINDS["amplitude"] or seconds.resolved:
-                yield seconds, values[seconds.rows]
-
-    def _seconds_of(self, there: np.ndarray) -> Iterator[_Seconds]:
-        rows = np.flatnonzero(there)
-        which = np.floor((self.run.t[rows] - self.run.t[0]) / SEGMENT)
-        alike = defaultdict(list)
-        for own in np.split(rows, np.flatnonzero(np.diff(which)) + 1):
-            if own.size >= LEAST_SAMPLES:
-                turns = (self.azimuth[own[-1]] - self.azimuth[own[0]]) / (2.0 * np.pi)
-                alike[own.size, bool(2.0 * (turns + 1.0) < own.size - 1)].append(own)
-        for (_, resolved), seconds in alike.items():
-            for k in range(0, len(seconds), AT_ONCE):
-                at = np.array(seconds[k : k + AT_ONCE])
-                t = self.run.t[at]
-                ahead = np.median(self.other[at] - self.speed[at], axis=1) / (2.0 * np.pi)
-                middle = t[:, :1] + 0.5 * SEGMENT
-                yield _Seconds(at, t - middle, self.azimuth[at], ahead, resolved)
-
-
-def _unwrapped(values: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Angles without jumps of a turn, (n,)."""
-    values = values.copy()
-    values[there] = np.unwrap(values[there])
-    return values
-
-
-def _is_measured(run: Run, rotor: str) -> bool:
-    measured = run.measured.get(f"rpm_{rotor}")
-    return measured is not None and int(np.isfinite(measured).sum()) >= 2
-
-
-def _speed(run: Run, rotor: str) -> np.ndarray:
-    """Rotor speed at every row [rad/s]: as measured, else as commanded."""
-    if not _is_measured(run, rotor):
-        return run.command[:, ROTORS.index(rotor)]
-    measured = run.measured[f"rpm_{rotor}"]
-    there = np.isfinite(measured)
-    return np.interp(run.t, run.t[there], measured[there]) * (2.0 * np.pi / 60.0)
-
-
 # --- the test ---------------------------------------------------------------------------------------
 
 
-def _line(flight: Flight, rotor: str, kind: str = "amplitude") -> Line | None:
-    """The line at one rotor's speed in one kind of channels, however weak; None without them."""
-    if all(_is_measured(run, rotor) for run in flight.runs):
-        return _line_at(flight, rotor, kind, 1.0)
-    lines = [_line_at(flight, rotor, kind, float(slip)) for slip in SLIPS]
-    return max((x for x in lines if x), key=lambda x: x.evidence, default=None)
+def _lines(flight: Flight, kinds: Collection[str], slips: Mapping[str, float]) -> Iterator[Line]:
+    """All lines in some kinds of channels that are no chance, each at its best slip.
+
+    Args:
+        flight: in which. kinds: of channels. slips: of rotors, where they are known.
+    """
+    for rotor in ROTORS:
+        if all(is_measured(run, rotor) for run in flight.runs):
+            tried = [1.0]
+        else:
+            tried = [slips[rotor]] if rotor in slips else SLIPS.tolist()
+        best: dict[tuple[str, str, int], Line] = {}
+        for slip in tried:
+            for line in _lines_at(flight, rotor, slip, kinds):
+                other = best.get(line.place)
+                if other is None or line.evidence > other.evidence:
+                    best[line.place] = line
+        yield from (line for line in best.values() if line.is_no_chance(len(tried)))
 
 
-def _line_at(flight: Flight, rotor: str, kind: str, slip: float) -> Line | None:
-    """The line at the rotor's speed times a factor."""
-    ratio: dict[str, list[float]] = {c: [] for c in KINDS[kind]}  # power over the neighbours' mean
-    squares: list[float] = []  # amplitude squared, by segment and axis
-    by_run: dict[str, list[float]] = {run.name: [] for run in flight.runs}
+@dataclass
+class _Tally:
+    """What the seconds say of one line.
+
+    ratio: power over its neighbours' by channel, by_run: by run. beside: mean power of these by run and
+    channel. squares: amplitude squared, by second and axis. peak: what is more at the line than NEAREST
+    to it.
+    """
+
+    ratio: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    by_run: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    beside: dict[tuple[str, str], float] = field(default_factory=dict)
+    squares: list[float] = field(default_factory=list)
+    peak: np.ndarray = field(default_factory=lambda: np.zeros(NEAREST.size))
+
+
+def _lines_at(flight: Flight, rotor: str, slip: float, kinds: Collection[str]) -> Iterator[Line]:
+    """The lines at multiples of a rotor's speed times a factor, however weak, that are a peak there."""
+    tallies: dict[tuple[str, int], _Tally] = defaultdict(_Tally)
     for run in flight.runs:
-        turning = _Turning(run, rotor, slip)
-        for channel in (c for c in ratio if c in run.measured):
-            segments = list(turning.segments(channel))
-            powers, level = _powers(segments)
+        turning = Turning(run, rotor, slip)
+        powers: dict[tuple[str, int], list[_Powers]] = defaultdict(list)
+        for part in parts(run, [c for c, kind in SHAKEN.items() if kind in kinds]):
+            for channel, order, of_part in _powers(part, turning):
+                powers[channel, order].append(of_part)
+        for (channel, order), found in powers.items():
+            own, near, beside, count = map(np.concatenate, zip(*found, strict=True))
+            level = float(beside.mean()) if beside.size else 0.0
             if level > 0.0:
-                ratio[channel] += (powers / level).tolist()
-                by_run[run.name] += (powers / level).tolist()
-                n = np.concatenate([np.full(len(y), y.shape[1]) for _, y in segments])
-                squares += (2.0 * (powers - level) / n).tolist()
-    if len(squares) < 2:
-        return None
+                tally = tallies[SHAKEN[channel], order]
+                tally.peak += (own[:, None] - near).sum(0) / level
+                tally.ratio[channel] += (own / level).tolist()
+                tally.by_run[run.name] += (own / level).tolist()
+                tally.beside[run.name, channel] = level
+                tally.squares += (2.0 * (own - level) / count).tolist()
+    for (kind, order), tally in tallies.items():
+        if len(tally.squares) > 1 and tally.peak.min() > 0.0:
+            yield _line_of(kind, rotor, order, slip, tally)
+
+
+_Powers = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Power at a line in each second (s,), NEAREST to it (s, n), of NEIGHBOURS (any,); readings (s,)."""
+
+
+def _powers(part: Part, turning: Turning) -> Iterator[tuple[str, int, _Powers]]:
+    """The powers of each channel and order that some seconds can show.
+
+    Not where the other rotor's line is.
+    """
+    ahead, n = turning.ahead(part)[:, None], part.t.shape[1]
+    kinds = {SHAKEN[c] for c in part.channels}
+    shown = {(k, kind): turning.shows(part, k, MOTION[kind]) for k in ORDERS for kind in kinds}
+    orders = [k for k in ORDERS if any(shown[k, kind].any() for kind in kinds)]
+    powers = part.powers(turning.azimuth[part.rows], orders) if orders else np.empty(0)
+    for o, order in enumerate(orders):
+        apart = np.abs(NEIGHBOURS - order * ahead) > 1.0
+        for c, channel in enumerate(part.channels):
+            rows = shown[order, SHAKEN[channel]]
+            of_line = powers[rows, c, o]
+            own, near, beside = np.split(of_line, [1, 1 + NEAREST.size], axis=1)
+            count = np.full(len(of_line), float(n))
+            yield channel, order, (own[:, 0], near, beside[apart[rows]], count)
+
+
+def _line_of(kind: str, rotor: str, order: int, slip: float, tally: _Tally) -> Line:
+    squares = tally.squares
     amplitude = float(np.sqrt(max(float(np.mean(squares)), 0.0)))
     spread = float(np.std(squares, ddof=1) / np.sqrt(len(squares)))
     std = spread / max(2.0 * amplitude, float(np.sqrt(spread)))
-    shown = {c: float(np.mean(r)) for c, r in ratio.items() if r}
-    every = [r for own in ratio.values() for r in own]
+    shown = {c: float(np.mean(r)) for c, r in tally.ratio.items()}
+    every = [r for own in tally.ratio.values() for r in own]
     return Line(
         kind=kind,
         rotor=rotor,
+        order=order,
         slip=slip,
         amplitude=amplitude,
         std=float(np.hypot(std, SMEAR * amplitude)),
         evidence=_evidence(every),
-        steady=max(_steady_evidence(own) for own in (every, *ratio.values()) if own),
+        steady=max(map(_steady_evidence, (every, *tally.ratio.values()))),
         channels=tuple(sorted((c for c in shown if shown[c] > SHOWS), key=lambda c: -shown[c]))
         or tuple(shown),
-        ratios=by_run,
+        ratios=dict(tally.by_run),
+        beside=tally.beside,
     )
-
-
-def _powers(segments: Sequence[tuple[_Seconds, np.ndarray]]) -> tuple[np.ndarray, float]:
-    """Each second's power at the rotor's own frequency, (s,), and the mean power beside it.
-
-    Not where the other rotor's line is.
-    """
-    if not segments:
-        return np.empty(0), 0.0
-    powers = np.concatenate([seconds.powers(readings) for seconds, readings in segments])
-    ahead = np.concatenate([seconds.ahead for seconds, _ in segments])
-    beside = powers[:, 1:][np.abs(np.array(NEIGHBOURS) - ahead[:, None]) > 1.0]
-    return powers[:, 0], float(beside.mean()) if beside.size else 0.0
 
 
 def _steady_evidence(ratios: Sequence[float]) -> float:

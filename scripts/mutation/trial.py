@@ -96,6 +96,7 @@ OWN: dict[str, tuple[str, ...]] = {
         "tests/test_input_innovations.py",
     ),
     "coax_env/diagnosis/vibration.py": ("tests/test_vibration.py", "tests/test_unlisted.py"),
+    "coax_env/diagnosis/order_tracking.py": ("tests/test_vibration.py", "tests/test_unlisted.py"),
     "coax_env/diagnosis/calibration.py": ("tests/test_study.py",),
     "coax_env/diagnosis/*": (
         "tests/test_scores.py", "tests/test_diagnosis.py", "tests/test_unlisted.py",
