@@ -1,9 +1,11 @@
 """Readings at the end of a sensor's range are no readings; what only looks so stays."""
 
+import math
+
 import numpy as np
 import pytest
 
-from coax_env.logs.clipped import clipped
+from coax_env.logs.clipped import clipped, near_an_end
 
 RATE = 100.0  # rows/s
 T = np.arange(0.0, 10.0, 1.0 / RATE)
@@ -61,3 +63,23 @@ def test_chance_makes_no_end(seed):
     """White noise to three digits, as a gyro of a machine that stands has it."""
     rng = np.random.default_rng(seed)
     assert not clipped(np.round(0.02 * rng.standard_normal(4000), 3)).any()
+
+
+def test_beside_an_end_noise_takes_what_is_left_to_either_side():
+    """A gyro that passes its end slowly, in noise: by what is below the end it reads too little."""
+    t = np.arange(4000) / 100.0
+    true = 10.0 * np.sin(0.8 * t)
+    y = np.clip(true + 0.5 * np.random.default_rng(0).standard_normal(t.size), -9.0, 9.0)
+    y[::7] = np.nan
+    at_ends = clipped(y)
+    near = near_an_end(y, at_ends)
+    read = ~np.isnan(y)
+    off = np.sign(true) * (y - true)
+    slow = np.abs(np.abs(true) - 9.0) < 0.5
+    assert near[at_ends].all() and not near[~read].any()
+    assert np.mean(off[slow & ~at_ends & read]) < -0.25 and near[slow & read].all()
+    partly = (np.abs(true) > 7.0) & (np.abs(true) < 8.0) & ~near & read
+    assert abs(np.mean(off[partly])) < 3.0 * 0.5 / math.sqrt(np.count_nonzero(partly))
+    assert np.mean(near[np.abs(true) < 6.5]) == 0.0
+    low = near_an_end(y - 40.0, at_ends)  # ends at -49 and -31
+    np.testing.assert_array_equal(low, near)

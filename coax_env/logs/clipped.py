@@ -5,6 +5,7 @@ synthetic flight 5,000 nats, and made three causes that were not there.
 """
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from coax_env.logs.packets import stretches
 
@@ -17,6 +18,11 @@ LEAST_STEP = 0.5
 """Usual steps by which one of the two readings before, and of the two behind, is off the end; ours."""
 MOST = 0.5
 """Share of the readings that may be at the ends: what shows little else moves between them; ours."""
+BESIDE = 3  # readings before and behind one, by which it is known what it should be; ours
+NEAR = 3.0
+"""Std of the noise from an end, up to which readings are pulled away from it; ours."""
+STEP_OF_NOISE = 0.954
+"""Median step of white noise over its std: of a normal number times the root of 2."""
 
 
 def clipped(values: np.ndarray) -> np.ndarray:
@@ -57,3 +63,28 @@ def _is_reached(y: np.ndarray, end: float, abrupt: float) -> bool:
         and off[behind : behind + 2].max() >= abrupt
         for first, behind in stretches(y == end)
     )
+
+
+def near_an_end(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Where a reading is at an end of its range, or near it by those beside it, (n,) bool.
+
+    Near the end only those readings are left that noise took inward. Of a gyro that was there for a
+    fifth of a clean **synthetic** flight they made a scale of 25 nats. The reading itself must not
+    say: that would be an end, too.
+
+    Args:
+        values: (n,) readings, NaN where there is none. ends: (n,) where one is at an end.
+    """
+    found = np.zeros(values.size, bool)
+    present = np.flatnonzero(~np.isnan(values))
+    y, there = values[present], ends[present]
+    steps = np.abs(np.diff(y))
+    noise = float(np.median(steps[steps > 0.0])) / STEP_OF_NOISE
+    padded = np.pad(y, BESIDE, mode="edge")
+    around = np.delete(sliding_window_view(padded, 2 * BESIDE + 1), BESIDE, axis=1)
+    expected = np.median(around, axis=1)
+    for end in np.unique(y[there]):
+        inwards = np.sign(np.median(y) - end)
+        there = there | ((expected - end) * inwards < NEAR * noise)
+    found[present] = there
+    return found

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from coax_env.errors import InputError
-from coax_env.logs.clipped import clipped
+from coax_env.logs.clipped import clipped, near_an_end
 from coax_env.logs.coarse import at_changes
 from coax_env.logs.columns import advice, time_advice
 from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
@@ -204,12 +204,14 @@ def _without_broken_packets(
 def _without_clipped(
     data: Mapping[str, np.ndarray], counts: Counter[str]
 ) -> Mapping[str, np.ndarray]:
-    """With holes where a sensor reads an end of its range."""
+    """With holes where a sensor reads an end of its range, or would near it."""
     found = dict(data)
     for channel in CHANNELS:
         if channel in data and (ends := clipped(data[channel])).any():
-            counts[f"readings of {channel} at an end of its range, left out"] += int(ends.sum())
-            found[channel] = np.where(ends, np.nan, data[channel])
+            near = near_an_end(data[channel], ends)
+            told = f"readings of {channel} at an end of its range or near it, left out"
+            counts[told] += int(near.sum())
+            found[channel] = np.where(near, np.nan, data[channel])
     return found
 
 
