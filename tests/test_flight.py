@@ -1,17 +1,20 @@
 """The flight folder: what is read, what is repaired and counted, what is refused and how."""
 
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from bundled_flight import BUNDLED
+from csv_edits import Table, rewrite
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from shared_flights import read
 
 from coax_env.errors import InputError
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
-from coax_env.logs.outliers import are_answers, find_outliers, off_median
+from coax_env.logs.outliers import are_answers, find_miscounts, find_outliers, off_median
 from coax_env.logs.repairs import hold_last
 from coax_env.model.layout import RPM_PER_RAD_S
 
@@ -467,3 +470,32 @@ def read_or_refuse(flight: Path) -> None:
     else:
         assert np.isfinite(run.command).all()
         assert (np.diff(run.t) > 0).all()
+
+
+@pytest.mark.parametrize("times", [0.5, 2.0])
+def test_a_counter_that_misses_pulses_reads_no_speed(times):
+    """For a second and a half, on a speed that is not steady; a spin-up passes half speed and stays."""
+    t = np.arange(1000) / 100.0
+    speed = 2000.0 + 100.0 * np.sin(t)
+    speed[::9] = np.nan
+    wrong = (t > 4.0) & (t < 5.5)
+    found = find_miscounts(np.where(wrong, times * speed, speed))
+    np.testing.assert_array_equal(found, wrong & ~np.isnan(speed))
+    assert find_miscounts(np.where(t > 8.0, times * speed, speed)).sum() > 170  # to the end
+    assert not find_miscounts(speed * np.minimum(0.3 + t / 2.0, 1.0)).any()
+    assert not find_miscounts(np.full(5, np.nan)).any()
+
+
+def test_a_miscounted_speed_is_left_out_of_a_flight(tmp_path: Path) -> None:
+    shutil.copytree(BUNDLED, tmp_path, dirs_exist_ok=True)
+    file = sorted(tmp_path.glob("*.csv"))[0]
+
+    def half(table: Table) -> None:
+        speed = table["rpm_upper"]
+        speed[400:550] = [f"{0.5 * float(cell):.1f}" if cell else cell for cell in speed[400:550]]
+
+    rewrite([file], half)
+    flight = read_flight(tmp_path)
+    run = next(run for run in flight.runs if run.name == file.stem)
+    assert np.isnan(run.measured["rpm_upper"][400:550]).all()
+    assert 50 < flight.counts["readings of rpm_upper at half or twice its speed, left out"] <= 150

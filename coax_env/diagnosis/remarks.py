@@ -57,12 +57,13 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
 def vibration_removed(lines: Sequence[Line]) -> str:
     """That a vibration was taken out of the readings."""
     units = {p.name: p.unit for p in CATALOGUE["vibration"].parameters}
-    sizes = ", ".join(
-        f"{' '.join(line.channels)} by {line.amplitude:.2g} {units[line.kind]}"
-        f" {TIMES[line.order]} a turn of the {line.rotor} rotor"
-        for line in lines
-    )
-    return f"the body shakes: {sizes}; that was taken out before anything else was looked for"
+    by_source: dict[str, list[str]] = {}
+    for line in lines:
+        source = f"{TIMES[line.order]} a turn of the {line.rotor} rotor"
+        size = f"{' '.join(line.channels)} by {line.amplitude:.2g} {units[line.kind]}"
+        by_source.setdefault(source, []).append(size)
+    shakes = ", ".join(f"{source} ({', '.join(sizes)})" for source, sizes in by_source.items())
+    return f"the body shakes {shakes}: taken out before anything else was looked for"
 
 
 TIMES = {1: "once", 2: "twice", 3: "three times", 4: "four times"}

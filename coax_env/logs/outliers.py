@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from coax_env.logs.packets import stretches
 from coax_env.model.layout import ANGLES
 
 HALF_WINDOW = 7
@@ -30,6 +31,13 @@ FASTEST = {
     **dict.fromkeys(("phi", "theta", "psi"), 35.0),
 }  # fmt: skip
 """What no such machine exceeds: 30 m/s, and 35 rad/s, the range of usual gyros; ours."""
+
+MISCOUNTED = (0.5, 2.0)
+"""Times the speed that a counter reads which misses every other pulse, or sees each twice."""
+NEAR = 0.1
+"""Part of that by which the reading may be off, since the speed is not the usual one; ours."""
+JUMP = 0.25
+"""Usual speeds from one reading to the next that no rotor makes; ours."""
 
 ANSWER_ROWS = 12
 """Rows back that a spike's cause may lie: 0.12 s at 100 Hz; ours."""
@@ -153,6 +161,32 @@ def find_leaps(channel: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
             least = min(abs(step[out]), abs(step[back]))
             if abs(y[back + 1] - y[out]) < LEAP_REST * least:
                 flagged[present[out + 1 : back + 1]] = True
+    return flagged
+
+
+def find_miscounts(speed: np.ndarray) -> np.ndarray:
+    """Where a rotor's speed is read as half or twice what it is, from one reading to the next on.
+
+    However long: a rotor that turned half as fast would not fly.
+
+    Args:
+        speed: (n,) readings, NaN where there is none.
+
+    Returns:
+        (n,) bool.
+    """
+    flagged = np.zeros(len(speed), dtype=bool)
+    present = np.flatnonzero(~np.isnan(speed))
+    if present.size < 2:
+        return flagged
+    usual = float(np.median(speed[present]))
+    jumps = np.abs(np.diff(speed[present])) > JUMP * usual
+    for times in MISCOUNTED:
+        near = np.abs(speed[present] - times * usual) < NEAR * times * usual
+        for first, behind in stretches(near):
+            begins = first == 0 or jumps[first - 1]
+            if begins and (behind == present.size or jumps[behind - 1]):
+                flagged[present[first:behind]] = True
     return flagged
 
 

@@ -15,7 +15,13 @@ from coax_env.logs.coarse import at_changes
 from coax_env.logs.columns import advice, time_advice
 from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
 from coax_env.logs.held import interpolated, repeats
-from coax_env.logs.outliers import are_answers, find_leaps, find_outliers, off_median
+from coax_env.logs.outliers import (
+    are_answers,
+    find_leaps,
+    find_miscounts,
+    find_outliers,
+    off_median,
+)
 from coax_env.logs.packets import broken_packets
 from coax_env.logs.units import BATTERY, ROTOR_COMMANDS, SWASH_COMMANDS, without
 from coax_env.model.layout import ANGLES, CHANNELS, ROTOR_SPEEDS, RPM_PER_RAD_S
@@ -257,6 +263,9 @@ def _without_outliers(
         if np.isnan(values).all():
             counts[f"empty columns {channel} dropped"] += 1
             continue
+        if channel in ROTOR_SPEEDS and (wrong := find_miscounts(values)).any():
+            counts[f"readings of {channel} at half or twice its speed, left out"] += int(wrong.sum())
+            values = np.where(wrong, np.nan, values)
         outlier = find_outliers(channel, values, noise.get(channel))
         outlier |= find_leaps(channel, data["t"], values)
         if outlier.any():
