@@ -263,9 +263,10 @@ def _without_outliers(
         if np.isnan(values).all():
             counts[f"empty columns {channel} dropped"] += 1
             continue
-        if channel in ROTOR_SPEEDS and (wrong := find_miscounts(values)).any():
-            counts[f"readings of {channel} at half or twice its speed, left out"] += int(wrong.sum())
-            values = np.where(wrong, np.nan, values)
+        if channel in ROTOR_SPEEDS and (miscounted := find_miscounts(values)).any():
+            told = f"readings of {channel} at half or twice its speed, left out"
+            counts[told] += int(miscounted.sum())
+            values = np.where(miscounted, np.nan, values)
         outlier = find_outliers(channel, values, noise.get(channel))
         outlier |= find_leaps(channel, data["t"], values)
         if outlier.any():
