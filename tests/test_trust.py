@@ -41,10 +41,10 @@ from coax_env.diagnosis.trust import (
     of_line,
     taken_back,
 )
-from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
+from coax_env.estimation.vibration import Line
 from coax_env.model.generic_terms import TERMS
 from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle_file import load_vehicle

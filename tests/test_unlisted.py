@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 
 from coax_env import InputError, derivative, diagnose, load_vehicle, read_flight
-from coax_env.diagnosis import unlisted, vibration
+from coax_env.diagnosis import unlisted
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation import vibration
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.model import effects

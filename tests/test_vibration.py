@@ -9,8 +9,8 @@ import pytest
 from csv_edits import Table, rewrite
 from scipy.stats import ncx2
 
-from coax_env import diagnose, load_vehicle
-from coax_env.diagnosis import order_tracking, vibration
+from coax_env import diagnose, identify, load_vehicle
+from coax_env.estimation import order_tracking, vibration
 from coax_env.logs.flight import Flight, Run
 
 SPEEDS = {"upper": 209.0, "lower": 224.0}  # rad/s: 33.3 and 35.7 Hz
@@ -395,3 +395,17 @@ def test_what_is_hidden_beside_rotors_that_shake_is_found(tmp_path):
     every = math.sqrt(sum(size**2 for size in SOURCES.values()))
     assert found["vibration.amplitude"]["value"] == pytest.approx(every, rel=0.15)
     assert found["vibration.rate"]["value"] == pytest.approx(0.1 * every, rel=0.15)
+
+
+@pytest.mark.slow
+def test_what_shakes_moves_no_number_of_the_vehicle(tmp_path):
+    """`identify` from the same flight, as it was and with both rotors shaking (**synthetic**)."""
+    injector.fly(tmp_path, {}, gusts=True, runs=("lon_3211", "heave_3211"), seed=10, longest=9.0)
+    still = identify(tmp_path)
+    rewrite(tmp_path.glob("*.csv"), shaking)
+    shaken_so = identify(tmp_path)
+    assert any(remark.startswith("the body shakes") for remark in shaken_so.remarks)
+    for name in still.fitted:
+        before, after = still.after[name], shaken_so.after[name]
+        assert abs(after.value - before.value) < 0.2 * before.std
+        assert after.std == pytest.approx(before.std, rel=0.1)

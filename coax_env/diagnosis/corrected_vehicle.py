@@ -9,11 +9,11 @@ from coax_env.diagnosis.confounding import of_undecided
 from coax_env.diagnosis.findings import stated_std
 from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.vibration import Line, large
 from coax_env.estimation.engine import Engine, objective
 from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter, Record
+from coax_env.estimation.vibration import Line, large
 from coax_env.logs.flight import Flight
 from coax_env.model.effects import CATALOGUE
 from coax_env.model.vehicle import Parameter, Vehicle

@@ -31,7 +31,6 @@ from coax_env.diagnosis import (
     onboard_filter,
     slow_commands,
     unlisted,
-    vibration,
 )
 from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
@@ -50,13 +49,13 @@ from coax_env.diagnosis.remarks import (
     lost_in_noise,
     one_step_against_a_second,
     remarks,
-    vibration_removed,
 )
 from coax_env.diagnosis.searches.searched import searched
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.shocks import engine_of
 from coax_env.diagnosis.trust import beside_large_axes, trusts
 from coax_env.errors import InputError
+from coax_env.estimation import vibration
 from coax_env.estimation.changing_model import clock_of
 from coax_env.estimation.fitted_vehicle import double_counting
 from coax_env.estimation.flown import flown_parts
@@ -262,7 +261,7 @@ def diagnose(
             *flight.notes,
             *passed_over,
             *double_counting(flight, vehicle),
-            *([vibration_removed(lines)] if lines else []),
+            *([vibration.remark(lines)] if lines else []),
             *of_sensors,
             *([oscillation_remark(swinging)] if swinging else []),
             *remarks(problem, fit, quadratic, {e: found[e] for e in found if trust[e].named}),

@@ -11,7 +11,6 @@ from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
 from coax_env.diagnosis.trust import Trust, of_line
-from coax_env.diagnosis.vibration import Line, large
 from coax_env.estimation.changing_model import BEFORE
 from coax_env.estimation.fitted_vehicle import with_timing
 from coax_env.estimation.helicopter_noise import level_unit
@@ -19,6 +18,7 @@ from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
+from coax_env.estimation.vibration import Line, large
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.model import effects
 from coax_env.model.layout import CHANNELS

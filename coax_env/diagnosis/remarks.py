@@ -10,7 +10,6 @@ from coax_env.diagnosis.confounding import Alternatives, undecided
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.run_air import has_own_air
 from coax_env.diagnosis.settings import Settings
-from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter_noise import (
     WHITE_LEVELS,
     error_level,
@@ -22,7 +21,6 @@ from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_air import strength_and_memory
 from coax_env.estimation.state_space import FreeParameter
-from coax_env.model.effects import CATALOGUE
 from coax_env.model.layout import AXES_OF_GUSTS, ERRING_GROUPS
 from coax_env.plain_words import and_list, channel_name, plain, with_unit
 
@@ -52,22 +50,6 @@ def remarks(problem: Problem, fit: Fit, quadratic: Quadratic, found: Alternative
         *_resting_on_unseen(problem, fit, quadratic, found),
         *_resting_on_undecided(problem, fit, quadratic, found),
     ]
-
-
-def vibration_removed(lines: Sequence[Line]) -> str:
-    """That a vibration was taken out of the readings."""
-    units = {p.name: p.unit for p in CATALOGUE["vibration"].parameters}
-    by_source: dict[str, list[str]] = {}
-    for line in lines:
-        source = f"{TIMES[line.order]} a turn of the {line.rotor} rotor"
-        size = f"{' '.join(line.channels)} by {line.amplitude:.2g} {units[line.kind]}"
-        by_source.setdefault(source, []).append(size)
-    shakes = ", ".join(f"{source} ({', '.join(sizes)})" for source, sizes in by_source.items())
-    return f"the body shakes {shakes}: taken out before anything else was looked for"
-
-
-TIMES = {1: "once", 2: "twice", 3: "three times", 4: "four times"}
-"""Orders of a line, in words."""
 
 
 def lost_in_noise(gain: Mapping[str, Any] | None) -> list[str]:

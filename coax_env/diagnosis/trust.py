@@ -32,9 +32,9 @@ from coax_env.diagnosis.sensor_low_pass import may_hide_behind
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.shocks import in_shocks
 from coax_env.diagnosis.unlisted import acted_on
-from coax_env.diagnosis.vibration import Line
 from coax_env.estimation.helicopter import UNUSUAL_FROM
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.vibration import Line
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.model import effects
 

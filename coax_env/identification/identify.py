@@ -15,7 +15,7 @@ import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
-from coax_env.estimation import late_commands
+from coax_env.estimation import late_commands, vibration
 from coax_env.estimation.engine import Engine, Estimate
 from coax_env.estimation.fitted_vehicle import (
     double_counting,
@@ -156,20 +156,22 @@ def identify(
     vehicle = load_vehicle(vehicle or flight.vehicle).in_air(flight.air)
     flight = flown_parts(flight, vehicle)
     passed_over = refuse_disagreement(flight, vehicle, waive)
-    if method != "paper":
-        flight = decimated(flight)
-    flight, held = _split(flight, hold_out)
     known = (*flight.notes, *passed_over, *double_counting(flight, vehicle))
     if method == "paper":
-        result = two_step(flight, vehicle, progress=report)
+        result = two_step(_split(flight, hold_out)[0], vehicle, progress=report)
         return replace(result, remarks=(*known, *result.remarks))
-    return _by_maximum_likelihood(flight, held, vehicle, also, known, report)
+    lines, calm, still = vibration.calmed(flight, vehicle)
+    known = (*known, *([vibration.remark(lines)] if lines else []))
+    flight, held = _split(decimated(calm), hold_out)
+    start = starting_noise(flight, still)
+    return _by_maximum_likelihood(flight, held, vehicle, start, also, known, report)
 
 
 def _by_maximum_likelihood(
     flight: Flight,
     held: Flight,
     vehicle: Vehicle,
+    start: Noise,
     also: Collection[str],
     known: tuple[str, ...],
     report: Progress,
@@ -182,7 +184,6 @@ def _by_maximum_likelihood(
             f"vehicle {vehicle.name!r} has no parameter with a std: nothing to identify"
         )
     bare = {**model.bare_values, **{f.name: f.value for f in free}}
-    start = starting_noise(flight, vehicle)
 
     def fitted(engine: Engine) -> tuple[Noise, OwnNumbers, dict[str, float]]:
         """Noise of the model as given, its own numbers, and all values with these."""

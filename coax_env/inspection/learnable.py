@@ -10,10 +10,10 @@ from itertools import combinations
 
 import numpy as np
 
-from coax_env.diagnosis import vibration
 from coax_env.diagnosis.diagnose import namable, stated
 from coax_env.diagnosis.fits import start
 from coax_env.diagnosis.problem import Problem
+from coax_env.estimation import vibration
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.quadratic import Quadratic

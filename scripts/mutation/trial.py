@@ -62,6 +62,8 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/estimation/quadratic.py": ("tests/test_quadratic.py", "tests/test_diagnosis.py"),
     "coax_env/estimation/prediction.py": ("tests/test_prediction.py", "tests/test_diagnosis.py"),
     "coax_env/estimation/trajectories.py": ("tests/test_trajectories.py", "tests/test_report.py"),
+    "coax_env/estimation/vibration.py": ("tests/test_vibration.py", "tests/test_unlisted.py"),
+    "coax_env/estimation/order_tracking.py": ("tests/test_vibration.py", "tests/test_unlisted.py"),
     "coax_env/estimation/*noise*": (
         "tests/test_noise_levels.py", "tests/test_estimation.py", "tests/test_helicopter.py",
         "tests/test_kalman.py", "tests/test_diagnosis.py",
@@ -95,8 +97,6 @@ OWN: dict[str, tuple[str, ...]] = {
         "tests/test_unlisted.py", "tests/test_terms_weighed.py", "tests/test_diagnosis.py",
         "tests/test_input_innovations.py",
     ),
-    "coax_env/diagnosis/vibration.py": ("tests/test_vibration.py", "tests/test_unlisted.py"),
-    "coax_env/diagnosis/order_tracking.py": ("tests/test_vibration.py", "tests/test_unlisted.py"),
     "coax_env/diagnosis/calibration.py": ("tests/test_study.py",),
     "coax_env/diagnosis/*": (
         "tests/test_scores.py", "tests/test_diagnosis.py", "tests/test_unlisted.py",

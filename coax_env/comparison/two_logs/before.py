@@ -7,12 +7,12 @@ import numpy as np
 
 from coax_env.comparison.two_logs.coordinates import ROTOR_SPEED, Coordinate, coordinates
 from coax_env.comparison.two_logs.logs import Logs
-from coax_env.diagnosis import vibration
 from coax_env.diagnosis.diagnose import namable, stated
 from coax_env.diagnosis.fits import fitted, noise_fitted, start
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
+from coax_env.estimation import vibration
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, clock_of
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, Moment, record_of

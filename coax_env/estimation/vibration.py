@@ -29,7 +29,8 @@ from itertools import groupby
 
 import numpy as np
 
-from coax_env.diagnosis.order_tracking import (
+from coax_env.estimation.helicopter_noise import SHAKEN
+from coax_env.estimation.order_tracking import (
     NEAREST,
     NEIGHBOURS,
     ROTORS,
@@ -39,8 +40,6 @@ from coax_env.diagnosis.order_tracking import (
     is_measured,
     parts,
 )
-from coax_env.diagnosis.settings import SETTINGS
-from coax_env.estimation.helicopter_noise import SHAKEN
 from coax_env.logs.flight import Flight
 from coax_env.model.effects import CATALOGUE
 from coax_env.model.vehicle import Vehicle
@@ -58,6 +57,8 @@ SMEAR = 0.01
 """Part of the amplitude that phase errors within a segment and clipped peaks take away (measured)."""
 SLIPS = np.linspace(0.985, 1.015, 13)
 """Speeds over the commanded ones that are tried where none is measured: a bench line's error; ours."""
+ENOUGH = 14.0
+"""nats that a line must be worth, as a name in a diagnosis by default; ours."""
 SHOWS = 2.0  # times its neighbours that a line's power must be for a channel to be said to show it
 
 
@@ -96,7 +97,7 @@ class Line:
 
     def is_no_chance(self, tries: int = 1) -> bool:
         """Whether there is one, in most seconds, where so many were tried in its place."""
-        return min(self.evidence, self.steady) > SETTINGS.evidence + math.log(tries)
+        return min(self.evidence, self.steady) > ENOUGH + math.log(tries)
 
 
 def find(flight: Flight) -> tuple[Line, ...]:
@@ -184,6 +185,22 @@ def without(vehicle: Vehicle) -> Vehicle:
     """The vehicle without its vibration."""
     rest = {name: table for name, table in vehicle.effects.items() if name != "vibration"}
     return replace(vehicle, effects=rest)
+
+
+def remark(lines: Sequence[Line]) -> str:
+    """That a vibration was taken out of the readings."""
+    units = {p.name: p.unit for p in CATALOGUE["vibration"].parameters}
+    by_source: dict[str, list[str]] = {}
+    for line in lines:
+        source = f"{TIMES[line.order]} a turn of the {line.rotor} rotor"
+        size = f"{' '.join(line.channels)} by {line.amplitude:.2g} {units[line.kind]}"
+        by_source.setdefault(source, []).append(size)
+    shakes = ", ".join(f"{source} ({', '.join(sizes)})" for source, sizes in by_source.items())
+    return f"the body shakes {shakes}: taken out before anything else was looked for"
+
+
+TIMES = {1: "once", 2: "twice", 3: "three times", 4: "four times"}
+"""Orders of a line, in words."""
 
 
 # --- the test ---------------------------------------------------------------------------------------
