@@ -14,8 +14,11 @@ import pytest
 from coax_env.diagnosis import refinement
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation import rough_numbers
+from coax_env.estimation.engine import Estimate
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
+from coax_env.identification.maximum_likelihood import OwnNumbers, over_roughness
 
 NAMES = ("mass", "gyro_bias.x", "gyro_bias.y")
 PRIOR = np.array([0.5, 2.0, 2.0])
@@ -202,7 +205,7 @@ class Rough(Made):
 
 def rough(monkeypatch: pytest.MonkeyPatch, **waves: float) -> tuple[Problem, Fit, float, float]:
     """A problem whose signatures have nine times the information on a rough number of std 0.14."""
-    monkeypatch.setattr(refinement, "ROUGH", ("gyro_bias",))
+    monkeypatch.setattr(rough_numbers, "ROUGH", ("gyro_bias",))
     apart = np.diag([30.0, 50.0, 40.0])
     made, fit, optimum = problem(apart, np.diag([30.0, 450.0, 360.0]))
     engine = Rough(**{**vars(made.engine), **waves})
@@ -258,5 +261,18 @@ def test_a_fit_that_stays_on_a_spike_is_as_unsure_as_the_top_is_far(monkeypatch)
 
 def test_what_is_not_rough_is_left_as_it_was(monkeypatch):
     made, fit, _, _ = rough(monkeypatch)
-    monkeypatch.setattr(refinement, "ROUGH", ("servo_play",))
+    monkeypatch.setattr(rough_numbers, "ROUGH", ("servo_play",))
     assert refinement._over_roughness(made, fit) is fit
+
+
+def test_an_identified_number_is_taken_over_roughness_too(monkeypatch):
+    """Two std beside its top, with a third of its std: `identify` has what the diagnosis has."""
+    made, fit, top, std = rough(monkeypatch, height=0.2, length=0.03)
+    start = fit.at({NAMES[1]: round((top + 2.0 * std) / 0.03) * 0.03}).values
+    free = made.free(fit.active)
+    narrow = np.diag((np.array([30.0, 450.0, 360.0]) + PRIOR**-2.0) ** -1.0)
+    estimate = Estimate(NAMES, start, narrow, 0.0, 0.0, 1, True)
+    found = over_roughness(made.engine, OwnNumbers(list(free), estimate, NOISE, 1.0), start).estimate
+    assert abs(found.values[NAMES[1]] - top) < 0.33 * std + 0.03
+    assert found.std[NAMES[1]] == pytest.approx(std, rel=0.4)
+    assert found.std[NAMES[0]] == estimate.std[NAMES[0]]

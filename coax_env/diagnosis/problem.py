@@ -40,9 +40,6 @@ SERVO_RATE = "servo_rate"
 for (moves.py) and not read off a slope. By that one of 0.68 rad/s, worth 1,022 nats, was put at more
 than 7 and dropped as too small (**synthetic**)."""
 
-ROUGH = ("servo_play",)
-"""Effects whose likelihood is rough over less than their std (refinement.py)."""
-
 LATE_SERVO = (*SERVO_FORMS, SERVO_RATE)
 """Effects by which the swash plate is late. Beside a lag the little that a limited rate adds says
 nothing of what it would explain in its place: each is fitted there. (Of a limit of 1.33 rad/s and a

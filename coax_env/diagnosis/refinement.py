@@ -5,33 +5,23 @@ average, but on a gusty flight it can be a standard deviation. The slope by diff
 passes has it in, and so has the curvature. Coloured innovations say that the gains are not those of
 the true noise: then that part of the slope is no more than a bias, and is left out.
 
-Where a linkage's play lets go depends on every twitch of the command: over less than a milliradian its
-likelihood is as rough as noise (ROUGH). Signatures and small differences see the roughness: of eight
-**synthetic** flights with play two had it 5 and 8 std off, 0.0163 +- 0.0003 rad for 0.0212, where the
-likelihood over several milliradians has 0.018 +- 0.0017. So that is a parabola through points which lie
-some nats lower.
+A number over which the likelihood is rough has its best and its std over several std
+(estimation/rough_numbers.py).
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
 from coax_env.diagnosis.fits import fitted
-from coax_env.diagnosis.problem import ROUGH, Fit, Problem
+from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import objective
 from coax_env.estimation.quadratic import Quadratic
+from coax_env.estimation.rough_numbers import is_rough, top_of
 from coax_env.estimation.state_space import FreeParameter
 from coax_env.estimation.whiteness import is_white
-
-FALL = 4.0
-"""nats by which the likelihood is to fall to either side of a rough number: more than it is rough."""
-MOST_DOUBLED = 5
-"""Times that a step of one std is doubled until it does; ours."""
-BESIDE = (-1.0, -0.7, -0.4, 0.4, 0.7, 1.0)
-"""Points of the parabola, in steps. Where the fit ended is none: that is the top of a spike; ours."""
 
 
 def refined(problem: Problem, fit: Fit) -> Fit:
@@ -128,46 +118,9 @@ def _likelihood_derivatives(
 def _over_roughness(problem: Problem, fit: Fit) -> Fit:
     """The fit with rough numbers at the top of their parabola, where that is likelier, and its std."""
     free = problem.free(fit.active)
-    for f in [f for e in fit.active if e in ROUGH for f in problem.own[e]]:
-        _, lin = problem.engine.linearise(fit.values, fit.noise, free, gains=False)
-        fit = _of_parabola(problem, fit, Quadratic.of(lin, free, fit.values), f)
+    for name in [f.name for e in fit.active for f in problem.own[e] if is_rough(f.name)]:
+        top = top_of(problem.engine, free, fit.values, fit.noise, name)
+        fit = replace(fit.at(top.values), objective=top.objective)
+        if top.std_ratio is not None:
+            fit = replace(fit, std_ratio={**fit.std_ratio, name: top.std_ratio})
     return fit
-
-
-def _of_parabola(problem: Problem, fit: Fit, quadratic: Quadratic, number: FreeParameter) -> Fit:
-    """`_over_roughness` of one number, all others at their optimum by the quadratic.
-
-    A fit that stays beside the top is as unsure as that is far.
-    """
-    free = problem.free(fit.active)
-    k = int(quadratic.index([number.name])[0])
-    covariance = quadratic.covariance(quadratic.names)
-    std, profile = math.sqrt(covariance[k, k]), covariance[k] / covariance[k, k]
-
-    @cache
-    def moved(by: float) -> Fit:
-        along = np.clip(quadratic.at + by * profile, quadratic.lower, quadratic.upper)
-        there = fit.at(dict(zip(quadratic.names, along.tolist(), strict=True)))
-        passes = problem.engine.filter(there.values, there.noise)
-        return replace(there, objective=objective(passes, free, there.values))
-
-    fit = moved(0.0)
-    step = std
-    for _ in range(MOST_DOUBLED):
-        fallen = moved(step).objective + moved(-step).objective - 2.0 * fit.objective
-        if fallen >= 2.0 * FALL:
-            break
-        step *= 2.0
-    points = step * np.array(BESIDE)
-    curvature, slope, _ = np.polyfit(points, [moved(by).objective for by in points], 2)
-    if not curvature > 0.0:
-        return fit
-    off = float(np.clip(-0.5 * slope / curvature, -step, step))
-    top = moved(off)
-    apart = math.sqrt(0.5 / curvature)
-    if top.objective < fit.objective:
-        fit = top
-    else:
-        apart = math.hypot(apart, off)
-    ratios = {**fit.std_ratio, number.name: max(apart / std, 1.0)}
-    return replace(fit, std_ratio=ratios)

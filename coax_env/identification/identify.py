@@ -36,6 +36,7 @@ from coax_env.identification.maximum_likelihood import (
     beside_commands,
     each_run,
     free_parameters,
+    over_roughness,
     own_numbers,
 )
 from coax_env.identification.two_step.method import TwoStep, two_step
@@ -199,6 +200,8 @@ def _by_maximum_likelihood(
         engine = Engine(model, late_commands.acting_sooner(engine.records, late))
         first, found, values = fitted(engine)
         known = (*known, late_commands.remark(late))
+    found = over_roughness(engine, found, values)
+    values = {**model.bare_values, **found.estimate.values}
     _, lin = engine.linearise(values, found.noise, found.free)
     quadratic = Quadratic.of(lin, found.free, values)
     names = [f.name for f in found.free]

@@ -24,6 +24,7 @@ from coax_env.estimation.helicopter_noise import fitted_levels
 from coax_env.estimation.input_innovations import sampled_passes, shown_by_commands
 from coax_env.estimation.noise_levels import fit_noise
 from coax_env.estimation.quadratic import Linearised
+from coax_env.estimation.rough_numbers import is_rough, top_of
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.whiteness import is_white
 from coax_env.model.effects import CATALOGUE
@@ -125,6 +126,27 @@ def own_numbers(
         "something that its numbers should not answer for; see scripts/diagnose.py"
     )
     return replace(found, remark=words)
+
+
+def over_roughness(engine: Engine, found: OwnNumbers, values: Mapping[str, float]) -> OwnNumbers:
+    """Numbers with those whose likelihood is rough where it is best over several std, and their std.
+
+    Args:
+        engine: model and records. found: as fitted. values: of all parameters there, by name.
+    """
+    estimate = found.estimate
+    for k, name in enumerate(estimate.names):
+        if is_rough(name):
+            top = top_of(engine, found.free, values, found.noise, name)
+            values = top.values
+            ratio = np.ones(len(estimate.names))
+            ratio[k] = top.std_ratio or 1.0
+            estimate = replace(
+                estimate,
+                values={n: values[n] for n in estimate.names},
+                covariance=estimate.covariance * np.outer(ratio, ratio),
+            )
+    return replace(found, estimate=estimate)
 
 
 def _by_turns(
