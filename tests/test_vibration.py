@@ -213,6 +213,31 @@ def test_taking_it_out_leaves_the_motion_and_the_noise(wanders, seconds):
     assert np.array_equal(left["rpm_upper"], run.measured["rpm_upper"])
 
 
+def test_of_a_weak_line_a_share_is_taken_out():
+    """Half as strong as the noise at its frequency, its phase anew in each second: what is taken out is
+    nearer to it than nothing, and than all that is fitted there."""
+    rng = np.random.default_rng(6)
+    t = np.arange(20000) / 100.0
+    phase = np.repeat(rng.uniform(0.0, 2.0 * np.pi, 200), 100)
+    line = SIGMA * math.sqrt(0.5 * 4.0 / 100.0) * np.sin(SPEEDS["upper"] * t + phase)
+    y = line + SIGMA * rng.standard_normal(t.size)
+    command = np.tile([*SPEEDS.values(), 0.0, 0.0], (t.size, 1))
+    run = Run("made up", t, command, {"ax": y})
+    turning = order_tracking.Turning(run, "upper", 1.0)
+    some = list(order_tracking.parts(run, ["ax"]))
+    angles = [[turning.angle(part, 1, 5.0)] for part in some]
+    taken = np.concatenate(
+        [x[:, 0].ravel() for x in order_tracking.fitted(some, angles, np.array([SIGMA**2]))]
+    )
+    whole = np.concatenate([
+        (part.products(waves)[1] @ np.linalg.inv(part.products(waves)[0]) @ waves)[:, 0].ravel()
+        for part, own in zip(some, angles, strict=True)
+        for waves in [part.waves(own)]
+    ])  # fmt: skip
+    off = np.mean((taken - line) ** 2)
+    assert off < 0.8 * np.mean(line**2) and off < 0.5 * np.mean((whole - line) ** 2)
+
+
 SOURCES = {("upper", 1): 0.4, ("upper", 2): 0.3, ("lower", 1): 0.25, ("lower", 2): 0.5}
 """Amplitude by rotor and times a turn [m/s2]; twice a turn is 66.5 and 71.3 Hz, read at 90 Hz."""
 

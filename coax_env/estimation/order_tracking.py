@@ -90,7 +90,9 @@ def fitted(
 
     Phase and amplitude stay for as many seconds as is likeliest: a speed that is measured well holds
     them together for a whole run, one that is commanded hardly for a second. What is fitted anew in
-    each second takes the noise at that frequency away with it, and leaves what looks like a filter.
+    each second takes the noise at that frequency away with it, and leaves what looks like a filter. And
+    of what is fitted only that share is a line's which is more than noise would make it (James and
+    Stein 1961).
 
     Args:
         some: parts of a run with the same channels. angles: of each part (s, n), NaN: none.
@@ -100,7 +102,7 @@ def fitted(
     of_parts = [part.products(w) for part, w in zip(some, waves, strict=True)]
     squares, answers = (np.concatenate(each) for each in zip(*of_parts, strict=True))
     number = np.concatenate([part.number for part in some])
-    best = -np.inf, np.empty(0)
+    best = 0.0, np.zeros_like(answers)
     for seconds in HELD:
         which, place = np.unique(number // seconds, return_inverse=True)
         A, b = (
@@ -110,9 +112,10 @@ def fitted(
         np.add.at(A, place, squares)
         np.add.at(b, place, answers)
         sizes = b @ np.linalg.pinv(A, hermitian=True, rcond=ALIKE)
-        gained = ((sizes * b).sum((0, 2)) / noise).sum() - 2.0 * sizes.size  # Akaike's criterion
-        if gained > best[0]:
-            best = gained, sizes[place]
+        explained = float(((sizes * b).sum((0, 2)) / noise).sum())
+        share = 1.0 - sizes.size / explained if explained > sizes.size else 0.0
+        if share**2 * explained > best[0]:
+            best = share**2 * explained, share * sizes[place]
     ends = np.cumsum([part.number.size for part in some])[:-1]
     return [sizes @ w for sizes, w in zip(np.split(best[1], ends), waves, strict=True)]
 
