@@ -272,7 +272,7 @@ def test_both_rotors_shake_once_and_twice_a_turn(without, measured_speed):
 
 def test_an_alias_among_the_motion_is_no_line():
     """Three times a turn at 99.8 Hz, read at 100 Hz, would be 0.2 Hz: gusts are that, steady as they
-    are; a gyro's alias counts from 15 Hz on."""
+    are; a gyro's alias counts from 10 Hz on."""
     rng = np.random.default_rng(2)
     t = np.arange(6000) / 100.0
     motion = np.cumsum(rng.standard_normal((6, t.size)), axis=1) * 0.05
@@ -289,7 +289,7 @@ def test_an_alias_among_the_motion_is_no_line():
         1: True, 2: True, 3: False, 4: True,
     }  # fmt: skip
     rotor = order_tracking.Turning(run, "lower", 1.0)  # 107 Hz: read as 7 Hz
-    assert rotor.shows(part, 3, 5.0).all() and not rotor.shows(part, 3, 15.0).any()
+    assert rotor.shows(part, 3, 5.0).all() and not rotor.shows(part, 3, 10.0).any()
 
 
 def test_powers_are_what_sines_explain_beyond_a_cubic():

@@ -48,7 +48,7 @@ KINDS = {
     kind: tuple(c for c in SHAKEN if SHAKEN[c] == kind) for kind in dict.fromkeys(SHAKEN.values())
 }
 """Parameter of the effect -> channels that share it as their root mean square."""
-MOTION = {"amplitude": 5.0, "rate": 15.0, "tilt": math.inf, "heave": math.inf}
+MOTION = {"amplitude": 5.0, "rate": 10.0, "tilt": math.inf, "heave": math.inf}
 """Frequency [Hz] up to which sensors of a kind read motion, and an alias is not told from it; ours. A
 pose is all motion; what a body shakes in it faster than half its rate is too small to see."""
 ORDERS = (1, 2, 3, 4)
