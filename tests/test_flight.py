@@ -476,14 +476,20 @@ def read_or_refuse(flight: Path) -> None:
 def test_a_counter_that_misses_pulses_reads_no_speed(times):
     """For a second and a half, on a speed that is not steady; a spin-up passes half speed and stays."""
     t = np.arange(1000) / 100.0
-    speed = 2000.0 + 100.0 * np.sin(t)
+    command = 2000.0 + 100.0 * np.sin(t)
+    speed = 1.03 * command
     speed[::9] = np.nan
     wrong = (t > 4.0) & (t < 5.5)
-    found = find_miscounts(np.where(wrong, times * speed, speed))
+    found = find_miscounts(np.where(wrong, times * speed, speed), command)
     np.testing.assert_array_equal(found, wrong & ~np.isnan(speed))
-    assert find_miscounts(np.where(t > 8.0, times * speed, speed)).sum() > 170  # to the end
-    assert not find_miscounts(speed * np.minimum(0.3 + t / 2.0, 1.0)).any()
-    assert not find_miscounts(np.full(5, np.nan)).any()
+    assert (
+        find_miscounts(np.where(t > 8.0, times * speed, speed), command).sum() > 170
+    )  # to the end
+    spun_up = np.minimum(0.3 + t / 2.0, 1.0)
+    assert not find_miscounts(speed * spun_up, command).any()
+    idle = np.where(t < 6.0, 0.5, 1.0)  # the flight at twice the usual speed
+    assert not find_miscounts(speed * idle, command * idle).any()
+    assert not find_miscounts(np.full(5, np.nan), np.full(5, 2000.0)).any()
 
 
 def test_a_miscounted_speed_is_left_out_of_a_flight(tmp_path: Path) -> None:
@@ -495,7 +501,16 @@ def test_a_miscounted_speed_is_left_out_of_a_flight(tmp_path: Path) -> None:
         speed[400:550] = [f"{0.5 * float(cell):.1f}" if cell else cell for cell in speed[400:550]]
 
     rewrite([file], half)
+
+    def sparse(table: Table) -> None:
+        speed = table["rpm_lower_cmd"]
+        table["rpm_lower_cmd"] = [cell if k % 5 == 0 else "" for k, cell in enumerate(speed)]
+        speed = table["rpm_lower"]
+        speed[600:700] = [f"{2.0 * float(cell):.1f}" if cell else cell for cell in speed[600:700]]
+
+    rewrite([file], sparse)
     flight = read_flight(tmp_path)
     run = next(run for run in flight.runs if run.name == file.stem)
     assert np.isnan(run.measured["rpm_upper"][400:550]).all()
+    assert np.isnan(run.measured["rpm_lower"][600:700]).all()
     assert 50 < flight.counts["readings of rpm_upper at half or twice its speed, left out"] <= 150

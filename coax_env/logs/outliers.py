@@ -35,9 +35,9 @@ FASTEST = {
 MISCOUNTED = (0.5, 2.0)
 """Times the speed that a counter reads which misses every other pulse, or sees each twice."""
 NEAR = 0.1
-"""Part of that by which the reading may be off, since the speed is not the usual one; ours."""
+"""Part of that by which the reading may be off, since rotors follow their commands late; ours."""
 JUMP = 0.25
-"""Usual speeds from one reading to the next that no rotor makes; ours."""
+"""Share of what is commanded that no rotor gains or loses from one reading to the next; ours."""
 
 ANSWER_ROWS = 12
 """Rows back that a spike's cause may lie: 0.12 s at 100 Hz; ours."""
@@ -164,25 +164,26 @@ def find_leaps(channel: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
     return flagged
 
 
-def find_miscounts(speed: np.ndarray) -> np.ndarray:
+def find_miscounts(speed: np.ndarray, command: np.ndarray) -> np.ndarray:
     """Where a rotor's speed is read as half or twice what it is, from one reading to the next on.
 
-    However long: a rotor that turned half as fast would not fly.
+    However long: it is told by what was commanded, since a rotor may idle at half of its speed.
 
     Args:
-        speed: (n,) readings, NaN where there is none.
+        speed: (n,) readings, NaN where there is none. command: (n,) in the same unit.
 
     Returns:
         (n,) bool.
     """
     flagged = np.zeros(len(speed), dtype=bool)
-    present = np.flatnonzero(~np.isnan(speed))
+    present = np.flatnonzero(np.isfinite(speed) & (command > 0.0))
     if present.size < 2:
         return flagged
-    usual = float(np.median(speed[present]))
-    jumps = np.abs(np.diff(speed[present])) > JUMP * usual
+    share = speed[present] / command[present]
+    usual = float(np.median(share))
+    jumps = np.abs(np.diff(share)) > JUMP * usual
     for times in MISCOUNTED:
-        near = np.abs(speed[present] - times * usual) < NEAR * times * usual
+        near = np.abs(share - times * usual) < NEAR * times * usual
         for first, behind in stretches(near):
             begins = first == 0 or jumps[first - 1]
             if begins and (behind == present.size or jumps[behind - 1]):

@@ -263,7 +263,7 @@ def _without_outliers(
         if np.isnan(values).all():
             counts[f"empty columns {channel} dropped"] += 1
             continue
-        if channel in ROTOR_SPEEDS and (miscounted := find_miscounts(values)).any():
+        if channel in ROTOR_SPEEDS and (miscounted := _miscounted(channel, data)).any():
             told = f"readings of {channel} at half or twice its speed, left out"
             counts[told] += int(miscounted.sum())
             values = np.where(miscounted, np.nan, values)
@@ -286,6 +286,14 @@ def _without_outliers(
     for channel, outlier in flagged.items():
         measured[channel] = np.where(outlier, np.nan, measured[channel])
     return measured
+
+
+def _miscounted(channel: str, data: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Where a rotor's speed is half or twice what it is, by its command; nowhere without one."""
+    command = data.get(f"{channel}_cmd")
+    if command is None or np.isnan(command).all():
+        return np.zeros(data[channel].size, bool)
+    return find_miscounts(data[channel], hold_last(command))
 
 
 def _comes_whole(measured: Mapping[str, np.ndarray]) -> bool:
