@@ -333,6 +333,8 @@ def test_at_half_the_rate_a_sine_is_one_wave_and_a_turn_a_reading_is_none():
     powers = part.powers(azimuth[None], (1, 2))[0, 0]
     assert powers[0, 0] == pytest.approx((wave @ y) ** 2 / (wave @ wave), rel=1e-6)
     assert powers[1, 0] == pytest.approx(0.0, abs=1e-12)
+    as_sine = part.powers(azimuth[None] + 0.5 * np.pi, (1,))[0, 0]
+    assert as_sine[0, 0] == pytest.approx(powers[0, 0], rel=1e-6)
 
 
 def test_no_line_without_accelerometers():
