@@ -496,19 +496,19 @@ def test_a_miscounted_speed_is_left_out_of_a_flight(tmp_path: Path) -> None:
     shutil.copytree(BUNDLED, tmp_path, dirs_exist_ok=True)
     file = sorted(tmp_path.glob("*.csv"))[0]
 
-    def half(table: Table) -> None:
-        speed = table["rpm_upper"]
-        speed[400:550] = [f"{0.5 * float(cell):.1f}" if cell else cell for cell in speed[400:550]]
+    def miscounted(table: Table) -> None:
+        """The lower rotor's beside a command that is logged in every fifth row."""
+        told = table["rpm_lower_cmd"]
+        table["rpm_lower_cmd"] = [cell if k % 5 == 0 else "" for k, cell in enumerate(told)]
+        for rotor, times, rows in (
+            ("upper", 0.5, range(400, 550)),
+            ("lower", 2.0, range(600, 700)),
+        ):
+            speed = table[f"rpm_{rotor}"]
+            for row in (row for row in rows if speed[row]):
+                speed[row] = f"{times * float(speed[row]):.1f}"
 
-    rewrite([file], half)
-
-    def sparse(table: Table) -> None:
-        speed = table["rpm_lower_cmd"]
-        table["rpm_lower_cmd"] = [cell if k % 5 == 0 else "" for k, cell in enumerate(speed)]
-        speed = table["rpm_lower"]
-        speed[600:700] = [f"{2.0 * float(cell):.1f}" if cell else cell for cell in speed[600:700]]
-
-    rewrite([file], sparse)
+    rewrite([file], miscounted)
     flight = read_flight(tmp_path)
     run = next(run for run in flight.runs if run.name == file.stem)
     assert np.isnan(run.measured["rpm_upper"][400:550]).all()

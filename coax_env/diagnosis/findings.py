@@ -90,8 +90,8 @@ def causes(
             earlier = {f.name: known.get(of_part(f.name, BEFORE)) for f in last}
             entries[-1]["since"] = onsets[effect].entry()
             entries[-1]["before"] = {n: number(f, factor) for n, f in earlier.items() if f}
-    if large(lines):
-        entries.append(_vibration(lines))
+    if sizes := large(lines):
+        entries.append(_vibration(lines, sizes))
     return _in_order(mixtures_as_one(entries))
 
 
@@ -153,10 +153,9 @@ def stated_std(
     return with_timing(parameter, spread, dt)
 
 
-def _vibration(lines: Sequence[Line]) -> dict[str, Any]:
-    """The cause that is found by its lines and not by a signature."""
+def _vibration(lines: Sequence[Line], sizes: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    """The cause that is found by its lines and not by a signature; sizes: `large` of these."""
     units = {p.name: p.unit for p in effects.CATALOGUE["vibration"].parameters}
-    sizes = large(lines)
     own = [line for line in lines if line.kind in sizes]
     return {
         "effect": "vibration",

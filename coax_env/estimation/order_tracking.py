@@ -104,13 +104,8 @@ def fitted(
     number = np.concatenate([part.number for part in some])
     best = 0.0, np.zeros_like(answers)
     for seconds in HELD:
-        which, place = np.unique(number // seconds, return_inverse=True)
-        A, b = (
-            np.zeros((which.size, *squares.shape[1:])),
-            np.zeros((which.size, *answers.shape[1:])),
-        )
-        np.add.at(A, place, squares)
-        np.add.at(b, place, answers)
+        place = np.unique(number // seconds, return_inverse=True)[1]
+        A, b = _sums(squares, place), _sums(answers, place)
         sizes = b @ np.linalg.pinv(A, hermitian=True, rcond=ALIKE)
         explained = float(((sizes * b).sum((0, 2)) / noise).sum())
         share = 1.0 - sizes.size / explained if explained > sizes.size else 0.0
@@ -118,6 +113,13 @@ def fitted(
             best = share**2 * explained, share * sizes[place]
     ends = np.cumsum([part.number.size for part in some])[:-1]
     return [sizes @ w for sizes, w in zip(np.split(best[1], ends), waves, strict=True)]
+
+
+def _sums(matrices: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Of matrices (s, ...) those with the same place (s,) added up, in the order of the places."""
+    total = np.zeros((place.max() + 1, *matrices.shape[1:]))
+    np.add.at(total, place, matrices)
+    return total
 
 
 def _squares_explained(

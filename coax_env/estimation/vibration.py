@@ -40,7 +40,7 @@ from coax_env.estimation.order_tracking import (
     is_measured,
     parts,
 )
-from coax_env.logs.flight import Flight
+from coax_env.logs.flight import Flight, Run
 from coax_env.model.effects import CATALOGUE
 from coax_env.model.vehicle import Vehicle
 
@@ -103,8 +103,9 @@ class Line:
 def find(flight: Flight) -> tuple[Line, ...]:
     """The lines at multiples of the rotor speeds that the flight has, however small, by kind."""
     found: dict[tuple[str, str, int], Line] = {}
-    rest, asked = flight, set(KINDS)
+    asked = set(KINDS)
     while asked:
+        rest = taken_out(flight, found.values()) if found else flight
         strongest = {}
         slips = {x.rotor: x.slip for x in sorted(found.values(), key=lambda x: x.evidence)}
         for line in sorted(_lines(rest, asked, slips), key=lambda x: x.evidence):
@@ -112,7 +113,6 @@ def find(flight: Flight) -> tuple[Line, ...]:
                 strongest[line.kind] = line
         found |= {line.place: line for line in strongest.values()}
         asked = set(strongest)
-        rest = taken_out(flight, found.values())
     return tuple(
         _beside(flight, line, found.values())
         for line in sorted(found.values(), key=lambda x: list(KINDS).index(x.kind))
@@ -150,24 +150,26 @@ def taken_out(flight: Flight, lines: Collection[Line]) -> Flight:
     for run in flight.runs:
         measured = dict(run.measured)
         for kind in dict.fromkeys(line.kind for line in lines):
-            own = [line for line in lines if line.kind == kind]
-            turning = {(x.rotor, x.slip): Turning(run, x.rotor, x.slip) for x in own}
-            for channels, alike in groupby(parts(run, KINDS[kind]), lambda part: part.channels):
-                noise = [
-                    0.5 * min(x.beside.get((run.name, c), math.inf) for x in own) for c in channels
-                ]
-                some = list(alike)
-                angles = [
-                    [turning[x.rotor, x.slip].angle(part, x.order, MOTION[kind]) for x in own]
-                    for part in some
-                ]
-                explained = fitted(some, angles, np.array(noise))
-                for c, channel in enumerate(channels):
-                    measured[channel] = measured[channel].copy()
-                    for part, shaken in zip(some, explained, strict=True):
-                        measured[channel][part.rows] -= shaken[:, c]
+            measured |= _calm(run, kind, [line for line in lines if line.kind == kind])
         runs.append(replace(run, measured=measured))
     return replace(flight, runs=tuple(runs))
+
+
+def _calm(run: Run, kind: str, lines: Sequence[Line]) -> dict[str, np.ndarray]:
+    """The readings of a kind of channels in a run without its lines, by channel."""
+    turning = {(x.rotor, x.slip): Turning(run, x.rotor, x.slip) for x in lines}
+    calm = {c: run.measured[c].copy() for c in KINDS[kind] if c in run.measured}
+    for channels, alike in groupby(parts(run, KINDS[kind]), lambda part: part.channels):
+        some = list(alike)
+        angles = [
+            [turning[x.rotor, x.slip].angle(part, x.order, MOTION[kind]) for x in lines]
+            for part in some
+        ]
+        beside = [min(x.beside.get((run.name, c), math.inf) for x in lines) for c in channels]
+        for part, shaken in zip(some, fitted(some, angles, 0.5 * np.array(beside)), strict=True):
+            for c, channel in enumerate(channels):
+                calm[channel][part.rows] -= shaken[:, c]
+    return calm
 
 
 def calmed(flight: Flight, vehicle: Vehicle) -> tuple[tuple[Line, ...], Flight, Vehicle]:
@@ -279,7 +281,9 @@ def _powers(part: Part, turning: Turning) -> Iterator[tuple[str, int, _Powers]]:
     kinds = {SHAKEN[c] for c in part.channels}
     shown = {(k, kind): turning.shows(part, k, MOTION[kind]) for k in ORDERS for kind in kinds}
     orders = [k for k in ORDERS if any(shown[k, kind].any() for kind in kinds)]
-    powers = part.powers(turning.azimuth[part.rows], orders) if orders else np.empty(0)
+    if not orders:
+        return
+    powers = part.powers(turning.azimuth[part.rows], orders)
     for o, order in enumerate(orders):
         apart = np.abs(NEIGHBOURS - order * ahead) > 1.0
         for c, channel in enumerate(part.channels):
