@@ -482,13 +482,14 @@ def test_a_counter_that_misses_pulses_reads_no_speed(times):
     wrong = (t > 4.0) & (t < 5.5)
     found = find_miscounts(np.where(wrong, times * speed, speed), command)
     np.testing.assert_array_equal(found, wrong & ~np.isnan(speed))
-    assert (
-        find_miscounts(np.where(t > 8.0, times * speed, speed), command).sum() > 170
-    )  # to the end
+    to_the_end = t > 8.0
+    assert find_miscounts(np.where(to_the_end, times * speed, speed), command).sum() > 170
     spun_up = np.minimum(0.3 + t / 2.0, 1.0)
     assert not find_miscounts(speed * spun_up, command).any()
     idle = np.where(t < 6.0, 0.5, 1.0)  # the flight at twice the usual speed
     assert not find_miscounts(speed * idle, command * idle).any()
+    for lost in (t < 0.04, (t > 4.0) & (t < 4.04), t > 9.96):  # a command, which the rotor survives
+        assert not find_miscounts(speed, np.where(lost, command / times, command)).any()
     assert not find_miscounts(np.full(5, np.nan), np.full(5, 2000.0)).any()
 
 

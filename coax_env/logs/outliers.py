@@ -167,7 +167,8 @@ def find_leaps(channel: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def find_miscounts(speed: np.ndarray, command: np.ndarray) -> np.ndarray:
     """Where a rotor's speed is read as half or twice what it is, from one reading to the next on.
 
-    However long: it is told by what was commanded, since a rotor may idle at half of its speed.
+    However long: it is told by what was commanded, since a rotor may idle at half of its speed. The
+    reading itself jumps there and back, which no rotor does.
 
     Args:
         speed: (n,) readings, NaN where there is none. command: (n,) in the same unit.
@@ -179,9 +180,11 @@ def find_miscounts(speed: np.ndarray, command: np.ndarray) -> np.ndarray:
     present = np.flatnonzero(np.isfinite(speed) & (command > 0.0))
     if present.size < 2:
         return flagged
-    share = speed[present] / command[present]
+    read, asked = speed[present], command[present]
+    share = read / asked
     usual = float(np.median(share))
-    jumps = np.abs(np.diff(share)) > JUMP * usual
+    # of the reading: a command that is lost for some rows moves the share, too
+    jumps = np.abs(np.diff(read)) > JUMP * usual * np.minimum(asked[1:], asked[:-1])
     for times in MISCOUNTED:
         near = np.abs(share - times * usual) < NEAR * times * usual
         for first, behind in stretches(near):
