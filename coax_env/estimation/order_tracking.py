@@ -14,7 +14,7 @@ import numpy as np
 from coax_env.logs.flight import Run
 from coax_env.model.layout import ANGLES
 
-ROTORS = ("upper", "lower")
+ROTOR_NAMES = ("upper", "lower")
 SEGMENT = 1.0  # s
 LEAST_SAMPLES = 12  # of a channel in a segment
 TREND = 3  # order of the polynomial that stands for the motion within a segment
@@ -156,7 +156,7 @@ class Turning:
     def __init__(self, run: Run, rotor: str, slip: float) -> None:
         self.measured = is_measured(run, rotor)
         self._speed, self._other = (
-            slip * _speed(run, r) for r in (rotor, *(r for r in ROTORS if r != rotor))
+            slip * _speed(run, r) for r in (rotor, *(r for r in ROTOR_NAMES if r != rotor))
         )
         self.azimuth = np.concatenate([[0.0], np.cumsum(self._speed[:-1] * np.diff(run.t))])
 
@@ -242,7 +242,7 @@ def is_measured(run: Run, rotor: str) -> bool:
 def _speed(run: Run, rotor: str) -> np.ndarray:
     """Rotor speed at every row [rad/s]: as measured, else as commanded."""
     if not is_measured(run, rotor):
-        return run.command[:, ROTORS.index(rotor)]
+        return run.command[:, ROTOR_NAMES.index(rotor)]
     measured = run.measured[f"rpm_{rotor}"]
     there = np.isfinite(measured)
     return np.interp(run.t, run.t[there], measured[there]) * (2.0 * np.pi / 60.0)

@@ -33,7 +33,7 @@ from coax_env.estimation.helicopter_noise import SHAKEN
 from coax_env.estimation.order_tracking import (
     NEAREST,
     NEIGHBOURS,
-    ROTORS,
+    ROTOR_NAMES,
     Part,
     Turning,
     fitted,
@@ -214,7 +214,7 @@ def _lines(flight: Flight, kinds: Collection[str], slips: Mapping[str, float]) -
     Args:
         flight: in which. kinds: of channels. slips: of rotors, where they are known.
     """
-    for rotor in ROTORS:
+    for rotor in ROTOR_NAMES:
         if all(is_measured(run, rotor) for run in flight.runs):
             tried = [1.0]
         else:
