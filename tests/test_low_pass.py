@@ -19,7 +19,7 @@ from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.low_pass import NONE, LowPass, before_low_pass
 from coax_env.estimation.state_space import Noise, Record
-from coax_env.model.layout import ROTOR_SPEEDS
+from coax_env.model.layout import INERTIAL, ROTOR_SPEEDS
 
 STEP = 0.01
 
@@ -109,17 +109,19 @@ def test_the_remark_says_where_it_cuts_off_and_what_is_not_asked():
 
 
 @pytest.mark.parametrize(
-    ("alike", "of_one", "active", "asked"),
+    ("alike", "of_one", "active", "aboard", "asked"),
     [
-        (4.1, 0.0, (), ["p", "ax"]),
-        (-1.0, 4.1, (), ["p", "ax"]),  # signs differ
-        (3.9, 3.9, (), []),
-        (3.9, 3.9, ("thrust_exponent", "wind"), ["ax"]),  # which looks like it
-        (3.9, 3.9, ("attitude_delay",), ["p"]),
+        (4.1, 0.0, (), INERTIAL, ["p", "ax"]),
+        (-1.0, 4.1, (), INERTIAL, ["p", "ax"]),  # signs differ
+        (3.9, 3.9, (), INERTIAL, []),
+        (3.9, 3.9, ("thrust_exponent", "wind"), INERTIAL, ["ax"]),  # which looks like it
+        (3.9, 3.9, ("attitude_delay",), INERTIAL, ["p"]),
+        (4.1, 4.1, ("thrust_exponent",), ("h", "q"), ["p"]),  # accelerations are not read
+        (4.1, 4.1, ("thrust_exponent", "attitude_delay"), ("h", "phi"), []),
     ],
 )
 def test_a_low_pass_is_asked_for_where_it_shows_or_what_looks_like_it_is_named(
-    monkeypatch, alike, of_one, active, asked
+    monkeypatch, alike, of_one, active, aboard, asked
 ):
     tried = []
 
@@ -135,6 +137,7 @@ def test_a_low_pass_is_asked_for_where_it_shows_or_what_looks_like_it_is_named(
     monkeypatch.setattr(sensor_low_pass, "_refitted", lambda problem, fit, found: fit)
     problem: Any = SimpleNamespace(
         has_slow_rows=False,
+        aboard=frozenset(aboard),
         engine=SimpleNamespace(filter=lambda values, noise: []),
         model=SimpleNamespace(channels=()),
     )

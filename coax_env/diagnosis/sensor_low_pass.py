@@ -63,7 +63,8 @@ def low_passes(
             low-pass does to the readings' noise.
         groups: channels that are asked, each group for one low-pass.
     """
-    if problem.has_slow_rows:
+    groups = [group for group in groups if not problem.aboard.isdisjoint(group)]
+    if problem.has_slow_rows or not groups:
         return {}
     passes = problem.engine.filter(fit.values, fit.noise)
     if max(_alike(passes, problem.model.channels, channels) for channels in _pools(groups)) < ALIKE:

@@ -28,7 +28,7 @@ from coax_env.kernel.compilation import compiled, pointer
 from coax_env.kernel.simd import any_lane, simd_view
 from coax_env.kernel.variants import under_names
 from coax_env.logs.flight import Run
-from coax_env.logs.held_signal import integral_of_held
+from coax_env.logs.held_signal import row_means
 from coax_env.model import dynamics, effects, usual_sizes
 from coax_env.model import inputs as U
 from coax_env.model import parameters as P
@@ -336,7 +336,7 @@ class HeliModel:
             if delay > 0.0:
                 for column in columns:
                     command = record.command[:, column]
-                    u[:, 0, column] = _delayed_mean(record.t, command, delay)
+                    u[:, 0, column] = row_means(record.t, command, -delay)
                     u[:, 1, column] = self._read(record.t, command, delay)
         both = u.reshape(record.t.size, -1)
         if record.input_innovations is None:
@@ -346,7 +346,7 @@ class HeliModel:
     def _read(self, t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
         """A late command (n,) as readings at the rows' times `t` see it."""
         held = delay if self.read_delay is None else self.read_delay
-        return _delayed_mean(t, command, _to_the_middle(t, held))
+        return row_means(t, command, -_to_the_middle(t, held))
 
     def reading_after(self, delay: float) -> "HeliModel":
         """The same, whose readings see commands this much later [s], once any delay is there."""
@@ -431,15 +431,6 @@ _SERVO_DELAY = effects.parameter_index("servo_delay.time")
 _NOMINAL_VOLTAGE = effects.parameter_index("battery_voltage.nominal")
 ROTORS, SWASH_PLATE = (U.OMEGA_U, U.OMEGA_L), (U.DELTA_LON, U.DELTA_LAT)
 """Columns of the input that command_delay alone and that servo_delay too make late."""
-
-
-def _delayed_mean(t: np.ndarray, command: np.ndarray, delay: float | np.ndarray) -> np.ndarray:
-    """Mean over each row's interval of a held command that arrives late, by one delay or each row's."""
-    integral = integral_of_held(t, command)
-    end = np.append(t[1:], t[-1] + (t[-1] - t[-2]))
-    start = t - delay
-    stop = np.minimum(end - delay, t[-1])
-    return (integral(stop) - integral(start)) / np.maximum(stop - start, 1e-9)
 
 
 def _to_the_middle(t: np.ndarray, delay: float) -> np.ndarray:

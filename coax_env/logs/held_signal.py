@@ -22,13 +22,13 @@ def integral_of_held(t: np.ndarray, values: np.ndarray) -> Callable[[np.ndarray]
     return integral
 
 
-def row_means(t: np.ndarray, values: np.ndarray, sooner: float) -> np.ndarray:
+def row_means(t: np.ndarray, values: np.ndarray, sooner: float | np.ndarray) -> np.ndarray:
     """Mean over each row of what is held, (n,), had it come sooner.
 
     Args:
         t: (n,) time [s], increasing.
         values: (n,) held.
-        sooner: by how much it comes before it is written [s].
+        sooner: by how much it comes before it is written [s], one or each row's; negative: later.
     """
-    edges = np.append(t, 2.0 * t[-1] - t[-2])
-    return np.diff(integral_of_held(t, values)(edges + sooner)) / np.diff(edges)
+    integral, ends = integral_of_held(t, values), np.append(t[1:], 2.0 * t[-1] - t[-2])
+    return (integral(ends + sooner) - integral(t + sooner)) / (ends - t)

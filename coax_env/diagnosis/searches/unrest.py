@@ -12,9 +12,9 @@ model lacks looks like them, too: on a real helicopter such gusts had an arm of 
 A likelihood that no model in reach makes white is spent on what happens within a few rows: with the
 readings of a motion capture it prefers numbers that fit the last tenth of a millimetre and fly the
 next second worse. So where innovations stay coloured and readings are finer than a rigid body is
-(LEAST_READING_STD), the search is done again with readings no finer than that, then than
-three times that, as long as the model's open-loop flight over the horizon comes nearer to the fitted
-runs (the likelihood raised to a power less than 1, for a model that is wrong: Miller and Dunson 2019,
+(LEAST_READING_STD), the search is done again with readings no finer than that, and with readings no
+finer than three times that; what flies nearest to the fitted runs in open loop over the horizon stays
+(the likelihood raised to a power less than 1, for a model that is wrong: Miller and Dunson 2019,
 J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Identification, ch. 8).
 """
 
@@ -85,9 +85,8 @@ def in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bo
         problem.report("the innovations stay coloured: searching again with readings believed less")
         levels = as_fitted | {channel: factor * std for channel, std in coarser.items()}
         other = searched_once(problem, noise.with_levels(levels), coarse=True)
-        if not _flies_better(problem, other.fit, best.fit):
-            break
-        best = other
+        if _flies_better(problem, other.fit, best.fit):
+            best = other
     return best
 
 
