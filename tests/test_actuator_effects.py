@@ -98,6 +98,7 @@ def test_a_limited_rate_makes_a_ramp():
         assert (at_once[:, 2] == 1.0).all(), "no limit"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [1, 7, 40])
 def test_a_lagging_servo_of_limited_rate_is_exact_at_any_step(rows):
     """x' = clip((u - x)/lag, -L, L), integrated in steps of a microsecond."""

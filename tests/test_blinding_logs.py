@@ -68,6 +68,7 @@ def same_but(found: Run, expected: Run, missing: slice) -> None:
 # --- a broken packet ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [1, 4, 8])
 def test_a_broken_packet_is_missing(tmp_path, rows):
     at = slice(FIRST, FIRST + rows)

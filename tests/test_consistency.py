@@ -141,12 +141,14 @@ def each(errors: Mapping[str, tuple[str, str]]) -> list:
     return [pytest.param(what, marks=() if what in QUICK else slow) for what in errors]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", each(ERRORS))
 def test_an_error_of_a_card_is_refused_with_the_line_to_change(tmp_path, what):
     columns, right = ERRORS[what]
     said_right(planted(BUNDLED, tmp_path / "f", columns), right)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", each(ERRORS_OF_POSITIONS))
 def test_and_where_positions_are_logged(tmp_path, tmp_path_factory, what):
     columns, right = ERRORS_OF_POSITIONS[what]
@@ -277,6 +279,7 @@ def test_a_clipped_peak_is_not_known():
     assert away[rows.known["r"]].max() < 0.2 and rows.known["r"][105]
 
 
+@pytest.mark.slow
 def test_a_column_that_was_written_in_another_unit_is_found():
     """Not by the card: the roll column itself is in degrees already divided by 57.3 once too often."""
     flight = bundled().select(RUNS)
@@ -341,6 +344,7 @@ def test_air_of_another_planet_and_unlogged_swash_are_refused(tmp_path):
     assert swash.check == "swash-logged" and "aileron_pwm" in swash.words
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "check"),
     [
@@ -385,6 +389,7 @@ def test_the_scripts_refuse_in_one_line(tmp_path, monkeypatch, script):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_waived_check_is_a_remark_of_the_comparison(tmp_path):
     flight = planted(BUNDLED, tmp_path / "f", "h = { sign = -1 }").select(["lon_3211", "yaw_3211"])
     with pytest.raises(InputError, match="h-range"):

@@ -159,6 +159,7 @@ def test_sensitivities_add_up_to_one_and_peak_where_the_margin_is_least(onboard)
     assert S.max() >= 1.0 / disk - 0.5 - 0.2
 
 
+@pytest.mark.slow
 def test_a_step_is_followed():
     from controllers import steps
 
@@ -261,6 +262,7 @@ def test_lqg_hovers_a_minute_a_hundred_times(vehicle):
     assert score["worst_height_rms_m"] < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effects",
     [
@@ -400,6 +402,7 @@ def test_scripts_design_and_evaluate(tmp_path):
 # --- other controllers, tasks and vehicles ------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integral", [False, True])
 def test_state_feedback_costs_what_its_riccati_solution_says(integral):
     """x'Px for LQR and LQI, flown with the kernel itself near trim."""
@@ -421,6 +424,7 @@ def test_state_feedback_costs_what_its_riccati_solution_says(integral):
     assert simulated == pytest.approx(predicted, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_lqi_takes_away_the_offset_that_lqr_leaves():
     heavy = LAMA.with_effect("thrust_scale", scale=-0.05)
     rms = {}
@@ -436,6 +440,7 @@ def test_the_exact_state_costs_less_than_noisy_sensors(onboard):
     assert exact["mean_cost"] < 0.7 * noisy["mean_cost"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensors", ["onboard", "mocap"])
 def test_pid_hovers_on_raw_sensors(sensors):
     score = evaluate(pid.design(LAMA, sensors=sensors), LAMA, episodes=10, seconds=15.0)
@@ -447,6 +452,7 @@ def test_pid_needs_attitude():
         pid.design(LAMA, sensors="paper")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("design", [lqr.design, pid.design, state_feedback.design])
 def test_hover_controllers_fly_to_a_target_and_stay(design):
     sensors = {} if design is state_feedback.design else {"sensors": "mocap"}
@@ -929,6 +935,7 @@ def test_machines_fly_to_a_position_in_wind(tmp_path):
     assert "position, wind 4.0" in machines.machines_page(out["windy"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "sensors"), [("hover", "onboard"), ("position", "mocap")])
 def test_the_outdoor_policy_flies_in_wind_on_two_suites(task, sensors):
     controller = make_controller("ppo_outdoor", sensors=sensors)

@@ -65,6 +65,7 @@ ACTIVE = {"motor_lag.upper": 0.06, "motor_lag.lower": 0.08, "rotor_drag.coeffici
           "wind.north": -1.0, "wind.east": 1.5, "axial_damping.coefficient": 0.07}  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("also", [{}, ACTIVE], ids=["bare", "with effects"])
 def test_signatures_are_what_moving_the_parameter_does(tmp_path, also):
     """Information and slope, against differences of the mean pass with the gains frozen."""
@@ -431,6 +432,7 @@ def test_hold_out_as_told(still):
     assert {run.name for run in result.replay_after} == {"lat_3211", "yaw_3211"}
 
 
+@pytest.mark.slow
 def test_the_held_out_runs_are_taken_in_at_the_end(still):
     """What the vehicle file gets is what a fit on all runs finds, not that on the others alone."""
     model = HeliModel(LAMA)
@@ -524,6 +526,7 @@ def test_bad_requests_are_refused_in_one_line(still, options, words):
 # --- replay ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_true_model_predicts_as_well_as_the_sensors_see(still):
     result = replay(still)
     assert set(result.findings["runs"]) == set(ON_AXES)
@@ -593,6 +596,7 @@ def test_moved_parameters_return(still, tmp_path):
     fly_in_env(path)
 
 
+@pytest.mark.slow
 def test_identification_knows_when_it_counts_twice(still):
     flight = only(still, "lon_3211")
     first = identify(flight)

@@ -1108,6 +1108,7 @@ print(*compiled)
 """
 
 
+@pytest.mark.slow
 def test_effects_are_compiled_when_first_flown():
     """None for a bare vehicle; an interrupt reaches the caller, and the next call compiles."""
     done = subprocess.run(

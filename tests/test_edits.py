@@ -137,6 +137,7 @@ def test_an_edit_is_found_at_its_size_by_a_model_that_lacks_much():
     assert abs(change - (1.0 / 1.25 - 1.0)) < 2.0 * std < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edit", "number", "size"),
     [("gain", "swash_gain.scale", 1.0 / 1.25 - 1.0), ("theta", "attitude_bias.y", 0.03)],

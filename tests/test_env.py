@@ -39,6 +39,7 @@ def actions(seed: int, *shape: int, size: float = 1.0) -> np.ndarray:
 # --- contract -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensors", SUITES)
 def test_check_env_passes_without_a_warning(sensors):
     with warnings.catch_warnings():

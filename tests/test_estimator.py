@@ -277,6 +277,7 @@ def seen_from(design, place: np.ndarray, psi: float, target: np.ndarray) -> np.n
     return row[None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("psi", [0.0, 0.8, -2.0])
 def test_where_the_target_moves_the_estimate_moves_and_the_machine_does_not(psi):
     """In the heading's axes, from one target to the next: a machine at rest brings no surprise."""

@@ -119,6 +119,7 @@ def test_a_reading_that_is_no_number_is_none(kind, exported):
         np.testing.assert_allclose(c.act(lost[k]), wanted, rtol=0.0, atol=2.0 * BAR)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(("kind", "sensors"), KINDS)
 def test_no_readings_at_all_give_commands_that_are_numbers(kind, sensors, exported):
@@ -131,6 +132,7 @@ def test_no_readings_at_all_give_commands_that_are_numbers(kind, sensors, export
         assert (np.abs(c.act(row)) <= 1.0).all() and np.isfinite(c.commands).all()
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.skipif(shutil.which("nm") is None, reason="no nm")
 @pytest.mark.parametrize(("kind", "sensors"), KINDS)
@@ -149,6 +151,7 @@ def test_it_needs_nothing_but_mathematics(kind, sensors, exported, tmp_path):
     assert not re.search(r" [bBdDC] ", said), "a variable outlives the call"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "sensors"), KINDS)
 def test_the_interface_names_the_envs_observations(kind, sensors):
     controller = make_controller(kind, LAMA, sensors=sensors)

@@ -68,6 +68,7 @@ def test_what_changes_evenly_stays_so_on_an_uneven_clock(rate, missing):
     np.testing.assert_allclose(np.exp(1j * turned), 1.0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slow", [0, 7])
 @pytest.mark.parametrize(("rate", "rows"), [(500.0, 5), (400.0, 4), (240.0, 2), (200.0, 2)])
 def test_white_noise_stays_white_and_is_that_of_the_means(rate, rows, slow):

@@ -75,6 +75,7 @@ FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("name", ["p", "az", "phi", "psi", "h", "vn", "rpm_upper"])
 def test_the_estimate_stays_finite_and_forgets(name, fault):

@@ -284,6 +284,7 @@ def test_open_flights_lose_nothing_genuine() -> None:
         assert len(flight.runs) == 12
 
 
+@pytest.mark.slow
 @pytest.mark.needs_shared_flights
 def test_windy_flight_loses_its_lost_echoes_and_nothing_else() -> None:
     flight = read("open_windy")
@@ -446,6 +447,7 @@ CELLS = st.one_of(
 )
 
 
+@pytest.mark.slow
 @FUZZ
 @given(st.lists(st.lists(CELLS, min_size=5, max_size=7), max_size=6), st.integers(0, 300))
 def test_any_rows_are_read_or_refused(tmp_path: Path, rows: list[list[str]], at: int) -> None:
@@ -493,6 +495,7 @@ def test_a_counter_that_misses_pulses_reads_no_speed(times):
     assert not find_miscounts(np.full(5, np.nan), np.full(5, 2000.0)).any()
 
 
+@pytest.mark.slow
 def test_a_miscounted_speed_is_left_out_of_a_flight(tmp_path: Path) -> None:
     shutil.copytree(BUNDLED, tmp_path, dirs_exist_ok=True)
     file = sorted(tmp_path.glob("*.csv"))[0]

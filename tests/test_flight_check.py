@@ -69,6 +69,7 @@ def suspicions(flight: Flight) -> str:
 # --- what is there --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_sound_flight_is_not_suspected():
     found = checked("hover", "lon_3211")
     assert found.suspicions == ()
@@ -209,6 +210,7 @@ def foreign(folder: Path, delimiter: str = ",") -> Flight:
     return read_flight(own)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
 def test_a_drafted_card_reads_a_foreign_log(tmp_path, delimiter):
     own = foreign(tmp_path, delimiter)

@@ -74,6 +74,7 @@ def hash_of(text: str) -> int:
     return sum(text.encode()[:40])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ulog", "dataflash"])
 @some(80)
 @given(changes=st.lists(st.tuples(st.integers(0, 8000), st.binary(max_size=4)), max_size=5))

@@ -304,6 +304,7 @@ def test_noise_in_common_is_half_of_the_variance(turns) -> None:
     assert off(run, "phi").std() == pytest.approx(NOISE["phi"], rel=0.1)
 
 
+@pytest.mark.slow
 def test_an_onboard_filters_attitude_is_carried_by_its_gyros(turns) -> None:
     """A row adds what the gyro says, and goes back a hundredth of 0.03 rad of noise."""
     run = turns("fused")
@@ -375,6 +376,7 @@ def test_commands_may_arrive_in_steps(turns) -> None:
     assert np.nanstd(speed) == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.slow
 def test_unrest_of_rotors_and_trim(tmp_path: Path) -> None:
     air = Air(jitter=1.0, trim_torque=0.01, trim_thrust=0.005)
     history = disturbances(air, LAMA, 50_000, 5, 0.002, np.random.default_rng(1))

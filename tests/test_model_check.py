@@ -68,6 +68,7 @@ def checked(problem: Problem, noise: Noise) -> ModelCheck:
     return model_check(problem, fit, problem.engine.filter(fit.values, fit.noise))
 
 
+@pytest.mark.slow
 def test_nothing_is_said_of_a_right_model(gusty):
     assert checked(*gusty).entry == {
         "prediction": [], "spectrum": [], "commands": [], "words": [],

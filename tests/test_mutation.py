@@ -95,6 +95,7 @@ def test_a_draw_takes_every_part_in_turn_and_does_not_depend_on_other_code():
     assert kept and again == kept
 
 
+@pytest.mark.slow
 def test_every_file_with_numbers_of_its_own_can_be_broken():
     """The rooms that compute, and whatever is compiled but the kernel, which has no equations."""
     files = draw.files_of(ROOT)

@@ -113,6 +113,7 @@ def changing(model, records, effects, row):
     return ChangingModel(model, dict.fromkeys(effects, moment), clock_of(records))
 
 
+@pytest.mark.slow
 def test_moved_from_a_row_on_is_the_model_that_changes_there(short):
     model, records, noise = short
     names, row = ("swash_offset", "gyro_bias", "accel_scale", "torque_balance"), 200
@@ -405,6 +406,7 @@ def test_the_injector_changes_nothing_but_from_its_moment_on(
                 assert jump == pytest.approx(early + share * (late - early), abs=2e-5)
 
 
+@pytest.mark.slow
 def test_what_grows_is_flown_with_every_size_between():
     """All fields alike; before the log begins as at its first row."""
     some = {"swash_lon": 0.02, "cg_x": -1e-3, "per_volt": 0.04}

@@ -110,6 +110,7 @@ def test_a_penalty_is_half_the_squared_distance_in_prior_widths():
 # --- what the data determine -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_covariance_is_the_error_of_a_bayesian_regression():
     """Truths drawn from the prior, data from them: the best differs from the truth by as much."""
     rng = np.random.default_rng(2)

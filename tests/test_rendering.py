@@ -50,6 +50,7 @@ def test_gymnasium_checks_the_pictures_without_a_warning(mode):
         check_env(gymnasium.make("CoaxHeli-v0", render_mode=mode).unwrapped)
 
 
+@pytest.mark.slow
 def test_a_picture_has_its_shape_and_is_reproducible():
     one, other = picture(), picture()
     assert one.shape == (rendering.HEIGHT, rendering.WIDTH, 3) and one.dtype == np.uint8

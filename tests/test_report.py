@@ -447,6 +447,7 @@ def test_a_finger_turns_the_flight(seen):
 # --- what a page says -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -864,6 +865,7 @@ def test_no_line_joins_predictions_across_what_was_cut_out():
     assert [values.size for values in figures._broken(t[:1], t[:1])] == [1, 1]
 
 
+@pytest.mark.slow
 def test_figures_are_plotly_figures():
     go = pytest.importorskip("plotly.graph_objects")
     t = np.arange(0.0, 5.0, 0.01)

@@ -17,6 +17,7 @@ def grid():
     return schedule.design(DRAGGED, LAMA, speeds=(0.0, 1.5, 3.0))
 
 
+@pytest.mark.slow
 def test_of_one_speed_it_is_the_lqg():
     one = schedule.design(DRAGGED, LAMA, speeds=(0.0,))
     same = lqr.design(DRAGGED, LAMA, "mocap", lqr.BRISK)

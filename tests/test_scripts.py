@@ -238,6 +238,7 @@ def test_it_is_refused_in_a_process_of_its_own(what, tmp_path):
     check_refused(script(name, *words, cwd=tmp_path), tmp_path, *said)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(PYTHON_SCRIPTS) - {"coax.py"}))
 def test_a_python_without_the_package_is_told_what_to_run(name, tmp_path):
     """All scripts import `command_line` before any package; ``-S`` hides what is installed. coax.py

@@ -69,6 +69,7 @@ def flown():
     return vehicle, record, starting_noise(flight, vehicle), free, values
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "active"),
     [

@@ -240,6 +240,7 @@ VEHICLES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", list(VEHICLES.values()), ids=list(VEHICLES))
 @pytest.mark.parametrize("name", list(MANEUVERS))
 def test_pilot_brings_every_maneuver_home(vehicle, name):

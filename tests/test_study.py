@@ -463,12 +463,14 @@ def test_a_study_may_begin_with_any_number() -> None:
     assert sorted({f.number for f in later.values()}) == [3, 4]
 
 
+@pytest.mark.slow
 def test_any_part_of_the_arms_is_a_fair_sample() -> None:
     flights = arms.plan_arms(list(arms.ARMS), 50, 60)
     early = [f.arm for f in flights[: len(flights) // 10]]
     assert {early.count(arm) for arm in arms.ARMS} <= {10, 11, 12}
 
 
+@pytest.mark.slow
 def test_every_arm_hides_every_effect_that_its_sensors_can_see() -> None:
     for name, arm in arms.ARMS.items():
         flights = arms.plan_arms([name], 4, 200)

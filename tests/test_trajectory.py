@@ -132,6 +132,7 @@ def test_the_way_and_the_motion_are_observed_in_the_headings_axes():
     assert motion[4:6] == pytest.approx(turn @ acceleration, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("design", "most"), [(lqr.design, 0.05), (pid.design, 0.7)])
 def test_a_circle_is_followed(design, most):
     more = {"limits": lqr.BRISK} if design is lqr.design else {}

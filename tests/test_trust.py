@@ -127,6 +127,7 @@ def believed(replication: Replication) -> bool:
     return not list(on_parts(replication, 8, SETTINGS))
 
 
+@pytest.mark.slow
 def test_a_cause_in_all_runs_returns():
     found = [asked_again(22.0, lambda i: 1.0, lambda i: 1.0, seed) for seed in range(40)]
     judged = [believed(r) for r in found if r]
@@ -135,6 +136,7 @@ def test_a_cause_in_all_runs_returns():
     assert strong == Replication(1.0, 1.0, ())
 
 
+@pytest.mark.slow
 def test_what_one_run_made_does_not():
     """All runs could show it, one alone does: half of the halves have it."""
     found = [asked_again(30.0, lambda i: float(i == 3), lambda i: 1.0, seed) for seed in range(40)]

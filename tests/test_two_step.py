@@ -379,6 +379,7 @@ def total(X, y):
     return total_least_squares(X, y, "abc", LOWER @ LOWER.T, (True, False, False))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("filtered", [False, True])
 def test_total_least_squares_is_unbiased_and_covers(filtered):
     """95 % intervals cover, also where the rows are not independent; least squares is biased."""

@@ -379,6 +379,7 @@ def test_vibration_is_named_and_explains_the_accelerometers(tmp_path):
     assert {u["channel"] for u in forbidden["unexplained"]} >= {"ax", "ay", "az"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loud", [1.0, 2.0])
 def test_louder_noise_is_no_vibration(tmp_path, loud):
     flight = read_flight(injector.fly(tmp_path / "f", {}, gusts=True, runs=TURNING, seed=48))

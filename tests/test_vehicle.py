@@ -252,6 +252,7 @@ def test_unknown_names_in_python():
 # --- draws --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_draws_are_log_normal_with_the_files_mean_and_spread():
     wide = LAMA.with_parameters({"inertia_zz": Parameter(2.5e-3, 1.5e-3, "kg m2", "test")})
     wide = wide.with_parameters({"cg_offset.x": Parameter(0.001, 0.002, "m", "test")})

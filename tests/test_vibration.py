@@ -242,6 +242,7 @@ SOURCES = {("upper", 1): 0.4, ("upper", 2): 0.3, ("lower", 1): 0.25, ("lower", 2
 """Amplitude by rotor and times a turn [m/s2]; twice a turn is 66.5 and 71.3 Hz, read at 90 Hz."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measured_speed", [True, False])
 @pytest.mark.parametrize("without", [None, ("upper", 1), ("lower", 2)])
 def test_both_rotors_shake_once_and_twice_a_turn(without, measured_speed):

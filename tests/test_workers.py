@@ -27,6 +27,7 @@ def backend(request):
     return request.param
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_every_piece_comes_back_once_with_its_own_result(jobs, backend):
     pieces = list(range(11))  # more than a portion of two workers

@@ -341,6 +341,7 @@ LOGGED = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", [LAMA, LOGGED], ids=["bare", "slow actuators"])
 @pytest.mark.parametrize("name", ["lat_doublet", "climb_descend"])
 def test_what_is_logged_is_what_is_flown(vehicle, name):
@@ -449,6 +450,7 @@ def test_a_downdraught_pushes_a_vehicle_that_has_axial_damping():
 AIMED = [(task, sensors) for task in ("position", "waypoints") for sensors in ("mocap", "state")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "sensors"), AIMED)
 def test_check_env_passes_for_every_task_without_a_warning(task, sensors):
     with warnings.catch_warnings():
@@ -726,6 +728,7 @@ def same(one: object, many: dict, name: str, row: int) -> bool:
     return bool(many[f"_{name}"][row]) and np.array_equal(one, many[name][row])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", WORLDS)
 def test_a_row_flies_as_a_single_env_in_any_world(world):
     arguments, n, seed = WORLDS[world], 3, 5
