@@ -497,6 +497,15 @@ def test_a_change_that_a_shock_may_have_made_has_no_name_with_one_thing_more(
 
 
 @pytest.mark.parametrize(
+    ("nats", "falls", "named"), [(27.0, True, False), (27.0, False, True), (29.0, True, True)]
+)
+def test_what_is_worth_little_and_does_not_hold_under_other_noise_has_no_name(nats, falls, named):
+    """An accelerometer's bias of 16 nats, gone at half a gust's memory (**synthetic**, clean)."""
+    of = known_of(nats=nats, falls_at=("half of all",) * falls)
+    assert without_name({"accel_bias": of}, SETTINGS) == (set() if named else {"accel_bias"})
+
+
+@pytest.mark.parametrize(
     ("nats", "of_moment", "named"),
     [(41.0, 21.0, False), (43.0, 21.0, True), (27.0, 43.0, True), (27.0, math.inf, True)],
 )

@@ -110,6 +110,10 @@ class Against:
         """Whether that is so, and it is worth little itself."""
         return self.may_have_been_constant(chosen) and self.nats < chosen.sure_evidence
 
+    def is_weak_and_falls(self, chosen: Settings) -> bool:
+        """Whether it is worth little, and does not hold under other noise."""
+        return bool(self.falls_at) and self.nats < chosen.holding_evidence
+
     def may_be_shock(self, chosen: Settings) -> bool:
         """Whether that is so where gusts come in single shocks."""
         return self.shaken and self.may_have_been_constant(chosen)
@@ -168,6 +172,7 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         if effect in standing_in
         or of.likelier_without
         or of.is_little_change(chosen)
+        or of.is_weak_and_falls(chosen)
         or of.by_speeds_alone
         or voices(effect, of) >= SPEAKING_AGAINST
     }
