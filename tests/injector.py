@@ -1049,8 +1049,10 @@ def _fly_run(
     for i, channel in enumerate(("p", "q", "r", "ax", "ay", "az")):
         columns[channel] = logged[:, 2 + i]
     late = partial(_late, times[:-1], first)
-    attitude = late(readings[:, 8:11], hidden.attitude_delay + hidden.pose_delay)
-    columns["phi"], columns["theta"], columns["psi"] = attitude.T
+    unwrapped = np.unwrap(readings[:, 8:11], axis=0)
+    attitude = late(unwrapped, hidden.attitude_delay + hidden.pose_delay)
+    columns["phi"], columns["theta"] = attitude[:, :2].T
+    columns["psi"] = (attitude[:, 2] + math.pi) % (2.0 * math.pi) - math.pi
     height = -late(readings[:, 13], hidden.sonar_delay + hidden.pose_delay)
     columns["h"] = height * (1.0 + hidden.sonar_tilt * (1.0 / logged[:, 17] - 1.0))
     columns["vn"], columns["ve"], columns["vd"] = logged[:, 14:17].T

@@ -13,10 +13,20 @@ from hypothesis import strategies as st
 from shared_flights import read
 
 from coax_env.errors import InputError
+from coax_env.estimation.flown import flown_parts
+from coax_env.kernel.angles import wrap_angles
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
-from coax_env.logs.outliers import are_answers, find_miscounts, find_outliers, off_median
+from coax_env.logs.outliers import (
+    AWAY,
+    are_answers,
+    find_averaged_headings,
+    find_miscounts,
+    find_outliers,
+    off_median,
+)
 from coax_env.logs.repairs import hold_last
 from coax_env.model.layout import RPM_PER_RAD_S
+from coax_env.model.vehicle_file import load_vehicle
 
 CARD = """
 [vehicle]
@@ -493,6 +503,49 @@ def test_a_counter_that_misses_pulses_reads_no_speed(times):
     for lost in (t < 0.04, (t > 4.0) & (t < 4.04), t > 9.96):  # a command, which the rotor survives
         assert not find_miscounts(speed, np.where(lost, command / times, command)).any()
     assert not find_miscounts(np.full(5, np.nan), np.full(5, 2000.0)).any()
+
+
+@pytest.mark.parametrize(("hz", "left"), [(25.0, 0.6), (100.0, AWAY), (200.0, AWAY)])
+@pytest.mark.parametrize("rate", [0.3, 1.0, 3.0])
+def test_headings_averaged_across_half_a_turn_are_found(
+    hz: float, left: float, rate: float
+) -> None:
+    """Put on other times by straight lines as plain numbers; no sound one is taken for such."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, 12.0, 1.0 / hz)
+    turned = np.pi + rate * (t - 3.0) + 0.1 * np.sin(2.0 * t) + 0.01 * rng.standard_normal(t.size)
+    logged = wrap_angles(turned)
+    assert not find_averaged_headings(t, logged).any()
+    at = t[1:-1] + 0.41 / hz
+    averaged = np.interp(at, t, logged)
+    off = np.abs(wrap_angles(averaged - np.interp(at, t, turned)))
+    found = find_averaged_headings(at, averaged)
+    assert found.any() and not found[off < 1e-9].any() and off[~found].max() < left
+    averaged[::7] = np.nan
+    assert not find_averaged_headings(at, averaged)[::7].any()
+    assert not find_averaged_headings(t[:2], logged[:2]).any()
+
+
+def test_no_run_is_cut_where_a_heading_was_averaged(tmp_path: Path) -> None:
+    """A row's reading is missing there, and nothing else: unwrapped it would lose a turn."""
+    shutil.copytree(BUNDLED, tmp_path, dirs_exist_ok=True)
+    file = tmp_path / "heading_turn.csv"
+
+    def averaged(table: Table) -> None:
+        rows = [k for k, cell in enumerate(table["psi"]) if cell]
+        t = np.array([float(table["t"][k]) for k in rows])
+        psi = np.array([float(table["psi"][k]) for k in rows])
+        psi = wrap_angles(psi + np.pi - psi[t.size // 2])
+        for k, heading in zip(
+            rows, np.interp(t + 0.4 * np.median(np.diff(t)), t, psi), strict=True
+        ):
+            table["psi"][k] = f"{heading:.5f}"
+
+    rewrite([file], averaged)
+    flight = read_flight(tmp_path)
+    flight = flown_parts(flight, load_vehicle(flight.vehicle))
+    (said,) = [note for note in flight.notes if "averaged across half a turn" in note]
+    assert not [note for note in flight.notes if "jumped" in note], said
 
 
 @pytest.mark.slow

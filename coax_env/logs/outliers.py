@@ -7,9 +7,11 @@ command is taken back a row later the rate is a spike. What commands and rotor s
 """
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
+from coax_env.kernel.angles import wrap_angles
 from coax_env.logs.packets import stretches
 from coax_env.model.layout import ANGLES
 
@@ -38,6 +40,16 @@ NEAR = 0.1
 """Part of that by which the reading may be off, since rotors follow their commands late; ours."""
 JUMP = 0.25
 """Share of what is commanded that no rotor gains or loses from one reading to the next; ours."""
+
+AVERAGED_TIME = 0.3
+"""Time [s] between a heading before an average across half a turn and one behind it, or that of two
+rows where rows are slower; ours."""
+MOST_AVERAGED = 15
+"""Rows before, and behind, among which these two are; ours."""
+NEAR_HALF_A_TURN = 0.5
+"""[rad] of half a turn within which these two are; ours."""
+AWAY, TURNS_AWAY = 0.3, 4.0
+"""[rad] and [rad/s]: further or faster than either no heading turns away and back at once; ours."""
 
 ANSWER_ROWS = 12
 """Rows back that a spike's cause may lie: 0.12 s at 100 Hz; ours."""
@@ -192,6 +204,49 @@ def find_miscounts(speed: np.ndarray, command: np.ndarray) -> np.ndarray:
             if begins and (behind == present.size or jumps[behind - 1]):
                 flagged[present[first:behind]] = True
     return flagged
+
+
+def find_averaged_headings(t: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """Where a heading is an average of readings on either side of half a turn, as plain numbers.
+
+    Who puts headings of 3.1 and -3.1 on other times by a straight line has 0 between them. Unwrapped as
+    they are, such readings may lose a whole turn.
+
+    Args:
+        t: (n,) time [s], increasing. heading: (n,) [rad], NaN where there is none.
+
+    Returns:
+        (n,) bool.
+    """
+    flagged = np.zeros(len(heading), dtype=bool)
+    while True:  # what was averaged hides its neighbours
+        present = np.flatnonzero(np.isfinite(heading) & ~flagged)
+        away = _turned_away(t[present], wrap_angles(heading[present]))
+        if not away.any():
+            return flagged
+        flagged[present[away]] = True
+
+
+def _turned_away(t: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """Headings (n,) far from half a turn between two that are near it, before and behind them."""
+    away = np.zeros(heading.size, dtype=bool)
+    if heading.size < 3:
+        return away
+    row = float(np.median(np.diff(t)))
+    longest = max(AVERAGED_TIME, 2.0 * row)
+    rows = range(1, 1 + min(round(longest / row), MOST_AVERAGED))
+    near = np.abs(heading) > np.pi - NEAR_HALF_A_TURN
+    for before, behind in product(rows, rows):
+        apart = before + behind
+        if apart < heading.size:
+            first, last = heading[:-apart], heading[apart:]
+            within = slice(before, heading.size - behind)
+            took = t[apart:] - t[:-apart]
+            off = [np.abs(wrap_angles(heading[within] - other)) for other in (first, last)]
+            far = np.minimum(*off) > np.maximum(AWAY, TURNS_AWAY * took)
+            soon = took <= longest * (1.0 + 1e-9)
+            away[within] |= near[:-apart] & near[apart:] & soon & far
+    return away
 
 
 def _windows(y: np.ndarray) -> np.ndarray:

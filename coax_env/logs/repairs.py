@@ -17,6 +17,7 @@ from coax_env.logs.csv_log import BEYOND_ALL, CsvLog
 from coax_env.logs.held import interpolated, repeats
 from coax_env.logs.outliers import (
     are_answers,
+    find_averaged_headings,
     find_leaps,
     find_miscounts,
     find_outliers,
@@ -267,6 +268,9 @@ def _without_outliers(
             told = f"readings of {channel} at half or twice its speed, left out"
             counts[told] += int(miscounted.sum())
             values = np.where(miscounted, np.nan, values)
+        if channel == "psi" and (averaged := find_averaged_headings(data["t"], values)).any():
+            counts["headings averaged across half a turn, left out"] += int(averaged.sum())
+            values = np.where(averaged, np.nan, values)
         outlier = find_outliers(channel, values, noise.get(channel))
         outlier |= find_leaps(channel, data["t"], values)
         if outlier.any():
