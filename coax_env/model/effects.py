@@ -979,11 +979,17 @@ def sonar_scale(x, f, p, e):
     SENSOR,
     EffectParameter("time", "s", usual=0.1, smallest=0.02, lower=0.0, upper=0.5, timing=True),
     channels="h",
-    source="delayed echo, to first order: h - d h'",
+    source="delayed echo, to second order: h - d h' + d2/2 h''",
 )
 def sonar_delay(x, f, p, e):
     """The height reading is delayed."""
-    f[_HEIGHT] += p[e] * f[_SINK]
+    delay = p[e]
+    if delay != 0.0:
+        mass = f[F.MASS]
+        _, _, down = _in_world_axes(
+            x[S.PHI : S.PSI + 1], f[F.FORCE_X] / mass, f[F.FORCE_Y] / mass, f[F.FORCE_Z] / mass
+        )
+        f[_HEIGHT] += delay * f[_SINK] - 0.5 * delay * delay * (down + p[P.GRAVITY])
 
 
 @effect(
