@@ -230,12 +230,12 @@ def find_averaged_headings(t: np.ndarray, heading: np.ndarray) -> np.ndarray:
 def _turned_away(t: np.ndarray, heading: np.ndarray) -> np.ndarray:
     """Headings (n,) far from half a turn between two that are near it, before and behind them."""
     away = np.zeros(heading.size, dtype=bool)
-    if heading.size < 3:
+    near = np.abs(heading) > np.pi - NEAR_HALF_A_TURN
+    if heading.size < 3 or not near.any():
         return away
     row = float(np.median(np.diff(t)))
     longest = max(AVERAGED_TIME, 2.0 * row)
     rows = range(1, 1 + min(round(longest / row), MOST_AVERAGED))
-    near = np.abs(heading) > np.pi - NEAR_HALF_A_TURN
     for before, behind in product(rows, rows):
         apart = before + behind
         if apart < heading.size:

@@ -746,6 +746,16 @@ def _in_world_axes(attitude, x, y, z):
     return forward * cos_psi - right * sin_psi, forward * sin_psi + right * cos_psi, down
 
 
+@compiled()
+def _acceleration(x, f, p):
+    """Of the centre of gravity, north, east and down [m/s2]."""
+    mass = f[F.MASS]
+    north, east, down = _in_world_axes(
+        x[S.PHI : S.PSI + 1], f[F.FORCE_X] / mass, f[F.FORCE_Y] / mass, f[F.FORCE_Z] / mass
+    )
+    return north, east, down + p[P.GRAVITY]
+
+
 @effect(
     SENSOR,
     EffectParameter("time", "s", usual=0.03, smallest=0.008, lower=0.0, upper=0.3, timing=True),
@@ -756,13 +766,11 @@ def pose_delay(x, f, p, e):
     """Position, height and attitude readings are late; the velocity readings are not."""
     delay = p[e]
     if delay != 0.0:
-        half, mass = 0.5 * delay * delay, f[F.MASS]
-        north, east, down = _in_world_axes(
-            x[S.PHI : S.PSI + 1], f[F.FORCE_X] / mass, f[F.FORCE_Y] / mass, f[F.FORCE_Z] / mass
-        )
+        half = 0.5 * delay * delay
+        north, east, down = _acceleration(x, f, p)
         f[_NORTH] += half * north - delay * f[_SPEED_NORTH]
         f[_EAST] += half * east - delay * f[_SPEED_EAST]
-        f[_HEIGHT] += delay * f[_SINK] - half * (down + p[P.GRAVITY])
+        f[_HEIGHT] += delay * f[_SINK] - half * down
         _attitude_late(x, f, delay)
 
 
@@ -985,11 +993,8 @@ def sonar_delay(x, f, p, e):
     """The height reading is delayed."""
     delay = p[e]
     if delay != 0.0:
-        mass = f[F.MASS]
-        _, _, down = _in_world_axes(
-            x[S.PHI : S.PSI + 1], f[F.FORCE_X] / mass, f[F.FORCE_Y] / mass, f[F.FORCE_Z] / mass
-        )
-        f[_HEIGHT] += delay * f[_SINK] - 0.5 * delay * delay * (down + p[P.GRAVITY])
+        _, _, down = _acceleration(x, f, p)
+        f[_HEIGHT] += delay * f[_SINK] - 0.5 * delay * delay * down
 
 
 @effect(
