@@ -77,7 +77,7 @@ def test_what_leaps_with_its_command_is_not_halfway():
 def test_a_clean_flight_whose_rotor_speeds_are_coarse_has_no_cause(tmp_path):
     """A thrust exponent of 63 and 77 nats on two, with a yaw damping of 218 on one."""
     runs = ("heave_3211", "yaw_3211", "lon_3211")
-    injector.fly(tmp_path, {}, gusts=True, seed=4, runs=runs)
+    injector.fly(tmp_path, {}, gusts=True, seed=4, runs=runs, longest=9.0)
 
     def in_steps(table: Table) -> None:
         for name in ("rpm_upper", "rpm_lower"):

@@ -580,7 +580,9 @@ def test_controllers_come_by_name_and_from_their_files(name, tmp_path):
 
 @pytest.mark.slow
 def test_a_design_on_the_diagnosed_model_halves_the_cost_of_flying_the_machine():
-    content, _, controllers = model_comparison.compare_models(episodes=5)
+    machine = model_comparison.default_machine(LAMA)
+    flight = coax_env.simulate(machine, ("lon_3211", "lat_3211", "yaw_3211", "forward_run"), seed=0)
+    content, _, controllers = model_comparison.compare_models(flight=flight, episodes=5)
     assert content["hidden"] == ["motor_lag", "rotor_drag", "torque_balance"]
     assert {"motor_lag", "rotor_drag"} <= set(content["found"])
     assert content["cost_ratio"]["lqg"] > 2.0

@@ -510,10 +510,10 @@ def test_what_ends_in_flight_is_named_with_its_moment(tmp_path):
 
 @pytest.mark.slow
 def test_what_grows_is_named_as_what_it_is(tmp_path):
-    """A gyro that drifts off in gusts: for ten seconds, in two runs."""
+    """A gyro that drifts off in gusts: for seven seconds, in two runs."""
     hidden = {"gyro_bias": {"y": 0.04, "z": -0.03}}
-    injector.fly(tmp_path, {}, gusts=True, seed=41, runs=RUNS, longest=12.0,
-                 later=hidden, since=("lat_3211", 5.0), growing=10.0)  # fmt: skip
+    injector.fly(tmp_path, {}, gusts=True, seed=41, runs=RUNS, longest=9.0,
+                 later=hidden, since=("lat_3211", 5.0), growing=7.0)  # fmt: skip
     (cause,) = diagnose(tmp_path, hold_out=[]).findings["causes"]
     assert cause["effect"] in hidden
     since, grown = cause["since"], cause["since"]["grown"]

@@ -1,6 +1,7 @@
 """READMEs: what they print is printed, what they name is there, and the first one stays short."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -60,28 +61,52 @@ def test_every_test_named_as_a_proof_is_there():
         assert f"\ndef {name}(" in texts[file], f"{file}::{name}"
 
 
+BOTH = """
+import sys
+import coax_env.diagnosis.diagnose as room
+diagnoses = []
+whole = room.diagnose
+def once(*words, **named):
+    if not diagnoses:
+        diagnoses.append(whole(*words, **named))
+    return diagnoses[0]
+room.diagnose = once
+import demo
+demo.main()
+print({between!r})
+exec({lines!r})
+"""
+BETWEEN = "--- the lines of Python"
+
+
 @pytest.mark.slow
-def test_the_demo_prints_what_readme_says(tmp_path):
+def test_the_demo_and_the_lines_of_python_print_what_readme_says(tmp_path):
     """Word by word and number by number; [...] stands for what README leaves out.
 
-    And what is found is what the bundled flight hides, four effects at once, each sure.
+    And what is found is what the bundled flight hides, four effects at once, each sure. Both diagnose
+    that flight: the lines are given what the demo has found.
     """
     block = README.partition("prints (the bundled flight")[2].partition("\n\n")[2]
     block = block.partition("\n\nand where")[0]
+    lines, printed = ten_lines()
     done = subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "demo.py"), "--no-real", "--out", str(tmp_path)],
+        [sys.executable, "-c", BOTH.format(lines=lines, between=BETWEEN), "--no-real", "--out",
+         str(tmp_path)],
         cwd=tmp_path, capture_output=True, text=True, check=False, timeout=600,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "scripts"), *sys.path])},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-1500:]
+    of_demo, _, of_lines = done.stdout.partition(BETWEEN)
     pattern = ".*?".join(re.escape(part) for part in folded(block).split("[...]"))
-    assert re.search(pattern, folded(done.stdout)), done.stdout
+    assert re.search(pattern, folded(of_demo)), of_demo
+    assert folded(of_lines) == printed
     findings = json.loads((tmp_path / "findings.json").read_text())
     check_causes(findings, *what_it_hides())
     check_all_sure(findings)
 
 
 def ten_lines() -> tuple[str, str]:
-    """README's lines of Python, and what it says they print: test_wheel.py runs them."""
+    """README's lines of Python, and what it says they print."""
     found = re.search(r"```python\n(.*?)```\s+prints\s+(.*?)\n\n(?=\S)", README, re.DOTALL)
     assert found
     return found[1], folded(found[2])

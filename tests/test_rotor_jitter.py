@@ -410,7 +410,7 @@ def test_jitter_is_asked_beside_names_and_in_the_place_of_those_like_it(
 def test_by_poses_alone_jitter_is_no_answer_in_yaw(tmp_path):
     """A clean **synthetic** flight at 60 Hz: a yaw inertia of 20 nats before."""
     planned = arms.planned("mixed_poses", "clean", 11, 607)
-    hide(replace(planned, runs=planned.runs[:5]), tmp_path / "flight")
+    hide(replace(planned, runs=planned.runs[:5], longest=12.0), tmp_path / "flight")
     found = diagnose(tmp_path / "flight")
     assert found.findings["causes"] == []
     assert found.findings["noise"][JITTER_MEMORY]["value"] == pytest.approx(0.05, rel=0.4)

@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
-from test_readme import folded, ten_lines
 
 import coax_env
 from coax_env.errors import DISTRIBUTION
@@ -134,7 +133,6 @@ def test_it_works_where_there_is_no_checkout(coax):
     the_verbs_work(coax)
     data_files_have_come(coax)
     what_is_missing_is_named_with_its_extra(coax)
-    the_readmes_lines_run(coax)
 
 
 def the_verbs_work(coax: Callable[..., Done]) -> None:
@@ -155,6 +153,7 @@ def the_verbs_work(coax: Callable[..., Done]) -> None:
     assert len(coax("fly", code=2).stderr.splitlines()) == 1
     coax("simulate", "--maneuver", "lon_3211,heave_3211", "--out", "my")
     assert "next: coax diagnose" in coax("check_flight", "my/flight").stdout
+    assert coax("diagnose", "my/flight").stdout.startswith("verdict: consistent\n")
 
 
 def data_files_have_come(coax: Callable[..., Done]) -> None:
@@ -181,12 +180,6 @@ def what_is_missing_is_named_with_its_extra(coax: Callable[..., Done]) -> None:
         "coax_env.errors.MissingPackage: this needs pigame, which is not installed: pip install"
         " 'coaxheli[render]', or what it consists of: pip install 'moviepy>=1.0' 'pygame>=2.6'"
     )
-
-
-def the_readmes_lines_run(coax: Callable[..., Done]) -> None:
-    """From a log to a better hover, as README has it."""
-    lines, printed = ten_lines()
-    assert folded(coax(text=lines).stdout) == printed
 
 
 @pytest.mark.slow
