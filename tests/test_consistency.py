@@ -129,27 +129,15 @@ ERRORS_OF_POSITIONS: Mapping[str, tuple[str, str]] = {
 }
 
 
-QUICK = (
-    "theta turned", "one gyro taken for deg/s", "height in cm", "rotors swapped",
-    "velocities swapped", "z up, y left", "rotor as pulse widths", "pn turned",
-)  # fmt: skip
-"""An error of each kind; the others, on other channels, are in the slow tests."""
-
-
-def each(errors: Mapping[str, tuple[str, str]]) -> list:
-    slow = pytest.mark.slow
-    return [pytest.param(what, marks=() if what in QUICK else slow) for what in errors]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("what", each(ERRORS))
+@pytest.mark.parametrize("what", ERRORS)
 def test_an_error_of_a_card_is_refused_with_the_line_to_change(tmp_path, what):
     columns, right = ERRORS[what]
     said_right(planted(BUNDLED, tmp_path / "f", columns), right)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", each(ERRORS_OF_POSITIONS))
+@pytest.mark.parametrize("what", ERRORS_OF_POSITIONS)
 def test_and_where_positions_are_logged(tmp_path, tmp_path_factory, what):
     columns, right = ERRORS_OF_POSITIONS[what]
     sound = with_positions(tmp_path_factory.getbasetemp() / "positions")

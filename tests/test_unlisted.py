@@ -191,9 +191,7 @@ def test_terms_are_no_part_of_the_catalogue():
 # --- found in flight --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("gusts", "size"), [(False, 0.01), pytest.param(True, 0.02, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("gusts", "size"), [(False, 0.01), (True, 0.02)])
 @pytest.mark.slow
 def test_a_force_in_no_list_becomes_part_of_the_model(tmp_path, gusts, size):
     """M = a sin(3 psi), hidden: the right axis, form and size, and no effect of the list is blamed."""
