@@ -82,6 +82,16 @@ def test_poles_are_those_of_a_butterworth_low_pass():
     assert_allclose(b, [poles.sum().real, -np.prod(poles).real], rtol=1e-3)
 
 
+@pytest.mark.parametrize("low_pass", [LowPass(0.008), LowPass(0.009, 2)])
+def test_what_changes_slowly_comes_late_by_its_delay(low_pass):
+    """A ramp, in steps of a thousandth of it, once it has settled."""
+    step = low_pass.time / 1000.0
+    a, b = low_pass.shares(np.array([step]))[:, 0]
+    ramp = step * np.arange(20_000)
+    logged = lfilter([1.0 - a - b], [1.0, -a, -b], ramp)
+    assert ramp[-1] - logged[-1] == pytest.approx(low_pass.delay, rel=2e-3)
+
+
 @pytest.fixture(scope="module")
 def smoothed(tmp_path_factory):
     """**Synthetic**: nothing is hidden, gyros and accelerometers are behind 20 Hz at 1 kHz."""

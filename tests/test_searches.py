@@ -782,6 +782,24 @@ def test_what_hides_behind_a_low_pass(active, own, smoothed, hidden):
 
 
 @pytest.mark.parametrize(
+    ("late", "gyros", "hides"),
+    [
+        (0.048, LowPass(0.004), False),
+        (0.012, LowPass(0.026), True),  # taken back too far, gyros are ahead
+        (0.011, LowPass(0.004), True),
+        (0.016, LowPass(0.004, 2), True),  # late by 5.7 ms
+        (0.018, LowPass(0.004, 2), False),
+    ],
+)
+def test_attitudes_that_come_later_than_a_low_pass_do_so_by_themselves(late, gyros, hides):
+    problem = SimpleNamespace(model=SimpleNamespace(vehicle=SimpleNamespace(effects=())))
+    fit = Fit(("attitude_delay",), {"attitude_delay.time": late}, FINE)
+    passes = {"p": LowPass(0.002), "q": gyros, "ax": LowPass(0.05)}
+    found = hidden_behind(passes, fit, problem)  # type: ignore[arg-type]
+    assert found - {"thrust_exponent"} == ({"attitude_delay"} if hides else set())
+
+
+@pytest.mark.parametrize(
     ("white", "found", "nats", "beside", "taken"),
     [
         (False, ("wind",), 0.0, ["wind"], "steady"),  # not white with strengths: none are used

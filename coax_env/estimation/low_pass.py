@@ -30,6 +30,11 @@ class LowPass(NamedTuple):
         """Frequency [Hz] at which it lets half of the power through."""
         return 1.0 / (2.0 * math.pi * self.time)
 
+    @property
+    def delay(self) -> float:
+        """Time [s] by which it makes late what changes slowly."""
+        return self.time * (1.0 if self.order == 1 else math.sqrt(2.0))
+
     def shares(self, step: np.ndarray) -> np.ndarray:
         """Of the last reading and the one before it in a reading, (2, n).
 
