@@ -786,9 +786,9 @@ def test_what_hides_behind_a_low_pass(active, own, smoothed, hidden):
     [
         (0.048, LowPass(0.004), False),
         (0.012, LowPass(0.026), True),  # taken back too far, gyros are ahead
-        (0.011, LowPass(0.004), True),
-        (0.016, LowPass(0.004, 2), True),  # late by 5.7 ms
-        (0.018, LowPass(0.004, 2), False),
+        (0.007, LowPass(0.004), True),
+        (0.011, LowPass(0.004, 2), True),  # late by 5.7 ms
+        (0.012, LowPass(0.004, 2), False),
     ],
 )
 def test_attitudes_that_come_later_than_a_low_pass_do_so_by_themselves(late, gyros, hides):

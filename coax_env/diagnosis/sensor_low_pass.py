@@ -41,9 +41,9 @@ ALIKE = 4.0
 are tried; chance reaches it once in 4,000 flights. A low-pass of 20 Hz makes 7 to 14 of it in 110 s.
 (Pooled alone one of 43 Hz was not seen beside rotors that jitter: 7.2 and 4.3 of roll and pitch rate,
 -13.7 of yaw rate; a servo's delay of 7,186 nats was not named on that **synthetic** flight.)"""
-LATER = 3.0
-"""Times the delay of gyros' low-pass from which attitudes are late by themselves; ours. What one of
-26 ms took back too far was half of that."""
+LATER = 2.0
+"""Times the delay of gyros' low-pass from which attitudes are late by themselves; ours. Gyros that come
+late make attitudes early, and what one of 26 ms took back too far was half of that."""
 TIMES = (0.4, 0.65, 1.1, 1.8)
 """Of a row, that are tried: 40 to 9 Hz at 100 Hz; ours."""
 FALLS = 2
