@@ -163,7 +163,7 @@ def data_files_have_come(coax: Callable[..., Done]) -> None:
         "from coax_env.identification.two_step.published import table_viii\n"
         "from controllers.loading import make_controller\n"
         "here = Path(coax_env.__file__).parent\n"
-        "flight = coax_env.read_flight(here / 'logs' / 'flights' / 'windy')\n"
+        "flight = coax_env.read_flight('windy')\n"
         "print(json.dumps([str(here), len(flight.runs), list(shipped_vehicles()),"
         " len(table_viii()), make_controller('ppo').kind]))"
     )

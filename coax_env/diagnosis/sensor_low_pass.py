@@ -101,8 +101,8 @@ def hidden_behind(passes: Mapping[str, LowPass], fit: Fit, problem: Problem) -> 
     at_once = "motor_lag" not in {*fit.active, *problem.model.vehicle.effects}
     hidden = {LIKE[ACCELEROMETERS]} if at_once and passes.keys() & set(ACCELEROMETERS) else set()
     of_gyros = max((passes[c].delay for c in GYROS if c in passes), default=0.0)
-    late = fit.values[f"{LIKE[GYROS]}.time"] if LIKE[GYROS] in fit.active else 0.0
-    return hidden | {LIKE[GYROS]} if of_gyros > 0.0 and late < LATER * of_gyros else hidden
+    late = fit.values.get(f"{LIKE[GYROS]}.time", 0.0)
+    return hidden | {LIKE[GYROS]} if late < LATER * of_gyros else hidden
 
 
 def may_hide_behind(problem: Problem, fit: Fit, effect: str) -> bool:
