@@ -110,6 +110,11 @@ SENSORS = {
         NOISE, held={"phi": 2, "theta": 2, "psi": 2, "h": 5, "vn": 10, "ve": 10, "vd": 10}
     ),
     "fifty": Sensors(NOISE, every_row=(2,)),
+    "twenty_five": Sensors(NOISE, every_row=(4,)),
+    "lab_twenty_five": Sensors(
+        {c: std for c, std in NOISE.items() if c in FAST} | LAB_POSE, every_row=(4,),
+        formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"),
+    ),
     "pose_steadied": Sensors(  # by the motion capture's own software
         LAB_POSE, step=0.01,
         steadied=dict.fromkeys(POSE, 10.0), formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"),

@@ -86,7 +86,11 @@ class Pendulum:
         return np.array([{**TRUTH, **values}[name] for name in TRUTH])
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
-        return record.command
+        changes = np.diff(record.command, axis=0, append=record.command[-1:])
+        return record.command + record.of_next * changes
+
+    def between(self, record: Record, vector: np.ndarray) -> np.ndarray:
+        return record.between * np.diff(record.command, axis=0, append=record.command[-1:]) ** 2
 
     def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         return self.start_at.copy(), np.diag(self.start_std**2)

@@ -75,7 +75,27 @@ def test_those_that_explain_half_as_much_as_the_first_are_kept_with_their_number
         Score(e, nats, nats, True) for e, nats in ((PLATE, 286.0), (MARKERS, 264.0), (DRAG, 142.0))
     ]
     assert runners_up(problem, fit_of(), None, strong) == {MARKERS: {NUMBERS[MARKERS]: 0.14}}
-    assert runners_up(problem, fit_of(), None, strong[:1]) == {}
+    assert runners_up(problem, fit_of(), None, strong[2:]) == {}
+
+
+@pytest.mark.parametrize(("first", "other"), [(PLATE, MARKERS), (MARKERS, PLATE)])
+def test_what_turns_alike_is_a_runner_up_however_little_it_explains(
+    problem, monkeypatch, first, other
+):
+    """And is begun at the other's angle. What is in the model, or may not be named, is none."""
+    monkeypatch.setattr(from_afar, "at_optimum", lambda p, fit, q, a, fixed: fit)
+    strong = [Score(first, 286.0, 286.0, True)]
+    others = runners_up(problem, fit_of(), None, strong)
+    assert set(others) == {other}
+    problem.ends = {(DRAG, other): 50.0}
+    fit = fit_of(DRAG, first).at({NUMBERS[first]: -0.1})
+    found = exchanged(problem, fit, None, first, others)
+    assert found is not None and found.active == (DRAG, other)
+    begun = problem.asked[0].values
+    assert (begun[NUMBERS[first]], begun[NUMBERS[other]]) == (0.0, -0.1)
+    assert runners_up(problem, fit_of(other), None, strong) == {}
+    problem.candidates = (first, DRAG)
+    assert runners_up(problem, fit_of(), None, strong) == {}
 
 
 @pytest.mark.parametrize(
@@ -99,7 +119,7 @@ def test_the_likelier_one_takes_its_place(problem, end, occam, worth, large, tak
             (f"{PLATE} -> {MARKERS}", 7.0),
         )
         first = problem.asked[0].values
-        assert (first[NUMBERS[PLATE]], first[NUMBERS[MARKERS]]) == (0.0, 0.14)
+        assert (first[NUMBERS[PLATE]], first[NUMBERS[MARKERS]]) == (0.0, 0.145)
         assert problem.said == [
             "frame_yaw explains it better than swash_phase, by 7.0 nats in the end"
         ]

@@ -23,6 +23,7 @@ from test_estimation import (
 )
 
 from coax_env.estimation import compiled_model, kalman, pass_data
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.sparse import (
     aligned,
     combine,
@@ -109,6 +110,10 @@ def dense_filter(record: Record, p: np.ndarray, R: np.ndarray, q: np.ndarray) ->
         x = step_of(x, record.command[k, 0], dt[k], p)[0]
         grown = [(1.0 - math.exp(-2.0 * d * dt[k])) / (2.0 * d) if d else dt[k] for d in DECAY]
         P = F @ P @ F.T + np.diag(q * grown)
+        if record.between and k < record.t.size - 1:
+            answer = np.array([dt[k] ** 2, dt[k]])  # of angle and rate to the torque
+            change = record.command[k + 1, 0] - record.command[k, 0]
+            P += record.between * change**2 * np.outer(answer, answer)
         found["F"].append(F)
     return {
         **{name: np.array(rows) for name, rows in found.items()},
@@ -135,6 +140,7 @@ def fast_filter(
     kept = pass_data.Covariances(np.zeros((n, 2, 2)), np.arange(n))
     run = pass_data.RunData(np.append(np.diff(record.t), 0.0), record.command, record.z)
     run = run if record.blur is None else run._replace(blur=record.blur)
+    run = run._replace(between=model.between(record, p)) if record.between else run
     start = pass_data.Variances(Pendulum.start_at, np.diag(Pendulum.start_std**2), R, q, DECAY)
     log_likelihood, beyond = kalman.filter_pass(
         compiled_model.CompiledModel.of(model), run, start, p, GATE, refresh, trace, kept
@@ -143,11 +149,12 @@ def fast_filter(
 
 
 @pytest.mark.parametrize("sine", [0.0, 1.0], ids=["linear", "nonlinear"])
-@pytest.mark.parametrize("clock", ["even", "jitters", "wrong"])
+@pytest.mark.parametrize("clock", ["even", "jitters", "wrong", "between"])
 def test_the_pass_is_the_textbooks_filter(sine, clock):
     """States, covariances, innovations, gains, Jacobians and likelihood; with holes and outliers.
 
-    Where the clock is wrong, each reading has a variance of its own beside its channel's.
+    Where the clock is wrong, each reading has a variance of its own beside its channel's. Where the
+    torque changes between the rows, its mean over a row has one.
     """
     values = {**TRUTH, "sine": sine}
     record = with_holes(swing(11, n=200, values=values), 0.3, seed=2)
@@ -159,7 +166,7 @@ def test_the_pass_is_the_textbooks_filter(sine, clock):
         t = DT * np.cumsum(np.random.default_rng(3).uniform(0.3, 2.0, 200))
     R = np.array([NOISE.reading[c] for c in CHANNELS]) ** 2
     blur = R * np.random.default_rng(4).exponential(2.0, z.shape) if clock == "wrong" else None
-    record = replace(record, z=z, t=t, blur=blur)
+    record = replace(record, z=z, t=t, blur=blur, between=0.1 if clock == "between" else 0.0)
     model = Pendulum()
     p = model.vector(values)
     q = model.process_noise(NOISE, p).intensity
@@ -176,6 +183,37 @@ def test_the_pass_is_the_textbooks_filter(sine, clock):
         (trace.gains.H, np.broadcast_to(H, trace.gains.H.shape)),
     ):  # fmt: skip
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_what_changes_at_unknown_times_is_believed_as_little_as_it_deserves(known):
+    """A torque that jumps once within each row, evenly anywhere: its mean is half of the next one's.
+
+    Flown in a hundred steps a row; the covariance then says by how much each reading of the rate is
+    missed, and would say far too little if the mean were taken to be known.
+    """
+    rng, rows, fine = np.random.default_rng(8), 4000, 100
+    torque = 20.0 * rng.standard_normal(rows)
+    x, z = np.zeros(2), np.empty((rows, 3))
+    for k in range(rows):
+        z[k] = x[ANGLE], x[RATE] + TRUTH["bias"], x[RATE]
+        since = rng.uniform(0.0, fine)
+        for i in range(fine):
+            u = torque[k] if i < since else torque[min(k + 1, rows - 1)]
+            rate = x[RATE] + DT / fine * (
+                u - TRUTH["stiffness"] * math.sin(x[ANGLE]) - TRUTH["damping"] * x[RATE]
+            )
+            x = np.array([x[ANGLE] + DT / fine * rate, rate])
+    z += rng.standard_normal(z.shape) * [NOISE.reading[c] for c in CHANNELS]
+    z[:, 0] = wrap_angles(z[:, 0])
+    record = Record(
+        "jumps", DT * np.arange(rows), torque[:, None], z, of_next=0.5,
+        between=0.0 if known else 1.0 / 12.0,
+    )  # fmt: skip
+    noise = NOISE.with_levels({"torque": 1e-3})
+    (run,) = Engine(Pendulum(), [record]).filter({**TRUTH, "sine": 1.0}, noise)
+    missed = float(np.mean(run.innovations[100:, 1:] ** 2))
+    assert missed > 2.0 if known else missed == pytest.approx(1.0, abs=0.04)
 
 
 @pytest.mark.parametrize("factor", [0.4, 3.0])

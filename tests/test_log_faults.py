@@ -10,6 +10,7 @@ from coax_env import load_vehicle
 from coax_env.diagnosis.log_faults import remarks, undone
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.searches.once import Searched
+from coax_env.diagnosis.slow_commands import EVENLY, between_rows
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.low_pass import LowPass
 from coax_env.estimation.state_space import Noise, Record
@@ -31,10 +32,10 @@ UNREAD = np.isin(CHANNELS, ROTOR_SPEEDS)
 
 def found(**but: Any) -> Searched:
     fit = Fit((), {}, Noise({}))
-    of_next = but.pop("of_next", 0.0)
     records = but.pop("records", GIVEN.engine.records)
-    problem = replace(GIVEN.with_records(records), **but)
-    return Searched(problem, fit, fit, fit, None, of_next=of_next)  # type: ignore[arg-type]
+    between = but.pop("between", (0.0, 0.0))
+    problem = replace(GIVEN.with_records(between_rows(records, *between)), **but)
+    return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
 
 def test_of_a_sound_log_nothing_is_changed_or_said():
@@ -50,13 +51,16 @@ def test_of_a_sound_log_nothing_is_changed_or_said():
         ({"commands_late": 0.02}, "commands are written 0.02 s later", True),
         ({"late_imu": {"gyros": 2}}, "gyros 0.02 s", False),
         ({"low_passes": {"p": LowPass(0.01)}}, "come through a low-pass", False),
-        ({"of_next": 0.5}, "0.5 of the way", True),
+        ({"between": (0.5, 0.0)}, "0.5 of the way", True),
+        ({"between": (0.0, EVENLY)}, "when is not known", True),
     ],
 )
 def test_each_fault_is_undone_and_said(fault, words, of_commands):
     before = logged("held out")
     (held,) = undone([before], GIVEN, found(**fault))
-    assert np.array_equal(held.command, before.command) != of_commands
+    as_written = np.array_equal(held.command, before.command)
+    assert (as_written and (held.of_next, held.between) == (0.0, 0.0)) != of_commands
+    assert (held.of_next, held.between) == fault.get("between", (0.0, 0.0))
     assert np.array_equal(held.z, before.z) == of_commands
     (said,) = remarks(GIVEN, found(**fault))
     assert words in said

@@ -691,7 +691,7 @@ def test_what_a_gust_may_have_made_counts_for_nothing():
 def test_a_change_matters_from_its_smallest_size_on():
     """Against what it was before: its number then, or off."""
     model = HeliModel(load_vehicle("lama400d"))
-    problem = SimpleNamespace(model=model)
+    problem = SimpleNamespace(model=model, row=0.01)
     p = next(p for p in model.sized("gyro_bias") if p.name == "y")
     name = "gyro_bias.y"
     off = {"gyro_bias.x": 0.0, "gyro_bias.z": 0.0}
@@ -701,6 +701,21 @@ def test_a_change_matters_from_its_smallest_size_on():
         was = {of_part(n, BEFORE): 0.0 for n in off} | {of_part(name, BEFORE): 5.0 * p.smallest}
         moved = fit.at({name: (5.0 + change) * p.smallest, **was})
         assert trials._matters(problem, moved, "gyro_bias") == matters
+        assert trials._matters(problem, fit, "gyro_bias", 0.5), "half of that is half of it"
+
+
+@pytest.mark.parametrize(
+    ("row", "change", "matters"),
+    [(0.04, 0.034, True), (0.04, 0.030, False), (0.01, 0.009, True), (0.005, 0.007, False)],
+)
+def test_a_delay_has_changed_where_rows_show_it(row, change, matters):
+    """By two std of a difference of two times, each uniform within a row; and by its smallest size."""
+    times = np.random.default_rng(1).uniform(0.0, row, (2, 100_000))
+    assert trials.ROWS_APART * row == pytest.approx(2.0 * np.std(times[0] - times[1]), rel=0.01)
+    problem = SimpleNamespace(model=HeliModel(load_vehicle("lama400d")), row=row)
+    name = "servo_delay.time"
+    values = {name: 0.05, of_part(name, BEFORE): 0.05 - change}
+    assert trials._matters(problem, Fit((), values, NOISE_OF_ALL), "servo_delay") == matters
 
 
 @pytest.fixture
@@ -1126,7 +1141,7 @@ def test_colour_is_asked_of_a_fit_that_has_converged(monkeypatch, gained, colour
         "_with_noise_of": lambda of, fit, other: fit, "_compared": lambda *given: (trial, rivals),
         "converged": lambda of, fit: replace(fit, objective=90.0),
         "quadratic_at": lambda of, fit, free: (fit, quadratic),
-        "_leaves_colour": lambda *given: False,
+        "_leaves_colour": lambda *given: False, "_matters": lambda *given: True,
         "_is_coloured": lambda of, fit, q, effect: coloured and fit.objective > 95.0,
         "_worth": lambda state, of, fit, rivals, q, found: replace(found, nats=-fit.objective),
     }  # fmt: skip
@@ -1176,9 +1191,9 @@ def test_what_is_out_of_reach_could_not_have_become_the_best():
             assert not trial_worth(nats, gained).is_out_of_reach(state, fit)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("reach", [True, False])
-def test_a_step_out_of_reach_is_not_fitted_further(monkeypatch, reach):
-    """Neither is its moment looked for again, nor whether it grew."""
+@pytest.mark.parametrize(("reach", "large"), [(True, True), (True, False), (False, True)])
+def test_a_step_out_of_reach_or_too_small_is_not_fitted_further(monkeypatch, reach, large):
+    """Neither is its moment looked for again, nor whether it grew; that ends at twice a step."""
     state, problem, trial, _ = weighed("begins", 1.0)
     moment, looked = Moment("a", 9.0), []
     candidate = every_moment.Scored("gyro_bias", 20.0, moment, {"gyro_bias.x": 0.01}, False, 20.0)
@@ -1194,15 +1209,18 @@ def test_a_step_out_of_reach_is_not_fitted_further(monkeypatch, reach):
 
     monkeypatch.setattr(trials, "grown_or_step", grown)
     monkeypatch.setattr(trials, "_leaves_colour", lambda *given: False)
+    shares = []
+    monkeypatch.setattr(trials, "_matters", lambda *given: shares.append(given[-1]) or large)
     monkeypatch.setattr(trials.Trial, "is_out_of_reach", lambda self, of, step: not reach)
     state.fit = trial
     best = trial_worth(50.0, 0.0)
-    if reach:
+    if reach and large:
         with pytest.raises(InterruptedError):
             trials.fitted_change(state, state, candidate, {}, best)
     else:
         assert trials.fitted_change(state, state, candidate, {}, best) is None
-    assert len(looked) == 1 + reach
+    assert len(looked) == 1 + (reach and large)
+    assert shares == [0.5] * reach
 
 
 def test_a_cause_that_stands_may_change_for_less_than_a_name():

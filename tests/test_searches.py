@@ -50,7 +50,9 @@ def _steady_rotors(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def _commands_on_time(monkeypatch):
-    """Written when they act, gyros on time, but where a test says otherwise."""
+    """Written when they act, held between the rows, gyros on time, but where a test says otherwise."""
+    stand_in(monkeypatch, "likeliest_between", lambda problem, noise: problem)
+    stand_in(monkeypatch, "held_after_all", lambda first: None)
     stand_in(monkeypatch, "commands_late", lambda first: 0.0)
     stand_in(monkeypatch, "with_imu_on_time", lambda first, smoothed, noise: None)
 
@@ -924,26 +926,43 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     assert asked == (["again", (True, True)] if erring else [(False, False)])
 
 
+@pytest.mark.parametrize("held", [False, True])
+def test_what_commands_do_between_rows_is_asked_first_and_again_beside_what_was_found(
+    monkeypatch, held
+):
+    stand_in(monkeypatch, "likeliest_between", lambda problem, noise: problem.called("on the way"))
+    stand_in(
+        monkeypatch, "held_after_all", lambda first: first.problem.called("held") if held else None
+    )
+    assert searched_names(monkeypatch) == ["on the way", *["held"] * held]
+
+
 def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
     """From the levels that were given, and from there on that problem is the one as given."""
+    stand_in(
+        monkeypatch, "commands_late", lambda first: 0.03 if first.problem.name == "logged" else 0.0
+    )
+    assert searched_names(monkeypatch) == ["logged", "0.03 sooner"]
+
+
+def searched_names(monkeypatch) -> list[str]:
+    """What a log called "logged" is called at each search; each begins at the levels given."""
     levels, asked = Noise({}, {"phi": 0.1}), []
 
     def once_more(problem: Any, noise: Noise) -> Searched:
-        asked.append((problem.name, noise))
+        asked.append(problem.name)
+        assert noise is levels
         fit = Fit((), {}, noise)
         return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
     def of(name: str) -> Any:
         return SimpleNamespace(
-            name=name, report=lambda text: None, smoothed=False,
+            name=name, report=lambda text: None, smoothed=False, called=of,
             with_commands_sooner=lambda seconds: of(f"{seconds:g} sooner"),
         )  # fmt: skip
 
     stand_in(monkeypatch, "rotors_first", lambda problem, noise: None)
     stand_in(monkeypatch, "searched_once", once_more)
-    stand_in(
-        monkeypatch, "commands_late", lambda first: 0.03 if first.problem.name == "logged" else 0.0
-    )
     stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
     stand_in(monkeypatch, "is_lag_unshown", lambda found: False)
     stand_in(monkeypatch, "with_true_times", lambda first, noise: first)
@@ -951,8 +970,8 @@ def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
     stand_in(monkeypatch, "with_errors", lambda found, noise, clock: (found, noise))
     stand_in(monkeypatch, "in_unrest", lambda best, noise, clock, erring: best)
     found = searched.searched(of("logged"), levels, {})
-    assert found.problem.name == "0.03 sooner"  # type: ignore[attr-defined]
-    assert asked == [("logged", levels), ("0.03 sooner", levels)]
+    assert found.problem.name == asked[-1]  # type: ignore[attr-defined]
+    return asked
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,8 @@ def test_headings_on_both_sides_of_north_are_not_a_turn():
 
 TRACKED = Sensors(NOISE | POSE, formats=dict.fromkeys(("h", "pn", "pe"), "%.5f"))
 """Table V's gyros and accelerometers, and a motion capture."""
+SLOW = TRACKED._replace(every_row=(4,))
+"""The same at 25 Hz: of four commands one is logged."""
 ON_AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "heading_turn")
 FAST = ("lon_3211", "lat_3211", "forward_run", "side_run", "heading_turn", "yaw_3211")
 
@@ -86,6 +88,7 @@ HIDDEN = {
     "gyro scale": ({"gyro_scale": {}}, "full", ON_AXES, SHORT),
     "compass": ({"magnetic_field": {}}, "full", ON_AXES, SHORT),
     "markers' axes, gyros aboard": ({"frame_yaw": {}}, "tracked", ON_AXES, SHORT),
+    "markers' axes at 25 Hz": ({"frame_yaw": -0.1}, "slow", ON_AXES, SHORT),
     "markers beside the centre of gravity": ({"marker_offset": {}}, "pose", ON_AXES, SHORT),
     "tether": ({"position_spring": {}}, "tracked", ("forward_run", "side_run"), 20.0),
     "upper blow-back": ({"upper_blowback": {}}, "full", FAST, SHORT),
@@ -107,6 +110,7 @@ def test_what_only_turns_the_heading_is_asked_where_that_is_read(channels, seen)
 def test_a_sensor_or_body_effect_is_named_alone(tmp_path, monkeypatch, case):
     hidden, sensors, runs, longest = HIDDEN[case]
     monkeypatch.setitem(injector.SENSORS, "tracked", TRACKED)
+    monkeypatch.setitem(injector.SENSORS, "slow", SLOW)
     folder = injector.fly(
         tmp_path / "f", hidden, sensors=sensors, runs=runs, longest=longest, seed=21
     )

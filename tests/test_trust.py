@@ -19,6 +19,7 @@ from coax_env.diagnosis import moves, replication, unlisted
 from coax_env.diagnosis.doubts import (
     Against,
     doubts,
+    has_limit,
     of_sizes,
     on_parts,
     sizes,
@@ -305,6 +306,16 @@ def test_a_size_is_unusual_from_two_and_a_half_on_and_a_limit_at_five(size, word
     assert bool(found) == bool(words) and all(words in text for text in found)
 
 
+@pytest.mark.parametrize(("scale", "limited"), [(-0.8, True), (-0.7, False), (0.7, False)])
+def test_what_a_machine_cannot_have_is_a_limit_too(scale, limited):
+    """A yaw inertia of a fifth of the file's, which is four usual sizes."""
+    problem = replace(problem_of(1), model=HeliModel(LAMA))
+    own = {"yaw_inertia": tuple(problem.model.effect_parameters("yaw_inertia"))}
+    fit = Fit(("yaw_inertia",), {"yaw_inertia.scale": scale}, Noise({}))
+    found = sizes(replace(problem, own=own), fit, "yaw_inertia")
+    assert has_limit(found) == limited
+
+
 def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
     """An effect against which nothing speaks but what is said here."""
     sound = Against(
@@ -382,7 +393,7 @@ def test_what_left_explains_nothing_any_more():
     [
         (False, False, False, False, False, 1.0, 100.0, True),
         (False, True, True, False, False, 1.0, 100.0, True),  # a doubtful name
-        (True, True, False, False, False, 1.0, 100.0, True),
+        (True, False, False, False, False, 1.0, 1000.0, False),
         (False, False, False, True, False, 1.0, 100.0, True),
         (False, False, False, False, True, 1.0, 100.0, True),
         (False, False, False, False, False, 0.7, 100.0, True),  # 30 % of the halves are without it

@@ -204,7 +204,7 @@ def diagnose(
     onsets = moments_of(problem, fit, quadratic, evidence, state.onsets)
     fit = confounding.beside_alternatives(problem, fit, quadratic, evidence, found)
     fit = confounding.beside_undecided(problem, fit, quadratic, evidence)
-    if not onsets and not first.of_next:
+    if not onsets:
         fit = slow_commands.beside_straight_lines(problem, fit, quadratic, evidence)
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)
     sensors = {c: sensor_std(flight, c) for c in flight.channels}

@@ -132,11 +132,20 @@ class Against:
 def sizes(problem: Problem, fit: Fit, effect: str) -> dict[str, float]:
     """Numbers of an effect, from its off-value on, in usual sizes, however wide priors are by now.
 
+    One that acts and stands at another limit, as an inertia of a fifth of the file's, has as many as
+    are believed at most.
+
     Args:
         problem, fit: with the effect. effect: an active one.
     """
-    numbers = problem.model.effect_parameters(effect)
-    return {f.name: abs(fit.values[f.name] - f.value) / f.std for f in numbers}
+    acting = set(problem.acting_names(effect))
+    found = {}
+    for f in problem.model.effect_parameters(effect):
+        far = fit.values[f.name] - f.value
+        most = abs((f.upper if far > 0.0 else f.lower) - f.value)
+        limited = f.name in acting and abs(far) > AT_BOUND * most > 0.0
+        found[f.name] = MOST_USUAL_SIZES if limited else abs(far) / f.std
+    return found
 
 
 def is_limit(size: float) -> bool:
@@ -169,7 +178,7 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
     return {
         effect
         for effect, of in against.items()
-        if effect in standing_in
+        if of.at_limit
         or of.likelier_without
         or of.is_little_change(chosen)
         or of.is_weak_and_falls(chosen)

@@ -30,7 +30,7 @@ def undone(held: Sequence[Record], given: Problem, found: Searched) -> list[Reco
     records = late_imu.on_time(records, problem.late_imu, problem.row)
     records = records_before(records, CHANNELS, problem.low_passes)
     records = with_clock_error(records, problem.clock_error)
-    return slow_commands.on_the_way(records, found.of_next)
+    return slow_commands.between_rows(records, *slow_commands.of_rows(problem))
 
 
 def remarks(given: Problem, found: Searched) -> list[str]:
@@ -50,9 +50,7 @@ def remarks(given: Problem, found: Searched) -> list[str]:
         said.append(late_commands.remark(problem.commands_late))
     if problem.late_imu:
         said.append(late_imu.remark(problem.late_imu, problem.row))
-    if found.of_next:
-        said.append(slow_commands.remark(found.of_next))
-    return said
+    return said + slow_commands.remarks(problem)
 
 
 def _without_rotor_speeds(given: Problem, problem: Problem) -> bool:

@@ -1,27 +1,34 @@
-"""What commands did between slow rows: held until the next, or on the way to it.
+"""What commands did between slow rows: held until the next, on the way to it, or not known.
 
 A log at 25 Hz has one command of four. Held until the next, each acts 15 ms late in the mean, which a
 lag or a delay of the machine gives back: on six **synthetic** flights by telemetry motor lags of 60 ms
 were 25 to 52, and the body's reaction to them 0.3 to 0.7 of its size. On straight lines to the next
 row those of four are 56 to 78 ms. But the next command answers what gusts do within the row, which on
 a clean flight makes straight lines 17 to 49 nats less likely. A log at 50 Hz has one command of two: a
-quarter of the next one in the mean. So beside the causes that were found a command is taken to have
-the share of the next one that is likeliest, if that is likelier by a tie; else, between slow rows, how
-far straight lines have each number elsewhere is a part of its std.
+quarter of the next one in the mean. And when within a row a command changed is not known: evenly
+anywhere, its mean over the row has a variance of a twelfth of the change squared, by which rows in
+which commands change much are believed less. Without that, at 25 Hz in still air, a turned swash plate
+had a thrust exponent beside it, 44 and 64 nats (**synthetic**).
+
+So before anything is named a command is taken to have the share of the next one, and that variance or
+none, that are likeliest together, if that is likelier by a tie; beside the causes that were found the
+share is asked again. Between slow rows where none is likelier how far straight lines have each number
+elsewhere is a part of its std.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
 from coax_env.diagnosis.evidence import Evidence, as_far_apart
-from coax_env.diagnosis.fits import converged, fitted, quadratic_at
+from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_at
 from coax_env.diagnosis.from_afar import STEPS
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.diagnosis.searches.once import Searched
+from coax_env.diagnosis.searches.once import Searched, as_given
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.state_space import Record
+from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.held import interpolated
 
 SLOWER = 0.015
@@ -32,9 +39,11 @@ ON_LINES = 0.5
 MOST_KNOWN = 0.6
 """Share of the rows that are on no line at most, where commands are on lines: one of two, and some;
 ours."""
-SHARES = (0.125, 0.25, ON_LINES)
-"""That are tried. On two **synthetic** flights at 50 Hz whose motors lag by 60 ms the first is 60 and
-65 nats likelier than none, with lags of 60 ms for 57; the second is 142 and 127 less likely."""
+EVENLY = 1.0 / 12.0
+"""Variance of a share that may be anything from 0 to 1."""
+SHARES = (0.125, 0.25, 0.375, ON_LINES)
+"""That are tried: where one command of two is logged the mean has 0.25 of the next, of four 0.375, of
+very many 0.5; an eighth is between."""
 
 
 def between_known(records: Sequence[Record]) -> float:
@@ -68,43 +77,97 @@ def of_seldom(between: float) -> str:
     )
 
 
-def remark(share: float) -> str:
+def likeliest_between(problem: Problem, noise: Noise) -> Problem:
+    """The problem whose commands are between the rows as is likeliest by the model as given.
+
+    Args:
+        problem: with commands that are held. noise: levels to start from.
+    """
+    if not problem.row > SLOWER:
+        return problem
+    _, fit = as_given(problem, noise)
+    trials = [_between(problem, *of) for of in product((0.0, *SHARES), (0.0, EVENLY))]
+    trials.sort(key=lambda trial: -_likelihood(trial, fit))
+    gained = _likelihood(trials[0], fit) - _likelihood(problem, fit)
+    if not gained > problem.settings.tie:
+        return problem
+    share, variance = of_rows(trials[0])
+    when = ", changing at unknown times" if variance else ""
+    problem.report(f"commands at {share:g} of the way to the next row's{when}: {gained:.1f} nats")
+    return trials[0]
+
+
+def held_after_all(found: Searched) -> Problem | None:
+    """The problem with commands that are held, where that is likelier by a tie beside what was found.
+
+    What is late looks, before it is found, like commands that changed within the rows.
+
+    Args:
+        found: with commands that are on the way or not known, or not.
+    """
+    if of_rows(found.problem) == (0.0, 0.0) or not found.fit.active:
+        return None
+    held = _between(found.problem, 0.0, 0.0)
+    ends = [fitted(p, noise_fitted(p, found.fit)).objective for p in (found.problem, held)]
+    return held if ends[1] < ends[0] - found.problem.settings.tie else None
+
+
+def of_rows(problem: Problem) -> tuple[float, float]:
+    """Share of the next command in a row's, and the variance of its mean; see Record."""
+    record = problem.engine.records[0]
+    return record.of_next, record.between
+
+
+def between_rows(records: Sequence[Record], share: float, variance: float) -> list[Record]:
+    """Records whose commands are so between the rows; see Record.
+
+    Args:
+        records: with commands as logged. share: of the next one; ON_LINES are the means of straight
+            lines. variance: of the mean.
+    """
+    return [replace(record, of_next=share, between=variance) for record in records]
+
+
+def _between(problem: Problem, share: float, variance: float) -> Problem:
+    return problem.with_records(between_rows(problem.engine.records, share, variance))
+
+
+def _likelihood(problem: Problem, fit: Fit) -> float:
+    return problem.engine.log_likelihood(fit.values, fit.noise)
+
+
+def remarks(problem: Problem) -> list[str]:
     """What was done between the rows, for who reads the findings.
 
     Args:
-        share: of the next command in a row's.
+        problem: with commands as they were taken to be.
     """
-    return (
-        "commands between the rows are taken to be, in the mean, at"
-        f" {share:.3g} of the way from each to the next, which beside the causes is likelier than that"
-        " they are held"
-    )
-
-
-def on_the_way(records: Sequence[Record], share: float) -> list[Record]:
-    """Records whose commands have a share of the next row's.
-
-    Args:
-        records: with commands as logged. share: ON_LINES are the means of straight lines.
-    """
-    found = []
-    for record in records:
-        command = record.command.copy()
-        command[:-1] += share * (record.command[1:] - record.command[:-1])
-        found.append(replace(record, command=command))
-    return found
+    share, variance = of_rows(problem)
+    said = []
+    if share:
+        said.append(
+            "commands between the rows are taken to be, in the mean, at"
+            f" {share:.3g} of the way from each to the next, which is likelier than that they are held"
+        )
+    if variance:
+        said.append(
+            "commands change between the rows, when is not known: rows in which they change much are"
+            " believed less"
+        )
+    return said
 
 
 def likelier_on_the_way(found: Searched) -> Searched:
-    """The same causes with commands on the way to the next row's, where they are likelier so.
+    """The same causes with another share of the next row's command, where they are likelier so.
 
     Args:
-        found: with commands that are held.
+        found: with what was likeliest before they were found.
     """
     problem, fit = found.problem, found.fit
     if not problem.row > SLOWER or not fit.active or found.changing is not None:
         return found
-    trials = {share: _fitted(problem, fit, share) for share in SHARES}
+    now, variance = of_rows(problem)
+    trials = {s: _fitted(problem, fit, s, variance) for s in (0.0, *SHARES) if s != now}
     share = min(trials, key=lambda s: trials[s][1].objective)
     between, other = trials[share]
     gained = fit.objective - other.objective
@@ -112,7 +175,7 @@ def likelier_on_the_way(found: Searched) -> Searched:
         return found
     problem.report(f"commands at {share:g} of the way to the next row's: {gained:.1f} nats")
     other, quadratic = quadratic_at(between, other)
-    return replace(found, problem=between, fit=other, quadratic=quadratic, of_next=share)
+    return replace(found, problem=between, fit=other, quadratic=quadratic)
 
 
 def beside_straight_lines(
@@ -124,13 +187,14 @@ def beside_straight_lines(
         problem, fit: with the causes, and commands that are held. quadratic: linearised at the fit.
         evidence: of the causes.
     """
-    if not problem.has_slow_rows or not fit.active:
+    share, variance = of_rows(problem)
+    if not problem.has_slow_rows or not fit.active or share:
         return fit
-    _, other = _fitted(problem, fit, ON_LINES)
+    _, other = _fitted(problem, fit, ON_LINES, variance)
     return as_far_apart(problem, fit, quadratic, evidence, other)
 
 
-def _fitted(problem: Problem, fit: Fit, share: float) -> tuple[Problem, Fit]:
-    """The problem with commands on the way to the next row's, and the fit of the same effects to it."""
-    between = problem.with_records(on_the_way(problem.engine.records, share))
-    return between, converged(between, fitted(between, fit, STEPS))
+def _fitted(problem: Problem, fit: Fit, share: float, variance: float) -> tuple[Problem, Fit]:
+    """The problem with other commands between the rows, and the fit of the same effects to it."""
+    other = _between(problem, share, variance)
+    return other, converged(other, fitted(other, fit, STEPS))

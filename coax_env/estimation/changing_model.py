@@ -340,6 +340,10 @@ class ChangingModel(HeliModel):
             u[rows] = (own + np.where(back > 0.0, back * (earlier - own), 0.0))[rows]
         return np.column_stack([u, where])
 
+    def between(self, record: Record, vector: np.ndarray) -> np.ndarray:
+        """As `HeliModel.between`, by what the machine is at last."""
+        return self.base.between(record, vector[: self._size])
+
     def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """First state and its covariance, the model's."""
         return self.base.start(record)

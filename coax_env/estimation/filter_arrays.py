@@ -43,6 +43,8 @@ class FilterArrays(NamedTuple):
     probe: Any  # a mean with one state moved
     moved: Any  # drift and readings there
     whole: Any  # a Jacobian of all states as they are (nx + m, nx)
+    u: Any  # inputs of a row with one moved
+    answers: Any  # (k, nx) of the state a row later to each of the first inputs, see RunData.between
     work: Any  # the model's scratch
     lanes: Any  # Lanes of moved states
     per_change: Any  # (width,) 1 / how far a state is moved, 0 of one at rest and beyond the last
@@ -101,7 +103,8 @@ def arrays_of(model, run, assumed, p, shown, channels):
         H=with_places(aligned(m, wide), r), F=with_places(aligned(r, wide), r),
         A=with_places(aligned(r, wide), r), AA=aligned(r, wide), AH=aligned(nx + m, long),
         FP=aligned(wide, wide), PF=aligned(wide, wide), base=np.zeros(nx + m), probe=np.zeros(nx),
-        moved=np.zeros(nx + m), whole=np.zeros((nx + m, nx)), work=np.zeros(model.work_size),
+        moved=np.zeros(nx + m), whole=np.zeros((nx + m, nx)), u=np.zeros(run.u.shape[1]),
+        answers=np.zeros((run.between.shape[1], nx)), work=np.zeros(model.work_size),
         lanes=lanes_of(nx, run.u.shape[1], p, scratch, m), per_change=aligned(1, long)[0],
     )  # fmt: skip
     for j in range(nx):

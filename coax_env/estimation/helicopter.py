@@ -324,10 +324,12 @@ class HeliModel:
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """The kernel's inputs (inputs.py) of steps and of readings, (n, 12), input innovations behind.
 
-        A late command is its mean over the row to the step, that in force as it begins to the readings.
+        A command is its mean over the row to the step, that in force as it begins to the readings.
         """
+        flown = record.command.copy()
+        flown[:-1] += record.of_next * (record.command[1:] - record.command[:-1])
         u = np.zeros((record.t.size, 2, N_INPUTS))
-        u[:, :, :TIME] = record.command[:, None]
+        u[:, 0, :TIME], u[:, 1, :TIME] = flown, record.command
         u[:, :, U.TIME] = (record.t - record.origin)[:, None]
         if record.battery is not None:
             u[:, :, U.BATTERY] = (record.battery - vector[_NOMINAL_VOLTAGE])[:, None]
@@ -335,13 +337,20 @@ class HeliModel:
         for columns, delay in ((ROTORS, late), (SWASH_PLATE, late + swash_later)):
             if delay > 0.0:
                 for column in columns:
-                    command = record.command[:, column]
-                    u[:, 0, column] = row_means(record.t, command, -delay)
-                    u[:, 1, column] = self._read(record.t, command, delay)
+                    u[:, 0, column] = row_means(record.t, flown[:, column], -delay)
+                    u[:, 1, column] = self._read(record.t, record.command[:, column], delay)
         both = u.reshape(record.t.size, -1)
         if record.input_innovations is None:
             return both
         return np.hstack([both, record.input_innovations])
+
+    def between(self, record: Record, vector: np.ndarray) -> np.ndarray:
+        """Variance of each command's mean over a row (n, 4), which comes as late as the command."""
+        changes = np.diff(record.command, axis=0, append=record.command[-1:])
+        late, swash_later = max(vector[_COMMAND_DELAY], 0.0), max(vector[_SERVO_DELAY], 0.0)
+        delays = [late + swash_later if j in SWASH_PLATE else late for j in range(changes.shape[1])]
+        means = [row_means(record.t, c**2, -d) for c, d in zip(changes.T, delays, strict=True)]
+        return record.between * np.column_stack(means)
 
     def _read(self, t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
         """A late command (n,) as readings at the rows' times `t` see it."""

@@ -53,6 +53,8 @@ SAME_STEP = 1e-6
 """Steps that differ by no more of themselves are the same: what is left of a clock's rounding."""
 LEAST, MOST = 1e-100, 1e100
 """Of a product of variances before its logarithm is taken; far from the least and largest number."""
+SMALL = 1e-4
+"""Of one and an input, by which that is moved to see what it does; ours."""
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -181,6 +183,35 @@ def _grow(assumed, dt, strength, k, w):
 
 
 @compiled(**REORDER)
+def _take_answers(model, u, dt, p, w):
+    """What each of the first inputs does to the state a row later, into `answers`, per its unit."""
+    model.step(w.x, u, dt, p, w.work, w.x_next)
+    _store_row(u, w.u)
+    for j in range(w.answers.shape[0]):
+        w.u[j] += SMALL * (1.0 + abs(u[j]))
+        change = w.u[j] - u[j]
+        model.step(w.x, w.u, dt, p, w.work, w.answers[j])
+        w.u[j] = u[j]
+        for i in range(w.x.size):
+            w.answers[j, i] = (w.answers[j, i] - w.x_next[i]) / change
+
+
+@compiled(**REORDER)
+def _grow_by_inputs(between, rows, w):
+    """What inputs whose mean over a row is not known add to the growth of the covariance.
+
+    Args:
+        between: (k,) variance of each. rows: how long the row is, in those of `answers`.
+    """
+    for j in range(between.size):
+        variance = between[j] * rows * rows
+        for a in range(w.K.size):
+            share = variance * w.answers[j, w.order[a]]
+            for b in range(w.K.size):
+                w.Q[a, b] += share * w.answers[j, w.order[b]]
+
+
+@compiled(**REORDER)
 def _predict(w):
     """P = F P F' + Q as F (F P)', and the mean of the step."""
     multiply(w.F, w.P, w.FP)
@@ -231,6 +262,7 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
     product = 1.0  # of variances whose logarithm is not yet in the likelihood: one for many
     deweighted, reading, F_slot = 0, 0, -1
     dt_of_F = dt_now = dt_of_Q = -1.0  # steps at which F and Q were computed, and F is scaled to
+    dt_of_answers = -1.0
     for k in range(n):
         z, u, dt = run.z[k], run.u[k], run.dt[k]
         fresh = k % refresh == 0
@@ -287,6 +319,9 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
                     trace.path.P[k, d, j] = w.P[at, j] if at >= 0 else 0.0
         if k == n - 1:
             break
+        if run.between.size and (fresh or abs(dt - dt_of_answers) > 0.5 * dt_of_answers):
+            _take_answers(model, u, dt, p, w)
+            dt_of_answers = dt
         model.step(w.x, u, dt, p, w.work, w.x_next)
         changed = True
         if fresh or abs(dt - dt_of_F) > 0.5 * dt_of_F:
@@ -309,7 +344,12 @@ def _filter_rows(model, run, assumed, p, gate, refresh, trace, covariances, w):
         if abs(dt - dt_of_Q) > SAME_STEP * dt or strength_changes(run.strength, k, k - 1):
             _grow(assumed, dt, run.strength, k, w)
             dt_of_Q = dt
+        if run.between.size:
+            _grow_by_inputs(run.between[k], dt / dt_of_answers, w)
         _predict(w)
+        if run.between.size:
+            w.Q[:, :] = 0.0  # of the next row, whose inputs change otherwise
+            dt_of_Q = -1.0
     return log_likelihood - 0.5 * math.log(product), deweighted, False
 
 

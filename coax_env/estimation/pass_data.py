@@ -15,7 +15,8 @@ class RunData(NamedTuple):
 
     dt: (n,) seconds from each row to the next. u: (n, nu). z: (n, m), NaN where missing.
     strength: of its process noise, see state_space.Strength. blur: (n, m) variance of each reading
-    beyond its channel's; (1, 0): none.
+    beyond its channel's; (1, 0): none. between: (n, k) variance of what each of the first k inputs
+    was in the mean over a row; (0, 0): it is known.
     """
 
     dt: np.ndarray
@@ -23,6 +24,7 @@ class RunData(NamedTuple):
     z: np.ndarray
     strength: Strength = STEADY
     blur: np.ndarray = np.zeros((1, 0))
+    between: np.ndarray = np.zeros((0, 0))
 
 
 class Variances(NamedTuple):
@@ -91,7 +93,7 @@ class Covariances(NamedTuple):
 
 
 STRENGTH = types.NamedTuple([INDICES, MATRIX], Strength)
-RUN_DATA = types.NamedTuple([VECTOR, MATRIX, MATRIX, STRENGTH, MATRIX], RunData)
+RUN_DATA = types.NamedTuple([VECTOR, MATRIX, MATRIX, STRENGTH, MATRIX, MATRIX], RunData)
 VARIANCES = types.NamedTuple([VECTOR, MATRIX, VECTOR, VECTOR, VECTOR], Variances)
 GAINS = types.NamedTuple([float32[:, ::1], VECTOR, float32[:, :, ::1], INDICES], Gains)
 PATH = types.NamedTuple(

@@ -144,6 +144,7 @@ class RunPasses:
         x0, P0 = self.starts[i]
         P0 = P0 + np.diag(self.model.start_noise(noise))
         blur = np.zeros((1, 0)) if record.blur is None else np.ascontiguousarray(record.blur)
+        between = self.model.between(record, p) if record.between > 0.0 else np.zeros((0, 0))
         e = np.full((n, m), np.nan)
         states = np.zeros((n, nx))
         count, rows, buffers = (0, 0, Buffers()) if keep is None else (_readings(record), n, keep)
@@ -165,7 +166,7 @@ class RunPasses:
         gains = Gains(K, per_sigma, H, shown)
         path = Path(F, F_of, predicted, decaying, rows_of_P, beyond)
         log_likelihood, deweighted = kalman.filter_pass(
-            self.compiled, RunData(self.intervals[i], u, record.z, record.strength, blur),
+            self.compiled, RunData(self.intervals[i], u, record.z, record.strength, blur, between),
             Variances(x0, P0, R, q, decay), p, GATE, self.refresh[i],
             Trace(states, e, gains, path), Covariances(P, slots),
         )  # fmt: skip

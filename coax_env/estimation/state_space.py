@@ -77,6 +77,9 @@ class Record:
     input_innovations: (n, k) what each command shows beyond the readings before it, or None
     (input_innovations.py). battery: (n,) its voltage [V], or None. strength: of its process noise.
     blur: (n, m) variance of each reading beyond its level's (clock_errors.py), or None.
+    of_next: share of the next row's command in what is commanded over a row in the mean, which readings
+    at its beginning do not see (slow_commands.py); 0: it is held. between: variance of that mean, in
+    squares of the change to the next row; 0: it was so.
     air: level of the process noise -> times which it is on this run (run_air.py).
     late: which readings can be moved back, or None.
     """
@@ -91,6 +94,8 @@ class Record:
     battery: np.ndarray | None = None
     strength: Strength = STEADY
     blur: np.ndarray | None = None
+    of_next: float = 0.0
+    between: float = 0.0
     air: Mapping[str, float] = field(default_factory=dict)
     late: Late | None = None
 
@@ -204,6 +209,9 @@ class Model(Protocol):
 
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """Inputs (n, nu) of the compiled functions, row by row."""
+
+    def between(self, record: Record, vector: np.ndarray) -> np.ndarray:
+        """Variance of the first k inputs' means over each row (n, k), of a record that has some."""
 
     def start(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """First state (nx,) and its covariance (nx, nx), from the record's first readings."""

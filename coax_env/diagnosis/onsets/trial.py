@@ -29,6 +29,13 @@ Measured on eight synthetic flights (study_changes.py, seed 40): 260 at most, of
 LEFT = 0.5
 """Share of a channel's colour that a step may leave where it shows: what leaves more is not what
 colours the channel, as a step or growing, and growth takes three times as long to fit; ours."""
+ROWS_APART = 2.0 * math.sqrt(2.0 / 12.0)
+"""Rows by which a lag or delay must change: two std of a difference, each time being known to a row
+over the root of 12 (fitted_vehicle.with_timing). At 25 Hz a step of the commands acts up to a row
+before it is logged, in each run elsewhere: a late command of 8 ms "ended" after two runs, 99 nats
+(**synthetic**)."""
+OF_GROWTH = 0.5
+"""Of what must change, what a step must be to be fitted as growing: that ends at twice its mean."""
 OVER = (0.5, 1.5)
 """s before and after a moment in which a gust may have made the evidence; ours."""
 
@@ -88,6 +95,8 @@ def fitted_change(
     problem, found = moved_to_best(problem, trial, effect)
     trial = step = fitted(problem, noise_fitted(problem, trial), steps=2)
     if best is not None and best.is_out_of_reach(state, step):
+        return None
+    if not _matters(problem, step, effect, OF_GROWTH):
         return None
     problem, found = moved_to_best(problem, trial, effect)
     if _leaves_colour(state, problem, trial, effect):
@@ -237,12 +246,17 @@ def _is_coloured(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) 
     return not are_white(white, channels_of(problem, fit, quadratic, effect))
 
 
-def _matters(problem: Problem, fit: Fit, effect: str) -> bool:
-    """Whether what changes is large enough to matter in prediction."""
+def _matters(problem: Problem, fit: Fit, effect: str, share: float = 1.0) -> bool:
+    """Whether what changes is large enough to matter in prediction, a time to be seen between rows.
+
+    Args:
+        problem, fit: with the change. effect: that changes. share: of that size that is enough.
+    """
     for p in problem.model.sized(effect):
         name = f"{effect}.{p.name}"
         was = fit.values.get(of_part(name, BEFORE), p.off)
-        if p.smallest > 0.0 and abs(fit.values[name] - was) >= p.smallest:
+        least = max(p.smallest, ROWS_APART * problem.row) if p.timing else p.smallest
+        if p.smallest > 0.0 and abs(fit.values[name] - was) >= share * least:
             return True
     return False
 

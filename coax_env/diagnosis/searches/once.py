@@ -34,7 +34,6 @@ class Searched:
     problem: what was searched.
     coarse: whether readings were taken to be no finer than LEAST_READING_STD.
     changing: with what began or changed in flight, where that has been asked already.
-    of_next: share of the next row's command in a row's, 0 where commands are held (slow_commands.py).
     air_asked: whether it has been asked if runs have air of their own.
     """
 
@@ -45,7 +44,6 @@ class Searched:
     quadratic: Quadratic
     coarse: bool = False
     changing: Changing | None = None
-    of_next: float = 0.0
     air_asked: bool = False
 
     @property

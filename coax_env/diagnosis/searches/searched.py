@@ -3,6 +3,7 @@
 A search may leave innovations coloured, or name what another noise explains. So it is asked in this
 order what the log has, and where it has that, the search is done again with it:
 
+- what commands do between slow rows (slow_commands.py), before the first search
 - commands that are written later than they act (estimation/late_commands.py)
 - what moves the rotors, alone; rotor speeds that come late, or jitter (rotors.py): nothing else touches
   these readings
@@ -37,6 +38,7 @@ from coax_env.diagnosis.searches.rotors import (
     with_late_speeds,
 )
 from coax_env.diagnosis.searches.unrest import in_own_air, in_unrest
+from coax_env.diagnosis.slow_commands import held_after_all, likeliest_between
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.late_commands import written_late
 from coax_env.estimation.state_space import Noise
@@ -51,7 +53,13 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         clock: of all runs in the order in which they were flown.
     """
     given = noise
+    problem = likeliest_between(problem, given)
     first, noise = _first(problem, given)
+    held = held_after_all(first)
+    if held is not None:
+        problem = held
+        problem.report("searching again with commands that are held between the rows")
+        first, noise = _first(problem, given)
     late_by = commands_late(first)
     if late_by > 0.0:
         problem = problem.with_commands_sooner(late_by)
