@@ -97,12 +97,10 @@ ARMS = {
     "resampled": Arm("readings of 10-50 Hz on one clock by straight lines", sensors=("resampled",)),
     "held": Arm("readings of 10-50 Hz, each written again until the next", sensors=("held",)),
     "fifty": Arm("every second row of 100 Hz", sensors=("fifty",)),
-    "twenty_five": Arm(
-        "every fourth row of 100 Hz: all sensors, or a motion capture beside inertial ones",
-        sensors=("twenty_five", "lab_twenty_five"),
-    ),
-    "still_twenty_five": Arm(
-        "the same in still air", STILL, sensors=("twenty_five", "lab_twenty_five")
+    "twenty_five": Arm("every fourth row of 100 Hz", sensors=("twenty_five",)),
+    "lab_twenty_five": Arm(
+        "the same of a motion capture beside inertial sensors, in still air", STILL,
+        sensors=("lab_twenty_five",),
     ),
     "pose_steadied": Arm(
         "CoaX class, a motion capture whose software smooths at 10 Hz, forwards and back",
