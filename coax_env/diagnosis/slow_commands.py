@@ -86,15 +86,15 @@ def likeliest_between(problem: Problem, noise: Noise) -> Problem:
     if not problem.row > SLOWER:
         return problem
     _, fit = as_given(problem, noise)
-    trials = [_between(problem, *of) for of in product((0.0, *SHARES), (0.0, EVENLY))]
-    trials.sort(key=lambda trial: -_likelihood(trial, fit))
-    gained = _likelihood(trials[0], fit) - _likelihood(problem, fit)
+    trials = {of: _between(problem, *of) for of in product((0.0, *SHARES), (0.0, EVENLY))}
+    nats = {of: _likelihood(trial, fit) for of, trial in trials.items()}
+    share, variance = likeliest = max(nats, key=lambda of: nats[of])
+    gained = nats[likeliest] - nats[0.0, 0.0]
     if not gained > problem.settings.tie:
         return problem
-    share, variance = of_rows(trials[0])
     when = ", changing at unknown times" if variance else ""
     problem.report(f"commands at {share:g} of the way to the next row's{when}: {gained:.1f} nats")
-    return trials[0]
+    return trials[likeliest]
 
 
 def held_after_all(found: Searched) -> Problem | None:

@@ -333,12 +333,10 @@ class HeliModel:
         u[:, :, U.TIME] = (record.t - record.origin)[:, None]
         if record.battery is not None:
             u[:, :, U.BATTERY] = (record.battery - vector[_NOMINAL_VOLTAGE])[:, None]
-        late, swash_later = max(vector[_COMMAND_DELAY], 0.0), max(vector[_SERVO_DELAY], 0.0)
-        for columns, delay in ((ROTORS, late), (SWASH_PLATE, late + swash_later)):
+        for column, delay in enumerate(_delays(vector)):
             if delay > 0.0:
-                for column in columns:
-                    u[:, 0, column] = row_means(record.t, flown[:, column], -delay)
-                    u[:, 1, column] = self._read(record.t, record.command[:, column], delay)
+                u[:, 0, column] = row_means(record.t, flown[:, column], -delay)
+                u[:, 1, column] = self._read(record.t, record.command[:, column], delay)
         both = u.reshape(record.t.size, -1)
         if record.input_innovations is None:
             return both
@@ -347,9 +345,8 @@ class HeliModel:
     def between(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """Variance of each command's mean over a row (n, 4), which comes as late as the command."""
         changes = np.diff(record.command, axis=0, append=record.command[-1:])
-        late, swash_later = max(vector[_COMMAND_DELAY], 0.0), max(vector[_SERVO_DELAY], 0.0)
-        delays = [late + swash_later if j in SWASH_PLATE else late for j in range(changes.shape[1])]
-        means = [row_means(record.t, c**2, -d) for c, d in zip(changes.T, delays, strict=True)]
+        columns = zip(changes.T, _delays(vector), strict=True)
+        means = [row_means(record.t, change**2, -delay) for change, delay in columns]
         return record.between * np.column_stack(means)
 
     def _read(self, t: np.ndarray, command: np.ndarray, delay: float) -> np.ndarray:
@@ -440,6 +437,12 @@ _SERVO_DELAY = effects.parameter_index("servo_delay.time")
 _NOMINAL_VOLTAGE = effects.parameter_index("battery_voltage.nominal")
 ROTORS, SWASH_PLATE = (U.OMEGA_U, U.OMEGA_L), (U.DELTA_LON, U.DELTA_LAT)
 """Columns of the input that command_delay alone and that servo_delay too make late."""
+
+
+def _delays(vector: np.ndarray) -> list[float]:
+    """Delay of each command [s]: command_delay makes all late, servo_delay the swash plate's, too."""
+    late, swash_later = max(vector[_COMMAND_DELAY], 0.0), max(vector[_SERVO_DELAY], 0.0)
+    return [late + swash_later if column in SWASH_PLATE else late for column in range(TIME)]
 
 
 def _to_the_middle(t: np.ndarray, delay: float) -> np.ndarray:
