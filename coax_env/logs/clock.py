@@ -53,6 +53,8 @@ def on_even_clock(runs: Sequence[Repaired], counts: Counter[str]) -> list[Repair
     Args:
         runs: of one flight. counts: what was repaired -> how often; rows with other times are added.
     """
+    if not any(_are_uneven(run.t) for run in runs):  # the rest takes long
+        return list(runs)
     slope, std = slope_of(runs)
     if not (slope < WRONG and std < UNSURE) or are_steep(runs):
         return list(runs)
@@ -98,17 +100,28 @@ def _off_the_middle(run: Repaired) -> Iterator[tuple[np.ndarray, np.ndarray]]:
             yield expected[kept] / scatter, seen[kept] / scatter
 
 
+def _are_uneven(t: np.ndarray) -> bool:
+    """Whether times of rows (n,) scatter so that there is something to mend, and it can be."""
+    scatter, step = _scatter_and_step(t)
+    return UNEVEN * step < scatter < LARGEST * step
+
+
+def _scatter_and_step(t: np.ndarray) -> tuple[float, float]:
+    """By how much times of rows (n,) scatter, and how far rows are apart [s]; 0 where they are few."""
+    scatter = float(median_abs_deviation(np.diff(t), scale="normal")) / math.sqrt(2.0)
+    step = float(np.median(t[AHEAD:] - t[:-AHEAD])) / AHEAD if t.size > 2 * AHEAD else 0.0
+    return scatter, step
+
+
 def even_times(t: np.ndarray) -> np.ndarray:
     """Times of rows (n,) on an even clock, lost rows left out; as they are where it is not clear.
 
     Args:
         t: as logged [s].
     """
-    steps = np.diff(t)
-    scatter = median_abs_deviation(steps, scale="normal") / math.sqrt(2.0)
-    step = float(np.median(t[AHEAD:] - t[:-AHEAD])) / AHEAD if t.size > 2 * AHEAD else 0.0
-    if not UNEVEN * step < scatter < LARGEST * step:
+    if not _are_uneven(t):
         return t
+    scatter, step = _scatter_and_step(t)
     for _ in range(3):  # the step's length, and where rows were lost, in turns
         place = _places(t, step)
         step, first = np.polyfit(place, t, 1)

@@ -48,12 +48,14 @@ class CsvLog:
 
 @dataclass(frozen=True)
 class _Cells:
-    """A CSV as text: the header, the rows that hold anything, and the line each of them ends on."""
+    """A CSV as text: the header, the rows that hold anything, the line each of them ends on, and the
+    same by columns."""
 
     path: Path
     header: list[str]
     rows: list[list[str]]
     lines: list[int]
+    columns: list[tuple[str, ...]]
 
 
 def read_csv(
@@ -154,14 +156,15 @@ def _split(path: Path, text: str) -> _Cells:
             raise InputError(f"{path}: {times} columns are named {name!r}")
     if not rows:
         raise InputError(f"{path}: a header and no rows")
-    return _Cells(path, header, rows, lines)
+    return _Cells(path, header, rows, lines, list(zip(*rows, strict=True)))
 
 
 def _numbers(cells: _Cells, column: int, name: str) -> np.ndarray:
     """A column's numbers (n,), NaN where a cell is empty."""
-    texts = [row[column] for row in cells.rows]
+    texts = cells.columns[column]
     try:
-        values = np.array([float(text) if text else np.nan for text in texts])
+        filled = [text or "nan" for text in texts] if "" in texts else texts
+        values = np.fromiter(map(float, filled), float, len(texts))
         if not np.isinf(values).any() and "_" not in "".join(texts):
             return values
     except ValueError:

@@ -87,6 +87,8 @@ def _row_numbers(present: np.ndarray, t: np.ndarray | None) -> np.ndarray:
     if t is None:
         return present
     step = np.diff(t)
+    if not step.size or step.max() <= MISSING * step.min():  # none can be missing
+        return present
     usual = float(np.median(step))
     missing = np.where(step > MISSING * usual, np.round(step / usual) - 1.0, 0.0)
     return present + np.append(0.0, np.cumsum(missing)).astype(int)[present]
@@ -103,8 +105,12 @@ def _off_beat(rows: np.ndarray, changes: np.ndarray) -> np.ndarray | None:
     """
     if changes.size < FEWEST_ON_IT:
         return None
+    at = rows[changes]
+    # every change that is off a beat spoils two steps at most: too many by one row, and there is none
+    if np.count_nonzero(np.diff(at) == 1) > 2.0 * (1.0 - ON_THE_BEAT) * at.size:
+        return None
     for beat in range(SLOWEST_BEAT, 1, -1):
-        counts = np.bincount(rows[changes] % beat, minlength=beat)
+        counts = np.bincount(at % beat, minlength=beat)
         if counts.max() >= ON_THE_BEAT * changes.size:
             return np.asarray(rows % beat != counts.argmax())
     return None
