@@ -310,19 +310,17 @@ def _fault_of(c: Coefficient, gusts_felt: bool, rows: EvenRows) -> Fault | None:
         and -c.share > LEAST_SHARE
     ):
         return Fault(c.check, f"{c.left} goes {measured} times as {c.part} says", channels)
-    if _are_at_one_level(c, rows):
-        return None
     most = MOST if c.exact else MOST_OF_A_MACHINE
-    if c.value - CLEAR_OF * c.std > most and c.share > LEAST_SHARE:
-        return Fault(c.check, f"{c.left} goes {measured} times as far as {c.part} says", channels)
+    large = c.value - CLEAR_OF * c.std > most and c.share > LEAST_SHARE
     # a small one is a unit only where no gust, unfelt, and no noise can have made it so
-    if (
+    small = (
         c.exact
         and gusts_felt
         and c.share > LEAST_SHARE_OF_SMALL
         and c.strength > LEAST_STRENGTH  # of a few windows some such share is by chance
         and c.value + CLEAR_OF * c.std < LEAST
-    ):
+    )
+    if (large or small) and not _are_at_one_level(c, rows):
         return Fault(c.check, f"{c.left} goes {measured} times as far as {c.part} says", channels)
     return None
 

@@ -8,6 +8,7 @@ their commands; of them only the sign is asked, and the size within a factor.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.signal import lfilter
@@ -212,14 +213,21 @@ def _flapping(machine: Machine, forced: np.ndarray, edges: tuple[int, ...]) -> n
     modes = np.linalg.inv(vectors) @ forced
     first, rows = np.array(edges[:-1]), np.diff(edges)
     modes -= np.repeat(np.add.reduceat(modes, first, axis=1) / rows, rows, axis=1)
-    since = np.arange(edges[-1]) - np.repeat(first, rows)
     for k, value in enumerate(values):
         stays = np.exp(value * STEP)
-        left = stays ** np.arange(1, rows.max() + 1)
         through = lfilter([STEP], [1.0, -stays], modes[k])  # all runs as one...
         before = np.where(first > 0, through[first - 1], 0.0)
-        modes[k] = through - np.repeat(before, rows) * left[since]  # ...less what came over
+        modes[k] = through - np.repeat(before, rows) * _left(stays, edges)  # ...less what came over
     found: np.ndarray = np.real(vectors @ modes)
+    return found
+
+
+@lru_cache(maxsize=8)  # every change of a card asks for the same again
+def _left(stays: complex, edges: tuple[int, ...]) -> np.ndarray:
+    """What is left in each row (n,) of a mode before its run began; stays: from one row to the next."""
+    rows = np.diff(edges)
+    since = np.arange(edges[-1]) - np.repeat(edges[:-1], rows)
+    found: np.ndarray = (stays ** np.arange(1, rows.max() + 1))[since]
     return found
 
 
