@@ -1,7 +1,7 @@
 """A log that contradicts itself is refused with the line of its card to change; a sound one never is.
 
-Errors are planted through the card of a sound log, so that the right line is known: the entry
-without the error.
+Errors are planted as the card of a sound log would bring them, so that the right line is known: the
+entry without the error.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from pathlib import Path
 import injector
 import numpy as np
 import pytest
-from bundled_flight import BUNDLED, bundled, copied
+from bundled_flight import bundled, copied
 from shared_flights import read
 
 from coax_env.comparison.two_flights import read_two
@@ -21,22 +21,19 @@ from coax_env.consistency.checks import names
 from coax_env.consistency.even_rows import STEP, even_rows, weak
 from coax_env.errors import InputError
 from coax_env.estimation.flown import flown_parts
+from coax_env.logs.card import read_card
+from coax_env.logs.card_columns import Column
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
+from coax_env.logs.units import ROTOR_COMMANDS, SWASH_COMMANDS
+from coax_env.model.layout import RPM_PER_RAD_S
 from coax_env.model.sensors import log_suite
 from coax_env.model.vehicle_file import load_vehicle
 from coax_env.simulation.simulate import fly_all, log_flight
 
-RUNS = (
-    "lon_3211",
-    "lat_3211",
-    "yaw_3211",
-    "climb_descend",
-    "forward_run",
-    "side_run",
-    "heading_turn",
-)
+RUNS = ("forward_run", "side_run", "heading_turn", "climb_descend")
 """Of a flight, that its errors are planted into: every axis."""
 MANEUVERS = ("lon_3211", "lat_3211", "heading_turn", "climb_descend")
+COMMANDS = (*ROTOR_COMMANDS, *SWASH_COMMANDS)
 
 
 def checked(flight: Flight, waive: tuple[str, ...] = ()) -> Agreement:
@@ -45,19 +42,39 @@ def checked(flight: Flight, waive: tuple[str, ...] = ()) -> Agreement:
 
 
 @cache
-def with_positions(folder: Path) -> Path:
+def with_positions(folder: Path) -> Flight:
     """A simulated flight with motion capture beside the default sensors."""
     lama = load_vehicle("lama400d")
     flown = fly_all(lama, MANEUVERS, seed=5)
     flight = log_flight(lama, flown, log_suite("mocap"), noise=True, seed=5)
-    return write_flight(flight, folder)
+    return read_flight(write_flight(flight, folder))
 
 
-def planted(sound: Path, folder: Path, columns: str) -> Flight:
-    """The flight with these lines under [columns] of its card."""
-    card = copied(folder, *RUNS, sound=sound) / "card.toml"
+def planted(folder: Path, columns: str) -> Path:
+    """The bundled flight with these lines under [columns] of its card."""
+    card = copied(folder, *RUNS) / "card.toml"
     card.write_text(card.read_text().replace("[[run]]", f"[columns]\n{columns}\n[[run]]", 1))
-    return read_flight(folder)
+    return folder
+
+
+def erring(folder: Path, columns: str, sound: Flight | None = None) -> Flight:
+    """The same, or another flight, without reading it anew: its readings as such a card has them."""
+    sound = sound or bundled().select(RUNS)
+    folder.mkdir()
+    card = folder / "card.toml"
+    run = '[[run]]\nname = "a"\nfile = "a.csv"\n'
+    card.write_text(f'[vehicle]\nname = "{sound.vehicle}"\n[columns]\n{columns}\n{run}')
+    named = read_card(card).columns
+    return replace(sound, runs=tuple(_erring(run, named) for run in sound.runs), columns=named)
+
+
+def _erring(run: Run, named: Mapping[str, Column]) -> Run:
+    units = {name: RPM_PER_RAD_S if name in ROTOR_COMMANDS else 1.0 for name in COMMANDS}
+    raw = {name: units[name] * run.command[:, k] for k, name in enumerate(COMMANDS)}
+    raw |= run.measured
+    found = {c: named[c].read(raw[named[c].name]) if c in named else raw[c] for c in raw}
+    command = [found.pop(name) / units[name] for name in COMMANDS]
+    return replace(run, command=np.stack(command, axis=1), measured=found)
 
 
 # --- errors of a card -----------------------------------------------------------------------------
@@ -133,7 +150,22 @@ ERRORS_OF_POSITIONS: Mapping[str, tuple[str, str]] = {
 @pytest.mark.parametrize("what", ERRORS)
 def test_an_error_of_a_card_is_refused_with_the_line_to_change(tmp_path, what):
     columns, right = ERRORS[what]
-    said_right(planted(BUNDLED, tmp_path / "f", columns), right)
+    said_right(erring(tmp_path / "f", columns), right)
+
+
+@pytest.mark.slow
+def test_an_error_is_planted_as_a_card_with_it_is_read(tmp_path):
+    """Of each kind; no reading of these is an outlier in one unit and not in another."""
+    kinds = ("z up, y left", "roll taken for deg", "rotors swapped", "velocities swapped",
+             "swash as pulse widths")  # fmt: skip
+    columns = "\n".join(ERRORS[kind][0] for kind in kinds)
+    read, made = read_flight(planted(tmp_path / "f", columns)), erring(tmp_path / "g", columns)
+    assert read.columns == made.columns
+    for expected, run in zip(read.runs, made.runs, strict=True):
+        np.testing.assert_allclose(run.command, expected.command, rtol=1e-12)
+        assert run.measured.keys() == expected.measured.keys()
+        for channel, values in expected.measured.items():
+            np.testing.assert_allclose(run.measured[channel], values, rtol=1e-12, err_msg=channel)
 
 
 @pytest.mark.slow
@@ -141,7 +173,7 @@ def test_an_error_of_a_card_is_refused_with_the_line_to_change(tmp_path, what):
 def test_and_where_positions_are_logged(tmp_path, tmp_path_factory, what):
     columns, right = ERRORS_OF_POSITIONS[what]
     sound = with_positions(tmp_path_factory.getbasetemp() / "positions")
-    said_right(planted(sound, tmp_path / "f", columns), right)
+    said_right(erring(tmp_path / "f", columns, sound), right)
 
 
 @pytest.mark.slow
@@ -149,11 +181,11 @@ def test_a_log_of_another_world_gets_all_its_lines_at_once(tmp_path):
     """Body x forward, y left, z up; yaw from the east, counted the other way round: as ROS has it."""
     turned = ("q", "r", "ay", "az", "theta")
     lines = [f"{c} = {{ sign = -1 }}" for c in turned]
-    flight = planted(BUNDLED, tmp_path / "f", "\n".join([*lines, YAW_FROM_THE_EAST]))
+    flight = erring(tmp_path / "f", "\n".join([*lines, YAW_FROM_THE_EAST]))
     found = checked(flight)
     assert found.advice is not None and not found.advice.left
     said = "\n".join(found.advice.lines)
-    mended, sound = planted(BUNDLED, tmp_path / "g", said), bundled().select(RUNS)
+    mended, sound = read_flight(planted(tmp_path / "g", said)), bundled().select(RUNS)
     assert checked(mended).faults == ()
     for run, expected in zip(mended.runs, sound.runs, strict=True):
         for c in turned:
@@ -298,7 +330,7 @@ def test_of_a_few_windows_no_noise_makes_a_unit():
 
 @pytest.mark.slow
 def test_a_check_can_be_waived(tmp_path):
-    flight = planted(BUNDLED, tmp_path / "f", "h = { sign = -1 }")
+    flight = read_flight(planted(tmp_path / "f", "h = { sign = -1 }"))
     vehicle = load_vehicle("lama400d").in_air(flight.air)
     assert {f.check for f in checked(flight).faults} == {"h-vd", "h-range"}
     remarks = refuse_disagreement(flight, vehicle, ("h-vd", "h-range"))
@@ -314,7 +346,7 @@ def test_a_check_can_be_waived(tmp_path):
 def test_every_fault_can_be_waived_by_its_name(tmp_path):
     known = names()
     for what in ("down accelerometer taken for g", "swash as pulse widths", "rotors swapped"):
-        flight = planted(BUNDLED, tmp_path / what, ERRORS[what][0])
+        flight = erring(tmp_path / what, ERRORS[what][0])
         failed = tuple(f.check for f in checked(flight).faults)
         assert failed and set(failed) <= set(known)
         assert checked(flight, failed).faults == ()
@@ -322,7 +354,7 @@ def test_every_fault_can_be_waived_by_its_name(tmp_path):
 
 @pytest.mark.slow
 def test_air_of_another_planet_and_unlogged_swash_are_refused(tmp_path):
-    card = copied(tmp_path / "f", *RUNS, "hover") / "card.toml"
+    card = copied(tmp_path / "f", "forward_run", "hover") / "card.toml"
     card.write_text(card.read_text().replace("density = 1.14", "density = 1140"))
     assert [f.check for f in checked(read_flight(tmp_path / "f")).faults] == ["density-range"]
     card.write_text(card.read_text().replace("density = 1140", "density = 1.14"))
@@ -367,8 +399,8 @@ def test_the_scripts_refuse_in_one_line(tmp_path, monkeypatch, script):
     """What ran for 290 s before and gave false causes; nothing is written."""
     import importlib
 
-    planted(BUNDLED, tmp_path / "f", "theta = { sign = -1 }")
-    planted(BUNDLED, tmp_path / "sound", "")
+    planted(tmp_path / "f", "theta = { sign = -1 }")
+    planted(tmp_path / "sound", "")
     module = importlib.import_module(script)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", [f"{script}.py", *WORDS.get(script, ("f",)), "--out", "out"])
@@ -379,7 +411,7 @@ def test_the_scripts_refuse_in_one_line(tmp_path, monkeypatch, script):
 
 @pytest.mark.slow
 def test_a_waived_check_is_a_remark_of_the_comparison(tmp_path):
-    flight = planted(BUNDLED, tmp_path / "f", "h = { sign = -1 }").select(["lon_3211", "yaw_3211"])
+    flight = erring(tmp_path / "f", "h = { sign = -1 }").select(["forward_run", "climb_descend"])
     with pytest.raises(InputError, match="h-range"):
         read_two(flight, flight, None)
     for one in read_two(flight, flight, None, ["h-vd", "h-range"]):
