@@ -1128,6 +1128,16 @@ def test_an_edited_callee_is_compiled_anew(tmp_path):
     )
     environment = os.environ | {"PYTHONPATH": str(tmp_path), "COAX_CACHE_DIR": str(tmp_path / "c")}
 
+    # the copy is the package to the last byte, and may have what that has compiled
+    derivative(np.zeros(16), np.zeros(4), LAMA.with_effect("yaw_damping", coefficient=0.0025))
+    digest = compilation.source_hash()
+    compiled = compilation.CACHE_DIR.parent / digest
+    for file in (*compiled.rglob("*.nbi"), *compiled.rglob("*.nbc")):
+        if file.parent.name in ("coax_env_kernel", "coax_env_model"):
+            copy = tmp_path / "c" / digest / file.relative_to(compiled)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(file, copy)
+
     def run():
         done = subprocess.run(
             [sys.executable, "-c", program],
@@ -1137,7 +1147,7 @@ def test_an_edited_callee_is_compiled_anew(tmp_path):
         return digest, float(value)
 
     first = run()
-    assert first[1] == pytest.approx(-1.0)
+    assert first == (digest, pytest.approx(-1.0))
     assert run() == first
     callee = tmp_path / "coax_env" / "model" / "effects.py"
     text = callee.read_text()
@@ -1150,8 +1160,7 @@ def test_an_edited_callee_is_compiled_anew(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lag", [0.0, 0.1])
-def test_no_index_leaves_its_array(lag, tmp_path):
+def test_no_index_leaves_its_array(tmp_path):
     """Compiled code does not look; with numba's bounds checks it does.
 
     Nor does numba notice an array that is returned by what only borrows its arrays (BORROWING).
@@ -1159,12 +1168,12 @@ def test_no_index_leaves_its_array(lag, tmp_path):
     program = (
         "import gc, numpy as np, coax_env; from coax_env.model import dynamics as d;"
         "from numba.core.dispatcher import Dispatcher;"
-        "v = coax_env.load_vehicle('lama400d');"
-        f"v = v.with_effect('motor_lag', upper={lag}, lower={lag});"
-        "x, u = np.ones(29), d.kernel_input(np.full(4, 200.0));"
-        "work, readings = np.zeros(d.WORK_SIZE), np.zeros(18);"
-        "d.step(x, u, 0.03, v.vector, work, x); d.measure(x, u, v.vector, work, readings);"
-        "print(np.isfinite(x).all() and np.isfinite(readings).all());"
+        "u, lama = d.kernel_input(np.full(4, 200.0)), coax_env.load_vehicle('lama400d')\n"
+        "for lag in (0.0, 0.1):\n"  # in one process: checked code takes long to compile
+        " v = lama.with_effect('motor_lag', upper=lag, lower=lag)\n"
+        " x, work, readings = np.ones(29), np.zeros(d.WORK_SIZE), np.zeros(18)\n"
+        " d.step(x, u, 0.03, v.vector, work, x); d.measure(x, u, v.vector, work, readings)\n"
+        " print(np.isfinite(x).all() and np.isfinite(readings).all())\n"
         "own = [f for f in gc.get_objects() if isinstance(f, Dispatcher) and f.overloads"
         " and not f.targetoptions.get('_nrt', True)];"
         "of = [str(o.signature.return_type) for f in own for o in f.overloads.values()];"
@@ -1174,7 +1183,7 @@ def test_no_index_leaves_its_array(lag, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", program], env=checked, capture_output=True, text=True
     )
-    assert done.stdout.split() == ["True", "True", "[]"], done.stderr
+    assert done.stdout.split() == ["True", "True", "True", "[]"], done.stderr
 
 
 def test_paper_states_are_the_first_sixteen():
