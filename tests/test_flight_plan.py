@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from coax_env import identify, load_vehicle, read_flight, simulate
+from coax_env.design import candidates
 from coax_env.design.candidates import Envelope
 from coax_env.design.flight_plan import multisine_maneuvers, plan_flight, write_plan
 from coax_env.errors import InputError
@@ -18,6 +19,22 @@ from coax_env.simulation.multisine import (
 from coax_env.simulation.simulate import fly
 
 LAMA = load_vehicle("lama400d")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def each_flown_once():
+    """Plans of one vehicle fly the same maneuvers with the same draws of it: for all tests here."""
+    tracks = {}
+
+    def flown(vehicle, plan, dt):
+        key = (vehicle.vector.tobytes(), repr(plan), dt)
+        if key not in tracks:
+            tracks[key] = fly(vehicle, plan, dt=dt)
+        return tracks[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(candidates, "fly", flown)
+        yield
 
 
 def test_multisines_are_orthogonal_in_time_and_share_no_frequency():
