@@ -301,7 +301,8 @@ def pair(change: dict[str, dict[str, float]], seed: int) -> pairs.Pair:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", [{}, {"added_mass": {"mass": -0.06}}])
-def test_what_changed_is_named_and_nothing_else(change, tmp_path):
+def test_what_changed_is_named_and_nothing_else(change, tmp_path, monkeypatch):
+    monkeypatch.setattr(pairs, "LONGEST", 4.0)  # s of each of four runs
     a, b = pairs.fly(pair(change, 5), tmp_path)
     found = compare(a, b).changes
     assert [c["effect"] for c in found["changes"]] == list(change), found["changes"]
@@ -315,7 +316,9 @@ def test_what_changed_is_named_and_nothing_else(change, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_logbook_grows_by_one_comparison(tmp_path):
+def test_a_logbook_grows_by_one_comparison(tmp_path, monkeypatch):
+    monkeypatch.setattr(pairs, "LONGEST", 4.0)
+    monkeypatch.setattr(pairs, "RUNS", ("lon_3211", "heave_3211"))
     pairs.fly(pair({}, 20), tmp_path)
     first = logbook(tmp_path)
     assert first["changes"] == [] and len(first["links"]) == 1

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import zipfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -860,10 +861,14 @@ def test_a_correction_is_judged_by_what_the_truth_removes():
 
 
 @pytest.mark.slow
-def test_policies_of_both_models_begin_alike_and_each_is_the_best_on_its_own(tmp_path):
+def test_policies_of_both_models_begin_alike_and_each_is_the_best_on_its_own(tmp_path, monkeypatch):
     pytest.importorskip("stable_baselines3")
     from controllers import machines, trainings
 
+    few = partial(trainings.train_best, flights=20)
+    monkeypatch.setattr(trainings, "train_best", few)
+    for module in (machines, trainings):
+        monkeypatch.setattr(module, "evaluate", partial(evaluate, seconds=5.0))
     found = machines.fly_machine(16, LAMA, tmp_path, 2, ppo_steps=2048, truth=True)
     assert set(found["scores"]["ppo"]) == {"bare", "corrected"}
     policies = tmp_path / "policies"
