@@ -67,6 +67,7 @@ def design_page(
     command_line: str = "",
     extreme: WorstVehicle | None = None,
     beside: Sequence[Sequence[str]] = (),
+    steps: Sequence[StepResponse] | None = None,
 ) -> str:
     """The report as HTML text.
 
@@ -81,6 +82,7 @@ def design_page(
         command_line: what was typed.
         extreme: of `worst_over_spread` on it.
         beside: other designs, rows under BESIDE_HEADER.
+        steps: of `step_responses`, where they are known already.
     """
     gain, phase = disk_in_words(disk)
     lead = [
@@ -96,7 +98,7 @@ def design_page(
         *_beside_section(beside),
         Section("Margins", _margin_blocks(controller, margins)),
         Section("Sensitivity", _sensitivity_blocks(controller)),
-        Section("Steps of the setpoint", _step_blocks(controller)),
+        Section("Steps of the setpoint", _step_blocks(steps or step_responses(controller))),
         Section("A flight", [figure(response, "From a start that is too low, turned, tilted")]),
         Section("The estimator", _estimator_blocks(controller)),
     ]
@@ -150,7 +152,7 @@ def _sensitivity_blocks(controller: Design) -> list[str]:
 STEP_HEADER = ("setpoint", "step", "rise 10-90 %", "overshoot", "within 5 %")
 
 
-def step_rows(responses: list[StepResponse]) -> list[list[str]]:
+def step_rows(responses: Sequence[StepResponse]) -> list[list[str]]:
     """The steps in words, under STEP_HEADER."""
 
     def after(seconds: float) -> str:
@@ -165,9 +167,8 @@ def step_rows(responses: list[StepResponse]) -> list[list[str]]:
     ]  # fmt: skip
 
 
-def _step_blocks(controller: Design) -> list[str]:
+def _step_blocks(responses: Sequence[StepResponse]) -> list[str]:
     """Responses to steps of what is held, and their figures."""
-    responses = step_responses(controller)
     panels = [(f"{one.name} [{one.unit}]", {one.name: one.value}) for one in responses]
     return [
         table(STEP_HEADER, step_rows(responses)),

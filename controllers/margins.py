@@ -119,14 +119,19 @@ def frequency_responses(
         frequencies [rad/s] (w,); the whole loop (w, 4, 4); the loop of each input with the others
         closed (w, 4).
     """
-    omega = np.append(np.geomspace(1e-3, 0.99 * math.pi / DT, points), math.pi / DT)
-    L = np.moveaxis(open_loop(controller, vehicle).frequency_response(omega).frdata, -1, 0)
+    omega, L = _frequency_response(open_loop(controller, vehicle), points)
     single = np.empty(L.shape[:2], dtype=complex)
     for k in range(4):
         rest = [i for i in range(4) if i != k]
         others = np.linalg.solve(np.eye(3) + L[:, rest][:, :, rest], L[:, rest, k : k + 1])
         single[:, k] = L[:, k, k] - (L[:, k : k + 1, rest] @ others)[:, 0, 0]
     return omega, L, single
+
+
+def _frequency_response(loop: Any, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies up to Nyquist [rad/s] (w,), and a loop's response (w, 4, 4)."""
+    omega = np.append(np.geomspace(1e-3, 0.99 * math.pi / DT, points), math.pi / DT)
+    return omega, np.moveaxis(loop.frequency_response(omega).frdata, -1, 0)
 
 
 def sensitivities(L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -257,7 +262,7 @@ def disk_margin(controller: Design, vehicle: Vehicle, points: int = 1000) -> flo
     closed = control.feedback(loop, np.eye(4))
     if np.abs(closed.poles()).max() >= 1.0:
         return 0.0
-    return _disk_margin(frequency_responses(controller, vehicle, points)[1])
+    return _disk_margin(_frequency_response(loop, points)[1])
 
 
 def _disk_margin(L: np.ndarray) -> float:

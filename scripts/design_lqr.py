@@ -48,6 +48,7 @@ def main() -> None:
     spread = margins.margins_over_spread(controller, vehicle, options.vehicles, options.seed)
     extreme = margins.worst_over_spread(controller, vehicle, seed=options.seed)
     beside = beside_rows(designs, vehicle, options.seed) if len(designs) > 1 else []
+    steps = step_responses(controller)
     make_folder(options.out)
     path = controller.save(options.out / "controller.json")
     if scheduled is not None:
@@ -56,7 +57,7 @@ def main() -> None:
     page = command_line.write_report(
         options.out / "report.html",
         lambda: design_page(
-            controller, vehicle, inputs, disk, score, worst, spread, words, extreme, beside
+            controller, vehicle, inputs, disk, score, worst, spread, words, extreme, beside, steps
         ),
     )
     print_margins(controller, inputs, disk)
@@ -68,7 +69,7 @@ def main() -> None:
     print(extreme_in_words(extreme))
     if beside:
         command_line.print_columns([BESIDE_HEADER, *beside])
-    command_line.print_columns([STEP_HEADER, *step_rows(step_responses(controller))])
+    command_line.print_columns([STEP_HEADER, *step_rows(steps)])
     print(f"controller {path}, {page}")
 
 

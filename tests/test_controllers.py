@@ -381,6 +381,8 @@ def test_no_evaluation_on_sensors_the_controller_does_not_know(onboard):
 
 @pytest.mark.slow
 def test_scripts_design_and_evaluate(tmp_path):
+    """What they refuse is in test_scripts.py."""
+
     def call(name, *words):
         return subprocess.run(
             [sys.executable, SCRIPTS / name, *words], capture_output=True, text=True, cwd=tmp_path
@@ -394,10 +396,6 @@ def test_scripts_design_and_evaluate(tmp_path):
     assert flown.returncode == 0, flown.stderr
     score = json.loads((tmp_path / "runs" / "evaluate" / "score.json").read_text())
     assert score["success_rate"] == 1.0
-    missing = call("evaluate.py", "--controller", "nothing.json")
-    assert (missing.returncode, len(missing.stderr.splitlines())) == (2, 1)
-    assert call("evaluate.py", "--episodes", "0", "--out", "none").returncode == 2
-    assert not (tmp_path / "none").exists()
 
 
 # --- other controllers, tasks and vehicles ------------------------------------------------------
@@ -582,7 +580,7 @@ def test_controllers_come_by_name_and_from_their_files(name, tmp_path):
 @pytest.mark.slow
 def test_a_design_on_the_diagnosed_model_halves_the_cost_of_flying_the_machine():
     machine = model_comparison.default_machine(LAMA)
-    flight = coax_env.simulate(machine, ("lon_3211", "lat_3211", "yaw_3211", "forward_run"), seed=0)
+    flight = coax_env.simulate(machine, ("lon_3211", "forward_run"), seed=0)
     content, _, controllers = model_comparison.compare_models(flight=flight, episodes=5)
     assert content["hidden"] == ["motor_lag", "rotor_drag", "torque_balance"]
     assert {"motor_lag", "rotor_drag"} <= set(content["found"])
@@ -932,7 +930,7 @@ def test_machines_fly_to_a_position_in_wind(tmp_path):
     out = {}
     for name, world in (("still", {}), ("windy", {"task": "position", "wind": 4.0})):
         flown = machines.fly_machines(
-            [2], "lama400d_outdoor", tmp_path / name, 2, truth=True, **world
+            [2], "lama400d_outdoor", tmp_path / name, 2, truth=True, **world, seconds=6.0
         )
         out[name] = list(flown)
     costs = {
