@@ -265,7 +265,7 @@ def test_a_name_that_is_taken_is_left_alone(sound_text, here, tmp_path):
 
 
 @pytest.mark.slow
-def test_simulate_then_replay_then_identify(tmp_path):
+def test_simulate_then_replay_then_identify(here, tmp_path):
     """A simulated flight goes through the other scripts as a measured one does."""
     done = script("simulate.py", "--maneuver", "lon_3211,heave_3211", "--out", "sim", "--seed", "3",
                   cwd=tmp_path)  # fmt: skip
@@ -287,7 +287,7 @@ def test_simulate_then_replay_then_identify(tmp_path):
     assert load_vehicle(path)["mass"].std <= load_vehicle("lama400d")["mass"].std
     gymnasium.make("CoaxHeli-v0", vehicle=str(path)).close()
 
-    done = script("identify.py", "sim/flight", "--method", "paper", "--out", "steps", cwd=tmp_path)
+    done = here("identify.py", "sim/flight", "--method", "paper", "--out", "steps")
     assert done.returncode == 0, done.stderr
     assert {p.name for p in (tmp_path / "steps").iterdir()} == {"vehicle.toml", "report.html"}
     assert "Table VIII examined" in (tmp_path / "steps" / "report.html").read_text()
@@ -295,16 +295,17 @@ def test_simulate_then_replay_then_identify(tmp_path):
 
 @pytest.mark.slow
 def test_without_plotly_the_results_are_there_and_it_says_what_to_install(
-    tmp_path, monkeypatch, capsys
+    sound_text, tmp_path, monkeypatch, capsys
 ):
     import replay
 
+    put(tmp_path, sound_text)
     page = importlib.import_module("coax_env.report.page")  # the room has a function of that name
     page._packed_plotly.cache_clear()  # of tests before
     for module in ("plotly", "plotly.offline"):
         monkeypatch.setitem(sys.modules, module, None)  # importing it is an ImportError
     out = tmp_path / "out"
-    monkeypatch.setattr(sys, "argv", ["replay", "windy", "--out", str(out)])
+    monkeypatch.setattr(sys, "argv", ["replay", str(tmp_path / "flight"), "--out", str(out)])
     replay.main()
     assert json.loads((out / "replay.json").read_text())["runs"]
     assert not (out / "report.html").exists()
@@ -340,14 +341,14 @@ def test_diagnose_writes_what_the_contract_says(tmp_path):
 
 
 @pytest.mark.slow
-def test_diagnose_writes_the_next_flight_of_a_tie(tmp_path):
+def test_diagnose_writes_the_next_flight_of_a_tie(here, tmp_path):
     """On a hover a scale of az is confounded with a bias; what an earlier one wrote is replaced."""
     flight = injector.fly(tmp_path / "flight", {"accel_scale": {}}, runs=["hover"], seed=4)
     others = [name for name in CATALOGUE if name not in ("accel_scale", "accel_bias")]
     out = tmp_path / "runs" / "diagnose"
     (out / "next_flight").mkdir(parents=True)
     (out / "next_flight" / "card.toml").write_text("of an earlier diagnosis")
-    done = script("diagnose.py", flight, "--exclude", ",".join(others), cwd=tmp_path)
+    done = here("diagnose.py", flight, "--exclude", ",".join(others))
     assert done.returncode == 0, done.stderr
     following = json.loads((out / "findings.json").read_text())["next_maneuver"]
     assert set(following["separates"]) == {"accel_scale", "accel_bias"}
