@@ -95,7 +95,7 @@ def test_any_readings_give_the_same_commands(kind, sensors, exported):
 def test_it_flies_the_same_flight(kind, sensors, flown, exported):
     controller, c, _ = exported(kind, sensors)
     vehicle = LAMA.with_effect("rotor_drag", coefficient=3e-4) if "wind" in flown else LAMA
-    difference = compiled.command_difference(controller, c, vehicle, 20.0, 2, 5, flown)
+    difference = compiled.command_difference(controller, c, vehicle, 10.0, 2, 5, flown)
     assert 0.0 < difference <= BAR
 
 

@@ -1,11 +1,11 @@
 """A policy on another model, and the best of several trainings."""
 
+import inspect
 import json
 import pickle
-import subprocess
 import sys
 import zipfile
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,7 +19,6 @@ from controllers.evaluation import evaluate
 from controllers.policy import Network, Sight, load_policy, save_policy
 from controllers.policy_transfer import joined_features, transferred
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
 LAMA = load_vehicle("lama400d")
 UNBALANCED = LAMA.with_effect("torque_balance", scale=0.07)
 LATE = LAMA.with_effect("motor_lag", upper=0.06, lower=0.06)
@@ -120,17 +119,19 @@ def test_training_begins_with_what_the_policy_does(with_critic, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_policy_kept_is_the_best_and_no_worse_than_the_one_there_was(tmp_path):
+def test_the_policy_kept_is_the_best_and_no_worse_than_the_one_there_was(tmp_path, monkeypatch):
     pytest.importorskip("stable_baselines3")
     from controllers import trainings
 
+    short = partial(evaluate, seconds=5.0)
+    monkeypatch.setattr(trainings, "evaluate", short)
     arguments = {"start": policy.SHIPPED, "flights": 4, "nominal": LAMA, **SMALL}
     best, scores = trainings.train_best(UNBALANCED, tmp_path / "a", (3,), **arguments)
     assert set(scores) == {"start", "transferred", "trained", "seed_3"}
     assert all(trainings.rank(scores[best]) <= trainings.rank(one) for one in scores.values())
     kept = (tmp_path / "a" / "policy.zip").read_bytes()
     assert kept == (tmp_path / "a" / best / "policy.zip").read_bytes()
-    as_it_is = evaluate(load_policy(policy.SHIPPED), UNBALANCED, 4, seed=scores[best]["seed"])
+    as_it_is = short(load_policy(policy.SHIPPED), UNBALANCED, 4, seed=scores[best]["seed"])
     assert scores["start"]["mean_cost"] == as_it_is["mean_cost"]
 
     made: list[str] = []
@@ -196,13 +197,21 @@ def test_networks_of_another_shape_are_no_start(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_shipped_policy_is_brought_to_a_vehicle_on_the_command_line(tmp_path):
+def test_a_shipped_policy_is_brought_to_a_vehicle_on_the_command_line(
+    tmp_path, monkeypatch, capsys
+):
+    """In this process; test_workers.py starts one of its own."""
     pytest.importorskip("stable_baselines3")
-    words = ["--start", str(policy.SHIPPED), "--seeds", "0", "--steps", "2048", "--out", "out"]
-    done = subprocess.run(
-        [sys.executable, SCRIPTS / "train_ppo.py", *words, "--set", "n_envs=16", "batch_size=256"],
-        cwd=tmp_path, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "the best, " in done.stdout and "transferred: 200 flights" in done.stdout
-    assert json.loads((tmp_path / "out" / "score.json").read_text())["success_rate"] == 1.0
+    import train_ppo
+    from controllers import trainings
+
+    assert inspect.signature(trainings.train_best).parameters["flights"].default == 200
+    monkeypatch.setattr(trainings, "train_best", partial(trainings.train_best, flights=20))
+    out = tmp_path / "out"
+    words = ["--start", str(policy.SHIPPED), "--seeds", "0", "--steps", "2048", "--out", str(out)]
+    words += ["--set", "n_envs=16", "batch_size=256"]
+    monkeypatch.setattr(sys, "argv", ["train_ppo", *words])
+    train_ppo.main()
+    said = capsys.readouterr().out
+    assert "the best, " in said and "transferred: 20 flights" in said
+    assert json.loads((out / "score.json").read_text())["success_rate"] == 1.0
