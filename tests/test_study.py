@@ -770,7 +770,8 @@ def test_expected_evidence_is_what_the_likelihood_has_in_gusts(tmp_path: Path) -
     expected, had = [], []
     for seed in (21, 22):
         flight = arms.planned("gusty", "one", 0, seed)
-        flight = replace(flight, effects={"axial_damping": {"coefficient": 0.11}})
+        effects = {"axial_damping": {"coefficient": 0.11}}
+        flight = replace(flight, effects=effects, runs=("lat_3211", "heave_3211", "low_hover"))
         folder = tmp_path / str(seed)
         truth = hide(flight, folder)
         log = read_flight(folder)
