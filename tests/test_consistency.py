@@ -329,6 +329,16 @@ def test_of_a_few_windows_no_noise_makes_a_unit():
 
 
 @pytest.mark.slow
+def test_of_a_few_windows_no_chance_exchanges_a_pair(tmp_path):
+    """Accelerometers that felt next to nothing: two coefficients of one std had them swapped."""
+    folder = injector.fly(
+        tmp_path / "f", {}, gusts=False, seed=21, runs=("lon_3211", "lat_3211", "heave_3211"),
+        longest=9.0, later={"cg_offset": {"x": -6e-4, "y": -1.2e-3}}, since=("lat_3211", 4.0),
+    )  # fmt: skip
+    assert checked(read_flight(folder)).faults == ()
+
+
+@pytest.mark.slow
 def test_a_check_can_be_waived(tmp_path):
     flight = read_flight(planted(tmp_path / "f", "h = { sign = -1 }"))
     vehicle = load_vehicle("lama400d").in_air(flight.air)
