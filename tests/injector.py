@@ -29,6 +29,7 @@ import math
 from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
@@ -1208,6 +1209,12 @@ def _turn(vectors: np.ndarray, tilt_x: float, tilt_y: float) -> np.ndarray:
     skew = np.array([[0, 0, axis[1]], [0, 0, -axis[0]], [-axis[1], axis[0], 0]])
     back = np.eye(3) - math.sin(angle) * skew + (1 - math.cos(angle)) * skew @ skew
     return back @ vectors
+
+
+def compile_ahead() -> None:
+    """Compile what flies, into the cache beside this file, before several processes would at once."""
+    with TemporaryDirectory() as folder:
+        fly(folder, {}, runs=["hover"], longest=1.0)
 
 
 def _main() -> None:

@@ -433,19 +433,21 @@ def flight_with(
     return Flight("lama400d", tuple(logs), noise={s.name: s.noise for s in suite if s.noise > 0.0})
 
 
-HIDDEN: dict[str, tuple[Callable[[], Between], dict[str, float]]] = {
-    "servo_play": (lambda: Gear(0.02), {"width": 0.02}),
-    "servo_rate": (lambda: SlowMotor(0.8), {"limit": 0.8}),
-    "command_delay": (lambda: Radio(0.035), {"time": 0.037}),
-    "motor_droop": (lambda: SoftMotors(0.25, 0.15), {"upper": 0.25, "lower": 0.15}),
+OF_THE_PLATE, OF_MOTORS = RUNS[:2], RUNS[2:]
+HIDDEN: dict[str, tuple[Callable[[], Between], dict[str, float], list[str]]] = {
+    "servo_play": (lambda: Gear(0.02), {"width": 0.02}, OF_THE_PLATE),
+    "servo_rate": (lambda: SlowMotor(0.8), {"limit": 0.8}, OF_THE_PLATE),
+    "command_delay": (lambda: Radio(0.035), {"time": 0.037}, RUNS[1:]),
+    "motor_droop": (lambda: SoftMotors(0.25, 0.15), {"upper": 0.25, "lower": 0.15}, OF_MOTORS),
 }
-"""Effect -> what stands between, and the catalogue's numbers for it."""
+"""Effect -> what stands between, the catalogue's numbers for it, and the runs that show it."""
 
 
 @pytest.mark.slow
 def test_a_deadband_goes_by_the_name_of_play():
     """Its jumps cannot be followed; play of about its width trails as far, and says so."""
-    found = diagnose(flight_with(lambda: Pulses(0.012)), LAMA, hold_out=[]).findings
+    flight = flight_with(lambda: Pulses(0.012), runs=OF_THE_PLATE)
+    found = diagnose(flight, LAMA, hold_out=[]).findings
     (cause,) = found["causes"]
     assert cause["effect"] == "servo_play" and "servo_deadband" in cause["confusable_with"]
     assert cause["parameters"]["servo_play.width"]["value"] == pytest.approx(0.012, rel=0.35)
@@ -454,8 +456,8 @@ def test_a_deadband_goes_by_the_name_of_play():
 @pytest.mark.slow
 @pytest.mark.parametrize("effect", HIDDEN)
 def test_a_hidden_actuator_effect_is_found_and_nothing_else(effect):
-    between, truth = HIDDEN[effect]
-    found = diagnose(flight_with(between), LAMA, hold_out=[]).findings
+    between, truth, runs = HIDDEN[effect]
+    found = diagnose(flight_with(between, runs=runs), LAMA, hold_out=[]).findings
     assert [c["effect"] for c in found["causes"]] == [effect], found["causes"]
     (cause,) = found["causes"]
     assert effect != "servo_rate" or cause["confusable_with"] == []
@@ -481,7 +483,7 @@ def test_the_interval_of_a_play_reaches_over_its_likelihoods_roughness(tmp_path)
     """Five std off by the signatures, which see where the plate lets go and not the milliradians."""
     runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "forward_run", "side_run")
     truth = {"servo_play": {"width": 0.0265}}
-    injector.fly(tmp_path, truth, gusts=True, seed=5, runs=runs, longest=12.0)
+    injector.fly(tmp_path, truth, gusts=True, seed=5, runs=runs, longest=9.0)
     (cause,) = diagnose(tmp_path, hold_out=[]).findings["causes"]
     assert cause["effect"] == "servo_play"
     width = cause["parameters"]["servo_play.width"]
@@ -499,6 +501,7 @@ IN_THE_INJECTOR = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", IN_THE_INJECTOR)
 def test_what_the_injector_hides_is_found_and_nothing_else(tmp_path, case):
-    runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "climb_descend", "heading_turn")
-    folder = injector.fly(tmp_path / "flight", IN_THE_INJECTOR[case], runs=runs, seed=21, longest=9.0)
+    folder = injector.fly(
+        tmp_path / "flight", IN_THE_INJECTOR[case], runs=RUNS, seed=21, longest=9.0
+    )
     check_causes(diagnose(folder, hold_out=[]).findings, *truth_of(folder))

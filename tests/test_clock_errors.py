@@ -109,7 +109,7 @@ def test_nothing_is_named_where_rows_are_smoothed_as_though_even(tmp_path, monke
     """Rows 12 % of a step off, taken as even by what smooths them: positions half foreseen without."""
     uneven = SENSORS["pose_steadied"]._replace(noise=POSE, step=1.0 / 60.0, unrest=0.12)
     monkeypatch.setitem(SENSORS, "uneven", uneven)
-    runs = ("lon_3211", "lat_3211", "yaw_3211", "forward_run")
+    runs = ("lon_3211", "lat_3211", "yaw_3211")
     injector.fly(
         tmp_path, {}, gusts=True, sensors="uneven", seed=3, runs=runs, longest=14.0, craft=COAX
     )

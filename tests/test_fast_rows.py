@@ -151,7 +151,7 @@ def test_what_was_done_is_said():
     assert flight.counts == {"rows averaged": 2000 - rows}
 
 
-RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "forward_run", "heading_turn")
+RUNS = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
 
 
 @pytest.mark.slow

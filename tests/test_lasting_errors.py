@@ -392,7 +392,7 @@ def test_an_onboard_filters_drift_is_no_stabiliser_bars(tmp_path, monkeypatch):
     coloured: errors that last are asked for all the same, and nothing is named. **Synthetic**."""
     sensors = SENSORS["fused"]._replace(flicker=dict.fromkeys(GYROS, 0.01))
     monkeypatch.setitem(SENSORS, "fused", sensors)
-    runs = ("lon_3211", "lat_3211", "low_hover", "heading_turn")
+    runs = ("lon_3211", "lat_3211", "low_hover")
     injector.fly(tmp_path, {}, gusts=GUSTY, sensors="fused", seed=4, runs=runs, longest=14.0)
     found = diagnose(tmp_path)
     assert found.findings["causes"] == []
@@ -404,7 +404,7 @@ def test_an_onboard_filters_drift_is_no_stabiliser_bars(tmp_path, monkeypatch):
 def test_sensors_that_speak_of_each_other_are_not_believed(tmp_path):
     """Attitudes, velocities and height of an onboard filter: of eight such flights six had a gyro's
     scale that is not there. What rests on motion is found. **Synthetic**."""
-    runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
+    runs = ("lon_3211", "heave_3211", "yaw_3211")
     hidden = {"motor_lag": {"upper": 0.08, "lower": 0.06}}
     injector.fly(tmp_path, hidden, gusts=GUSTY, sensors="fused", seed=3, runs=runs, longest=10.0)
     found = diagnose(tmp_path)

@@ -104,7 +104,9 @@ def test_it_must_be_worth_what_a_sure_cause_is():
 def test_a_clean_flight_whose_commands_are_written_late_has_no_cause(tmp_path):
     """By all sensors one had three, of 598 nats at most; here by poses alone. What was done is said."""
     runs = ("lon_3211", "yaw_3211", "heave_3211")
-    injector.fly(tmp_path, {}, gusts=True, seed=11, runs=runs, craft=COAX, sensors="pose")
+    injector.fly(
+        tmp_path, {}, gusts=True, seed=11, runs=runs, craft=COAX, sensors="pose", longest=9.0
+    )
     result = diagnose(written_later(tmp_path, COMMANDS, 6), hold_out=[])
     assert result.findings["causes"] == []
     said = [text for text in result.remarks if "later than they act" in text]

@@ -80,19 +80,23 @@ TRACKED = Sensors(NOISE | POSE, formats=dict.fromkeys(("h", "pn", "pe"), "%.5f")
 SLOW = TRACKED._replace(every_row=(4,))
 """The same at 25 Hz: of four commands one is logged."""
 ON_AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211", "heading_turn")
+SWASH_AND_YAW = ("lon_3211", "lat_3211", "yaw_3211")
 FAST = ("lon_3211", "lat_3211", "forward_run", "side_run", "heading_turn", "yaw_3211")
 
 SHORT = 9.0  # s of each run, where that shows the effect
 HIDDEN = {
-    "late attitude": ({"attitude_delay": {}}, "full", ON_AXES, SHORT),
-    "gyro scale": ({"gyro_scale": {}}, "full", ON_AXES, SHORT),
-    "compass": ({"magnetic_field": {}}, "full", ON_AXES, SHORT),
-    "markers' axes, gyros aboard": ({"frame_yaw": {}}, "tracked", ON_AXES, SHORT),
+    "late attitude": ({"attitude_delay": {}}, "full", SWASH_AND_YAW, SHORT),
+    "gyro scale and compass": ({"gyro_scale": {}, "magnetic_field": {}}, "full", ON_AXES, SHORT),
+    "markers' axes, gyros aboard": (
+        {"frame_yaw": {}}, "tracked", ("lon_3211", "lat_3211", "heading_turn"), SHORT
+    ),
     "markers' axes at 25 Hz": ({"frame_yaw": -0.1}, "slow", ON_AXES, SHORT),
-    "markers beside the centre of gravity": ({"marker_offset": {}}, "pose", ON_AXES, SHORT),
-    "tether": ({"position_spring": {}}, "tracked", ("forward_run", "side_run"), 20.0),
-    "upper blow-back": ({"upper_blowback": {}}, "full", FAST, SHORT),
-}
+    "markers beside the centre of gravity": ({"marker_offset": {}}, "pose", SWASH_AND_YAW, SHORT),
+    "tether": ({"position_spring": {}}, "tracked", ("forward_run", "side_run"), 16.0),
+    "upper blow-back": (
+        {"upper_blowback": {}}, "full", ("forward_run", "side_run", "yaw_3211"), SHORT
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -132,7 +136,12 @@ def test_the_bodys_own_gyroscopic_moment_misleads_nobody(tmp_path):
 def test_turned_markers_are_named_or_among_the_alternatives(tmp_path):
     """A pose alone hardly tells turned markers from a turned swash plate, and then says so."""
     folder = injector.fly(
-        tmp_path / "f", {"frame_yaw": {}}, sensors="pose", runs=ON_AXES, longest=SHORT, seed=22
+        tmp_path / "f",
+        {"frame_yaw": {}},
+        sensors="pose",
+        runs=SWASH_AND_YAW,
+        longest=SHORT,
+        seed=22,
     )
     (folder / "truth.json").unlink()
     findings = diagnose(folder, hold_out=[]).findings

@@ -327,7 +327,7 @@ def test_one_group_swings_alone(monkeypatch, axes, alone):
 @pytest.mark.slow
 def test_nothing_is_named_where_gusts_have_a_frequency(tmp_path):
     """Taken for gusts that fade: a servo's play, and inertias 10 to 30 % too large. **Synthetic**."""
-    runs = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
+    runs = ("lon_3211", "lat_3211", "heave_3211")
     injector.fly(tmp_path, {}, gusts=Air("shedding"), seed=6, runs=runs, longest=9.0)
     found = diagnose(tmp_path)
     assert found.findings["causes"] == []

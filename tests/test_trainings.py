@@ -203,6 +203,7 @@ def test_a_shipped_policy_is_brought_to_a_vehicle_on_the_command_line(
     """In this process; test_workers.py starts one of its own."""
     pytest.importorskip("stable_baselines3")
     import train_ppo
+
     from controllers import trainings
 
     assert inspect.signature(trainings.train_best).parameters["flights"].default == 200
