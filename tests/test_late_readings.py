@@ -239,3 +239,16 @@ def test_late_attitudes_beside_rotors_that_jitter(tmp_path, monkeypatch):
     assert [(c["effect"], c["trust"]) for c in found["causes"]] == [("attitude_delay", "sure")]
     time = found["causes"][0]["parameters"][DELAY]
     assert abs(time["value"] - 0.06) < 2.5 * time["std"]
+
+
+@pytest.mark.slow
+def test_late_echoes(tmp_path, monkeypatch):
+    """By second order in the delay they were 0.277 +- 0.006 s late."""
+    monkeypatch.undo()
+    hidden = {"sonar_delay": {"time": 0.3}}
+    runs = ("heave_3211", "climb_descend")
+    injector.fly(tmp_path / "flight", hidden, gusts=True, seed=4, runs=runs, longest=12.0)
+    (cause,) = diagnose(tmp_path / "flight", hold_out=[]).findings["causes"]
+    assert cause["effect"] == "sonar_delay"
+    time = cause["parameters"]["sonar_delay.time"]
+    assert abs(time["value"] - 0.3) < 2.5 * time["std"] < 0.03
