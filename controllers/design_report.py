@@ -25,7 +25,7 @@ from controllers.margins import (
     frequency_responses,
     sensitivities,
 )
-from controllers.steps import StepResponse, step_responses
+from controllers.steps import StepResponse
 
 MARGIN_HEADER = (
     "input", "gain margin down", "gain margin up", "phase margin", "least |1 + L|", "crossover",
@@ -64,10 +64,10 @@ def design_page(
     score: dict[str, Any],
     worst: dict[str, Any],
     spread: np.ndarray,
+    steps: Sequence[StepResponse],
     command_line: str = "",
     extreme: WorstVehicle | None = None,
     beside: Sequence[Sequence[str]] = (),
-    steps: Sequence[StepResponse] | None = None,
 ) -> str:
     """The report as HTML text.
 
@@ -79,10 +79,10 @@ def design_page(
         score: of `evaluate` on the vehicle.
         worst: of `evaluate_spread` on it.
         spread: of `margins_over_spread` on it, (draws,).
+        steps: of `step_responses`.
         command_line: what was typed.
         extreme: of `worst_over_spread` on it.
         beside: other designs, rows under BESIDE_HEADER.
-        steps: of `step_responses`, where they are known already.
     """
     gain, phase = disk_in_words(disk)
     lead = [
@@ -98,7 +98,7 @@ def design_page(
         *_beside_section(beside),
         Section("Margins", _margin_blocks(controller, margins)),
         Section("Sensitivity", _sensitivity_blocks(controller)),
-        Section("Steps of the setpoint", _step_blocks(steps or step_responses(controller))),
+        Section("Steps of the setpoint", _step_blocks(steps)),
         Section("A flight", [figure(response, "From a start that is too low, turned, tilted")]),
         Section("The estimator", _estimator_blocks(controller)),
     ]

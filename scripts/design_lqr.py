@@ -57,7 +57,7 @@ def main() -> None:
     page = command_line.write_report(
         options.out / "report.html",
         lambda: design_page(
-            controller, vehicle, inputs, disk, score, worst, spread, words, extreme, beside, steps
+            controller, vehicle, inputs, disk, score, worst, spread, steps, words, extreme, beside
         ),
     )
     print_margins(controller, inputs, disk)

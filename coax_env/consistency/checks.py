@@ -243,12 +243,13 @@ class Checker:
             other = replace(rows, signals=swapped(rows.signals, (a, b)))
             touched = [k for k, one in enumerate(self._relations) if both & one.channels]
             anew = self._anew(other, both)
-            own = both.intersection
-            before = [c for k in touched for c in known[k] if own((c.left, c.part))]
-            after = [c for k in touched for c in anew[k] if own((c.left, c.part))]
-            agreed = sum(map(_agreement, before))
-            agree = sum(_agreement(c) for c in after if c.strength > SWAP_STRENGTH)
-            if agree - agreed > SWAP_GAIN and agreed < SWAP_LEFT * agree:
+            as_they_are, exchanged = (
+                [c for k in touched for c in some[k] if both & {c.left, c.part}]
+                for some in (known, anew)
+            )
+            before = sum(map(_agreement, as_they_are))
+            after = sum(_agreement(c) for c in exchanged if c.strength > SWAP_STRENGTH)
+            if after - before > SWAP_GAIN and before < SWAP_LEFT * after:
                 words = f"{a} and {b} agree with the other channels only once they are exchanged"
                 found.append(Fault(f"{a}-{b}-swapped", words, both))
         return found

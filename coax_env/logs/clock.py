@@ -53,7 +53,7 @@ def on_even_clock(runs: Sequence[Repaired], counts: Counter[str]) -> list[Repair
     Args:
         runs: of one flight. counts: what was repaired -> how often; rows with other times are added.
     """
-    if not any(_are_uneven(run.t) for run in runs):  # the rest takes long
+    if not any(_is_uneven(*_scatter_and_step(run.t)) for run in runs):  # the rest takes long
         return list(runs)
     slope, std = slope_of(runs)
     if not (slope < WRONG and std < UNSURE) or are_steep(runs):
@@ -100,9 +100,8 @@ def _off_the_middle(run: Repaired) -> Iterator[tuple[np.ndarray, np.ndarray]]:
             yield expected[kept] / scatter, seen[kept] / scatter
 
 
-def _are_uneven(t: np.ndarray) -> bool:
-    """Whether times of rows (n,) scatter so that there is something to mend, and it can be."""
-    scatter, step = _scatter_and_step(t)
+def _is_uneven(scatter: float, step: float) -> bool:
+    """Whether times scatter so that there is something to mend, and it can be."""
     return UNEVEN * step < scatter < LARGEST * step
 
 
@@ -119,9 +118,9 @@ def even_times(t: np.ndarray) -> np.ndarray:
     Args:
         t: as logged [s].
     """
-    if not _are_uneven(t):
-        return t
     scatter, step = _scatter_and_step(t)
+    if not _is_uneven(scatter, step):
+        return t
     for _ in range(3):  # the step's length, and where rows were lost, in turns
         place = _places(t, step)
         step, first = np.polyfit(place, t, 1)

@@ -48,14 +48,13 @@ class CsvLog:
 
 @dataclass(frozen=True)
 class _Cells:
-    """A CSV as text: the header, the rows that hold anything, the line each of them ends on, and the
-    same by columns."""
+    """A CSV as text: the header, the columns of the rows that hold anything, and the line each row
+    ends on."""
 
     path: Path
     header: list[str]
-    rows: list[list[str]]
-    lines: list[int]
     columns: list[tuple[str, ...]]
+    lines: list[int]
 
 
 def read_csv(
@@ -156,7 +155,7 @@ def _split(path: Path, text: str) -> _Cells:
             raise InputError(f"{path}: {times} columns are named {name!r}")
     if not rows:
         raise InputError(f"{path}: a header and no rows")
-    return _Cells(path, header, rows, lines, list(zip(*rows, strict=True)))
+    return _Cells(path, header, list(zip(*rows, strict=True)), lines)
 
 
 def _numbers(cells: _Cells, column: int, name: str) -> np.ndarray:
@@ -171,7 +170,7 @@ def _numbers(cells: _Cells, column: int, name: str) -> np.ndarray:
         pass
     bad = next(k for k, text in enumerate(texts) if text and not _is_finite_number(text))
     where, text = f"{cells.path}, line {cells.lines[bad]}", texts[bad]
-    if bad == 0 and not any(map(_is_finite_number, cells.rows[0])):
+    if bad == 0 and not any(_is_finite_number(texts[0]) for texts in cells.columns):
         raise InputError(
             f"{where}: {text[:40]!r} and no number in the row: if"
             " it holds the units, delete it, and name them in card.toml under [columns]"
