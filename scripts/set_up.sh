@@ -1,6 +1,10 @@
 # Sourced by scripts/demo and scripts/test: makes .venv complete, at no cost when it already is.
 # Sets ROOT and PYTHON. A stamp, written last, says which pins this .venv was finished with; a mark
 # that is still there says that an install was cut short, and the .venv is then made anew.
+# Packages come without bytecode, which takes longer to make for all of them than they take to come:
+# Python makes that of what is imported.
+
+unset PYTHONDONTWRITEBYTECODE # else every program parses every module anew
 
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 PYTHON="$ROOT/.venv/bin/python"
@@ -34,10 +38,21 @@ find_python() {
 install_packages() {
     "$PYTHON" -c 'import pip' 2>/dev/null || return 1
     touch "$UNFINISHED"
-    local pip=("$PYTHON" -m pip install -qq --disable-pip-version-check -c "$CONSTRAINTS")
+    local pip=("$PYTHON" -m pip install -qq --disable-pip-version-check --no-compile -c "$CONSTRAINTS")
+    "${pip[@]}" setuptools && "${pip[@]}" --no-build-isolation -e "$ROOT" || return 1
+    fill_cache & # all that it needs is there
+    local compiling=$!
     # torch first, at the pin of the constraints, so that nothing else chooses a build of it
-    "${pip[@]}" setuptools torch &&
-        "${pip[@]}" --no-build-isolation -e "$ROOT[rl,report,render,dev]"
+    if ! { "${pip[@]}" torch && "${pip[@]}" --no-build-isolation -e "$ROOT[rl,report,render,dev]"; }; then
+        kill "$compiling" 2>/dev/null
+        return 1
+    fi
+    wait "$compiling" || true # whoever needs the kernel says what is wrong with it
+}
+
+# Compiles what a diagnosis calls, where that has not been done.
+fill_cache() {
+    (cd "$ROOT" && "$PYTHON" -c "from coax_env.estimation.compile_ahead import fill_cache; fill_cache()")
 }
 
 set_up() {

@@ -1,12 +1,14 @@
 """Compilation: what is compiled, when, and by how many processes at once."""
 
 import gc
+import math
 import subprocess
 import threading
 import time
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 from numba import float64
 from numba.extending import overload
@@ -21,6 +23,7 @@ from coax_env.estimation import (
 )
 from coax_env.kernel import compilation
 from coax_env.kernel.compilation import compiled, compiled_when_called
+from coax_env.kernel.lazy import compiled_apart
 from coax_env.kernel.numba_internals import PackagedCacheLocator, cached_in
 
 
@@ -67,6 +70,29 @@ def test_what_compiled_code_alone_calls_has_no_wrapper_until_python_calls_it(tmp
     stored, another = a_new_process()
     assert another(1.5) == 4.0 and stored(1.5) == 3.0
     assert compiled_now(stored) == [0], "with a wrapper it serves both"
+
+
+def test_what_is_compiled_apart_is_called_and_no_part_of_what_calls_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(compilation, "CACHE_DIR", tmp_path)
+
+    def slanted(x, dt, out):
+        for i in range(x.size):
+            out[i] = x[i] + dt * math.sin(x[i])
+
+    apart, linked = compiled_apart(slanted, float64[::1]), numba.njit(slanted)
+    assert list(tmp_path.rglob("*slanted*.nbc"))  # already
+    x, codes = np.linspace(0.0, 1.0, 5), []
+    for called in (apart, linked):
+
+        @numba.njit
+        def caller(x, dt, out, called=called):
+            called(x, dt, out)
+
+        out = np.empty(5)
+        caller(x, 0.5, out)
+        assert out == pytest.approx(x + 0.5 * np.sin(x), rel=1e-15)
+        codes.append(caller.inspect_llvm(caller.signatures[0]))
+    assert ["llvm.sin" in code or "@sin" in code for code in codes] == [False, True]
 
 
 def test_a_copy_of_the_package_loads_what_was_compiled_for_the_other(tmp_path):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from corrected import FOUR, NINE
+from corrected import FOUR, LATE_AND_ASKEW, NINE
 
 import coax_env
 from coax_env.env import fleet
@@ -25,8 +25,8 @@ from coax_env.model.dynamics import (
     full_state,
     hover_trim,
     measure,
+    motion_of_registers,
     step,
-    step_and_measure_with,
 )
 from coax_env.model.dynamics import measure_bare as measure_any
 from coax_env.model.dynamics import step_bare as step_any
@@ -43,7 +43,7 @@ TERMS = (
 EVERY = tuple(
     name for effect in effects.CATALOGUE.values() for name in effect.names()
 ) + TERMS  # fmt: skip
-step_every, measure_every = step_and_measure_with(EVERY, "every")
+step_every, measure_every, _ = motion_of_registers()
 
 
 @compiled(makes_arrays=True)
@@ -319,8 +319,8 @@ def test_rows_go_into_registers_and_back_to_where_they_were(columns, kind):
 # --- the fleet ------------------------------------------------------------------------------------
 
 
-FIVE = FOUR.with_effect("battery_sag", rate=0.002)
-"""What is hidden in the bundled flight, and what follows each row's own clock."""
+SIX = FOUR.with_effect("battery_sag", rate=0.002).with_effect("vibration", tilt=2e-3, heave=3e-4)
+"""What is hidden in the bundled flight, and what follows each row's own clock and rotor."""
 LATE = FOUR.with_sensor("h", delay=0.033, dropout=0.2, bias_std=0.05).with_actuators(
     swash_travel=0.15, rotor_acceleration=2000.0
 )
@@ -362,10 +362,10 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
         (2, {"sensors": "mocap", "task": "position"}),
         (SIMD_WIDTH + 1, {"randomize": "posterior", "gusts": (0.3, 0.01)}),
         (13, {"sensors": "mocap", "task": "waypoints", "target": [(0, 0, 1.5, 0), (0, 0, 1.6, 0)]}),
-        pytest.param(11, {"vehicle": FIVE, "gusts": (0.3, 0.01)}, marks=SLOW),
-        pytest.param(11, {"vehicle": FIVE, "sensors": "paper"}, marks=SLOW),
-        pytest.param(11, {"vehicle": FIVE, "sensors": "state", "task": "waypoints"}, marks=SLOW),
-        pytest.param(11, {"vehicle": FIVE, "sensors": "mocap", "task": "position"}, marks=SLOW),
+        pytest.param(11, {"vehicle": SIX, "gusts": (0.3, 0.01)}, marks=SLOW),
+        pytest.param(11, {"vehicle": SIX, "sensors": "paper"}, marks=SLOW),
+        pytest.param(11, {"vehicle": SIX, "sensors": "state", "task": "waypoints"}, marks=SLOW),
+        pytest.param(11, {"vehicle": SIX, "sensors": "mocap", "task": "position"}, marks=SLOW),
         pytest.param(
             11,
             {
@@ -379,24 +379,12 @@ def flown(monkeypatch, side_by_side: bool, count: int, **arguments) -> dict[str,
         pytest.param(
             19, {"randomize": [LAMA, FOUR, LATE, "skybotix_coax"]}, marks=pytest.mark.slow
         ),
-        pytest.param(11, {"vehicle": NINE}, marks=SLOW),
-        pytest.param(
-            11,
-            {
-                "randomize": {
-                    "mass": (0.7, 0.9), "wind.north": (-2.0, 0.0),
-                    "rotor_drag.coefficient": (0.0, 4e-4), "servo_delay.time": (0.0, 0.05),
-                },
-                "wind": 1.0,
-            },
-            marks=SLOW,
-        ),
+        pytest.param(11, {"vehicle": LATE_AND_ASKEW}, marks=SLOW),
     ],
     ids=[
         "one group", "and three more", "fewer than a group", "own vehicles", "waypoints",
-        "five effects", "five, paper", "five, state", "five, mocap",
-        "nine effects, each their own, in turbulence, late sensors", "a list",
-        "nine effects", "ranges in wind",
+        "six effects", "six, paper", "six, state", "six, mocap",
+        "nine effects, each their own, in turbulence, late sensors", "a list", "a late servo",
     ],
 )  # fmt: skip
 def test_rows_in_a_simd_batch_fly_as_rows_one_by_one(monkeypatch, count, arguments):

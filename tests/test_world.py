@@ -8,6 +8,7 @@ from itertools import pairwise
 import gymnasium
 import numpy as np
 import pytest
+from corrected import LATE_AND_ASKEW
 from gymnasium.utils.env_checker import check_env
 
 import coax_env
@@ -362,7 +363,7 @@ def test_what_is_under_way_in_a_late_servo_at_reset_is_the_trim(monkeypatch, cou
     """A machine rigged askew hovers with its plate tilted: nothing moves before a command does."""
     monkeypatch.setattr(fleet, "SIMD_VARIANT_FROM", SIMD_WIDTH)
     rigged = LAMA.with_effect("swash_offset", lon=0.03, lat=-0.02)
-    env = CoaxVectorEnv(count, rigged.with_effect("servo_delay", time=0.03), nominal=rigged)
+    env = CoaxVectorEnv(count, LATE_AND_ASKEW, nominal=rigged)
     trim, command = dynamics.hover_trim(rigged)
     assert np.abs(command[2:]).min() > 0.01
     env.reset(seed=0, options={"state": np.tile(trim, (count, 1))})

@@ -234,12 +234,12 @@ def side_by_side(motion: Motion, kind: str, of_lanes: Motion = OF_LANES) -> Any:
     Returns:
         the three; None where a user's effect does not compile for registers.
     """
-    step, measure, drift = dynamics.motion_of_registers()
-    kernel = {"kernel_step": step, "kernel_measure": measure, "kernel_drift": drift}
-    own = compiled_motion(motion, kernel, f"of_registers_{kind}")
-    names = dict(zip(("step_of", "measure_of", "drift_of"), own, strict=True))
     signatures = (LANES_STEP, LANES_MEASURE, LANES_STEP)
     try:
+        step, measure, drift = dynamics.motion_of_registers()
+        kernel = {"kernel_step": step, "kernel_measure": measure, "kernel_drift": drift}
+        own = compiled_motion(motion, kernel, f"of_registers_{kind}")
+        names = dict(zip(("step_of", "measure_of", "drift_of"), own, strict=True))
         return tuple(
             pointer(signature.signature)(under_names(f, names, kind))
             for signature, f in zip(signatures, of_lanes[:3], strict=True)

@@ -1,10 +1,13 @@
-"""Compiled functions that are compiled when they are first called.
+"""Compiled functions that compiled code calls through their address, and does not have in it.
 
 numba compiles every function that a compiled function might call, so that whoever flies a vehicle
 without effects would wait for the code of them all. A lazily compiled function is called through its
 address instead, which stands in a cell of memory; while the cell is empty, the call goes to Python
 first and has the function compiled. What compiled code remembers is the cell's name, so it can be
 cached.
+
+And LLVM makes machine code of a function anew in each that it is linked into. A large one that many
+call is compiled apart: at once, by itself, and its callers have its address.
 """
 
 import ctypes
@@ -40,18 +43,37 @@ def lazily_compiled(function: Callable) -> Any:
 
     All are arrays of doubles, but for one called ``dt``, a number.
     """
+    return _called_by_address(function, _ARRAY)[0]
+
+
+def compiled_apart(function: Callable, arrays: types.Array) -> Any:
+    """The same, compiled now, or loaded from the cache.
+
+    Args:
+        function: of 3 to 6 arguments, a number ``dt`` among them or none. arrays: type of the others.
+    """
+    called, compile_now = _called_by_address(function, arrays)
+    compile_now()
+    return called
+
+
+def _called_by_address(function: Callable, arrays: types.Array) -> tuple[Any, Callable[[], None]]:
+    """What compiled code calls, and what compiles it where that has not been done."""
     name = name_apart(function).__qualname__
     arguments = function.__code__.co_varnames[: function.__code__.co_argcount]
-    signature = types.void(*(float64 if a == "dt" else _ARRAY for a in arguments))
+    signature = types.void(*(float64 if a == "dt" else arrays for a in arguments))
     cell = ctypes.c_size_t(0)
 
-    def compile_now() -> int:
+    def compile_now() -> None:
+        with _compiling:
+            if not cell.value:
+                made = pointer(signature)(function)
+                _kept.append(made)
+                cell.value = made.address
+
+    def compile_when_called() -> int:
         try:
-            with _compiling:
-                if not cell.value:
-                    made = pointer(signature)(function)
-                    _kept.append(made)
-                    cell.value = made.address
+            compile_now()
         except KeyboardInterrupt:
             return INTERRUPTED
         except Exception:  # Python cannot raise through compiled code: the caller there does
@@ -59,7 +81,7 @@ def lazily_compiled(function: Callable) -> Any:
             return FAILED
         return DONE
 
-    maker = _MAKER(compile_now)
+    maker = _MAKER(compile_when_called)
     _kept.extend((cell, maker))
     cell_symbol, maker_symbol = f"coax_env.kernel.lazy.{name}", f"coax_env.kernel.lazy.{name}.maker"
     llvmlite.binding.add_symbol(cell_symbol, ctypes.addressof(cell))
@@ -94,4 +116,5 @@ def lazily_compiled(function: Callable) -> Any:
         return signature, emit
 
     # numba takes no *args here
-    return intrinsic({3: of_three, 4: of_four, 5: of_five, 6: of_six}[len(signature.args)])
+    of = {3: of_three, 4: of_four, 5: of_five, 6: of_six}[len(signature.args)]
+    return intrinsic(of), compile_now

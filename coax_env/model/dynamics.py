@@ -24,8 +24,9 @@ import numpy as np
 
 from coax_env.errors import InputError
 from coax_env.kernel.compilation import compiled
-from coax_env.kernel.lazy import lazily_compiled
+from coax_env.kernel.lazy import compiled_apart, lazily_compiled
 from coax_env.kernel.simd import (
+    REGISTERS,
     any_lane,
     by_type,
     is_register,
@@ -646,7 +647,8 @@ def _stages_with(used: Collection[str] | None = None) -> dict[str, Any]:
 def motion_of_registers() -> tuple[Any, Any, Any]:
     """`step`, `measure`, `drift_and_readings` with every effect, to be called with SIMD registers."""
     motion = (_step, _measure, _drift_and_readings)
-    step, measure, drift = inlined(motion, _stages_with(), "of_registers", forced=False)
+    made = inlined(motion, _stages_with(), "of_registers", forced=False)
+    step, measure, drift = (compiled_apart(function.py_func, REGISTERS) for function in made)
     return step, measure, drift
 
 

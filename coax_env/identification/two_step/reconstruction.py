@@ -72,43 +72,70 @@ def _filter(
     q: np.ndarray, ax: np.ndarray, az: np.ndarray, sonar: np.ndarray, dt: float, g: float,
     process_noise: np.ndarray, sonar_variance: float, start: np.ndarray, spread: np.ndarray,
 ) -> tuple[np.ndarray, ...]:  # fmt: skip
-    """Forward pass: predicted and filtered states (n, 5), covariances (n, 5, 5), transitions."""
+    """Forward pass: predicted and filtered states (n, 5), covariances (n, 5, 5), transitions.
+
+    Products are written out: numba compiles those of whole matrices for ten seconds.
+    """
     n = q.size
-    x = start.copy()
-    P = np.diag(spread)
     predicted, filtered = np.zeros((n, 5)), np.zeros((n, 5))
     P_predicted, P_filtered = np.zeros((n, 5, 5)), np.zeros((n, 5, 5))
     transition = np.zeros((n, 5, 5))
-    slope = np.zeros(5)
+    x, slope, middle, gain = np.zeros(5), np.zeros(5), np.zeros(5), np.zeros(5)
+    A, F, FP, P = np.zeros((5, 5)), np.zeros((5, 5)), np.zeros((5, 5)), np.zeros((5, 5))
+    G = np.zeros((5, 3))
+    for i in range(5):
+        x[i], P[i, i] = start[i], spread[i]
     for k in range(n):
         _store_row(x, predicted[k])
         _store_matrix(P, P_predicted[k])
         if np.isfinite(sonar[k]):
-            gain = P[:, H].copy() / (P[H, H] + sonar_variance)
-            x = x + gain * (sonar[k] - x[H])
-            P = P - np.outer(gain, P[H].copy())
-            P = 0.5 * (P + P.T)
+            residual = sonar[k] - x[H]
+            for i in range(5):
+                gain[i] = P[i, H] / (P[H, H] + sonar_variance)
+                x[i] += gain[i] * residual
+            for i in range(5):
+                for j in range(i, 5):  # both halves, of what rounding may have parted
+                    left = P_predicted[k, i, j] - gain[i] * P_predicted[k, H, j]
+                    right = P_predicted[k, j, i] - gain[j] * P_predicted[k, H, i]
+                    P[i, j] = P[j, i] = 0.5 * (left + right)
         _store_row(x, filtered[k])
         _store_matrix(P, P_filtered[k])
         after = min(k + 1, n - 1)
         _rates(x, q[k], ax[k], az[k], g, slope)
-        middle = x + 0.5 * dt * slope
+        for i in range(5):
+            middle[i] = x[i] + 0.5 * dt * slope[i]
         q_half, ax_half = 0.5 * (q[k] + q[after]), 0.5 * (ax[k] + ax[after])
         az_half = 0.5 * (az[k] + az[after])
         _rates(middle, q_half, ax_half, az_half, g, slope)
-        x = x + dt * slope
+        for i in range(5):
+            x[i] += dt * slope[i]
         sin, cos = np.sin(middle[THETA]), np.cos(middle[THETA])
-        A = np.zeros((5, 5))
         A[U, THETA], A[U, W] = -g * cos, -q[k]
         A[W, THETA], A[W, U], A[W, BIAS] = -g * sin, q[k], -1.0
         A[H, THETA] = middle[U] * cos + middle[W] * sin
         A[H, U], A[H, W] = sin, -cos
-        F = np.eye(5) + dt * A + 0.5 * dt * dt * (A @ A)
-        G = np.zeros((5, 3))
         G[THETA, GYRO], G[U, GYRO], G[W, GYRO] = 1.0, -middle[W], middle[U]
         G[U, AX] = G[W, AZ] = 1.0
+        for i in range(5):
+            for j in range(5):
+                squared = 0.0
+                for a in range(5):
+                    squared += A[i, a] * A[a, j]
+                F[i, j] = (i == j) + dt * A[i, j] + 0.5 * dt * dt * squared
         _store_matrix(F, transition[k])
-        P = F @ P @ F.T + dt * dt * ((G * process_noise) @ G.T)
+        for i in range(5):
+            for j in range(5):
+                FP[i, j] = 0.0
+                for a in range(5):
+                    FP[i, j] += F[i, a] * P[a, j]
+        for i in range(5):
+            for j in range(5):
+                total = 0.0
+                for a in range(5):
+                    total += FP[i, a] * F[j, a]
+                for a in range(3):
+                    total += dt * dt * G[i, a] * process_noise[a] * G[j, a]
+                P[i, j] = total
     return predicted, P_predicted, filtered, P_filtered, transition
 
 
@@ -136,17 +163,16 @@ def _rates(x: np.ndarray, q: float, ax: float, az: float, g: float, out: np.ndar
     out[BIAS] = 0.0
 
 
-@compiled(makes_arrays=True)
 def _smooth(
     predicted: np.ndarray, P_predicted: np.ndarray, filtered: np.ndarray,
     P_filtered: np.ndarray, transition: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Backward pass of Rauch, Tung and Striebel."""
     smooth, P_smooth = filtered.copy(), P_filtered.copy()
+    back = np.linalg.solve(P_predicted[1:], transition[:-1] @ P_filtered[:-1]).swapaxes(1, 2)
     for k in range(len(filtered) - 2, -1, -1):
-        back = np.linalg.solve(P_predicted[k + 1], transition[k] @ P_filtered[k]).T.copy()
-        smooth[k] += back @ (smooth[k + 1] - predicted[k + 1])
-        P_smooth[k] += back @ (P_smooth[k + 1] - P_predicted[k + 1]) @ back.T
+        smooth[k] += back[k] @ (smooth[k + 1] - predicted[k + 1])
+        P_smooth[k] += back[k] @ (P_smooth[k + 1] - P_predicted[k + 1]) @ back[k].T
     return smooth, P_smooth
 
 
