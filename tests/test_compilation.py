@@ -28,14 +28,15 @@ from coax_env.kernel.numba_internals import PackagedCacheLocator, cached_in
 
 
 def test_what_only_python_calls_is_compiled_when_it_is_called(tmp_path, monkeypatch):
-    monkeypatch.setattr(compilation, "CACHE_DIR", tmp_path)
+    """And once, whatever effects of their own users have."""
+    monkeypatch.setattr(compilation, "OF_PACKAGE", tmp_path)
+    monkeypatch.setattr(compilation, "CACHE_DIR", tmp_path / "with a user's effect")
 
     @compiled_when_called(float64(float64))
     def doubled(x):
         return x + x
 
     assert not list(tmp_path.rglob("*doubled*"))
-    monkeypatch.setattr(compilation, "CACHE_DIR", tmp_path / "with a user's effect")
     assert doubled(1.5) == 3.0 and doubled.prepare() is doubled.prepare()
     assert list(tmp_path.rglob("*doubled*.nbc"))
     assert not (tmp_path / "with a user's effect").exists()

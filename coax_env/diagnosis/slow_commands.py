@@ -85,7 +85,15 @@ def likeliest_between(problem: Problem, noise: Noise) -> Problem:
     """
     if not problem.row > SLOWER:
         return problem
-    _, fit = as_given(problem, noise)
+    return likeliest_at(problem, as_given(problem, noise)[1])
+
+
+def likeliest_at(problem: Problem, fit: Fit) -> Problem:
+    """The problem whose commands are between the rows as is likeliest at a fit.
+
+    Args:
+        problem: with commands that are held, of slow rows. fit: of anything.
+    """
     trials = {of: _between(problem, *of) for of in product((0.0, *SHARES), (0.0, EVENLY))}
     nats = {of: _likelihood(trial, fit) for of, trial in trials.items()}
     share, variance = likeliest = max(nats, key=lambda of: nats[of])

@@ -61,7 +61,8 @@ def _cache_root() -> Path:
     )
 
 
-CACHE_DIR = _cache_root() / source_hash()
+CACHE_DIR = OF_PACKAGE = _cache_root() / source_hash()
+"""Of what is compiled from now on, a user's files in it; and of what no such file takes part in."""
 _included: list[Path] = []
 
 
@@ -129,9 +130,10 @@ def compiled(
 def compiled_when_called(signature: Any, **options: Any) -> Callable[[Callable], Any]:
     """As `compiled`, but at the first call, or at that of its attribute ``prepare``.
 
-    For functions that Python alone calls, so that an import compiles only what others call.
+    For functions that Python alone calls, so that an import compiles only what others call. They have
+    a model's functions by address: a user's effect changes nothing in them.
     """
-    folder = CACHE_DIR  # a user's file that is included later changes nothing in it
+    folder = OF_PACKAGE
 
     def decorate(function: Callable) -> Any:
         @cache

@@ -21,6 +21,7 @@ from injector_sensors import kit
 
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.shocks import in_shocks, with_shocks
+from coax_env.diagnosis.slow_commands import SLOWER, likeliest_at
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise, still_air
 from coax_env.estimation.run_passes import GATE, RunPass
@@ -82,6 +83,8 @@ def expected_evidence(
     off = {n: v for effect in listed for n, v in problem.off_values(effect).items()}
     noise = true_noise(planned, flight, vehicle, values)
     fit = Fit(tuple(listed), {**model.bare_values, **off, **values}, noise)
+    if problem.row > SLOWER:  # what was commanded between slow rows nobody knows
+        problem = likeliest_at(problem, fit)
     if in_shocks(problem, fit):  # the level beside the strengths is another
         problem, shaken = with_shocks(problem, replace(fit, levels=fitted_levels(noise)))
         noise = shaken.noise
