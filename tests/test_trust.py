@@ -325,6 +325,7 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
         of_moment=math.inf, shaken=False, poses_alone=False, clock_error=0.0, smoothed=False,
         errors_left=0.0, beside_terms=(), beside_moved=(), taken_back_by="",
         by_speeds_alone=False,
+        followed=False,
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -473,6 +474,13 @@ def test_a_lag_that_rotor_speeds_alone_show_has_no_name():
     assert without_name({"motor_lag": of}, SETTINGS) == {"motor_lag"}
     (doubt,) = doubts("motor_lag", {"motor_lag": of}, SETTINGS)
     assert "rotors' speeds" in doubt
+
+
+def test_what_an_onboard_filter_follows_is_doubted():
+    of = known_of(followed=True)
+    assert not without_name({"gyro_bias": of}, SETTINGS)
+    (doubt,) = doubts("gyro_bias", {"gyro_bias": of}, SETTINGS)
+    assert "onboard filter" in doubt
 
 
 @pytest.mark.parametrize("none", [False, True])

@@ -35,6 +35,7 @@ from coax_env.diagnosis import (
 from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
+from coax_env.diagnosis.evidence import less_sure
 from coax_env.diagnosis.gain import TOO_SHORT, flies_worse, gain_of, likelier_without
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.input_innovations import engine_as_fitted
@@ -174,9 +175,8 @@ def diagnose(
     records = [record_of(run) for run in calm.runs]
     of_sensors = []
     if circular:
-        asked = tuple(e for e in candidates if e not in onboard_filter.CIRCULAR)
-        of_sensors.append(onboard_filter.remark(set(candidates) - set(asked)))
-        records, candidates = onboard_filter.read_seldom(records, CHANNELS), asked
+        of_sensors.append(onboard_filter.remark())
+        records = onboard_filter.read_seldom(records, CHANNELS)
     used, held = split(model, records, noise, hold_out, candidates, settings)
 
     between = slow_commands.between_known(used)
@@ -204,6 +204,7 @@ def diagnose(
     onsets = moments_of(problem, fit, quadratic, evidence, state.onsets)
     fit = confounding.beside_alternatives(problem, fit, quadratic, evidence, found)
     fit = confounding.beside_undecided(problem, fit, quadratic, evidence)
+    fit = less_sure(problem, fit, quadratic, evidence, onboard_filter.followed(problem, fit))
     if not onsets:
         fit = slow_commands.beside_straight_lines(problem, fit, quadratic, evidence)
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)

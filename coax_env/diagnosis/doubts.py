@@ -69,6 +69,7 @@ class Against:
         beside_moved: numbers of the vehicle far from its file's that show in channels among its own.
         taken_back_by: a cause that takes back at rest what it does; empty: none.
         by_speeds_alone: whether it is a motor's lag that measured rotor speeds alone show.
+        followed: whether the states of an onboard filter that were read follow it.
     """
 
     channels: tuple[str, ...]
@@ -96,6 +97,7 @@ class Against:
     beside_moved: tuple[str, ...]
     taken_back_by: str
     by_speeds_alone: bool
+    followed: bool
 
     @property
     def at_limit(self) -> bool:
@@ -229,6 +231,8 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
             "no reading but the rotors' speeds shows it: speeds that are read late look the same; "
             "quick changes of thrust or torque would tell"
         )
+    if of.followed:
+        yield "an onboard filter's states were read, which follow what is wrong with their sensors"
     yield from under_noise(of.falls_at)
     yield from on_parts(of.parts, of.runs, chosen)
     yield from of_sizes(of.sizes)

@@ -25,6 +25,7 @@ from coax_env.diagnosis.doubts import LOUD, Against, doubts, on_parts, sizes, wi
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.late_rotor_speeds import LAG, by_speeds_alone
 from coax_env.diagnosis.noise_variation import not_holding
+from coax_env.diagnosis.onboard_filter import CIRCULAR
 from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import LIKE_DRIFT, Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, of_runs, replications
@@ -152,6 +153,7 @@ def trusts(
             beside_moved=tuple(name for name, own in far.items() if own & set(channels)),
             taken_back_by=undone.get(effect, ""),
             by_speeds_alone=effect == LAG and unconfirmed,
+            followed=problem.of_onboard_filter and effect in CIRCULAR,
         )
     nameless = without_name(against, problem.settings)
     return {
