@@ -1,4 +1,5 @@
-"""Slow tests begin first: no worker is left with a long one while the others have nothing to do."""
+"""Slow tests begin first, and those of a minute, ``slow(first=True)``, before them: no worker is left
+with a long one while the others have nothing to do."""
 
 import os
 from collections.abc import Sequence
@@ -10,9 +11,13 @@ import pytest
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Slow ones first in each worker's share, which is a part of the list (xdist's worksteal)."""
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    slow = [item for item in items if item.get_closest_marker("slow")]
-    quick = [item for item in items if not item.get_closest_marker("slow")]
-    shares = zip(parts(slow, workers), parts(quick, workers), strict=True)
+    kinds: tuple[list[pytest.Item], ...] = ([], [], [])
+    for item in items:
+        slow = item.get_closest_marker("slow")
+        kinds[2 if slow is None else 0 if slow.kwargs.get("first") else 1].append(item)
+    first, others, quick = kinds
+    dealt = [first[k::workers] for k in range(workers)]
+    shares = zip(dealt, parts(others, workers), parts(quick, workers), strict=True)
     items[:] = [item for share in shares for part in share for item in part]
 
 

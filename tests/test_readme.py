@@ -83,7 +83,7 @@ exec({lines!r})
 BETWEEN = "--- the lines of Python"
 
 
-@pytest.mark.slow
+@pytest.mark.slow(first=True)
 def test_the_demo_and_the_lines_of_python_print_what_readme_says(tmp_path):
     """Word by word and number by number; [...] stands for what README leaves out.
 

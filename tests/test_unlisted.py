@@ -283,7 +283,7 @@ def run_diagnose(*words: object, cwd: Path) -> subprocess.CompletedProcess:
     )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.slow(first=True)
 def test_an_effect_of_ones_own_is_named(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text(HEADING_MOMENT)
