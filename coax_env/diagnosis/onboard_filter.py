@@ -194,6 +194,6 @@ def followed(problem: Problem, fit: Fit) -> dict[str, float]:
     apart: dict[str, float] = {}
     for effect in CIRCULAR.intersection(fit.active) if problem.of_onboard_filter else ():
         names = problem.acting_names(effect)
-        largest = max(abs(fit.values[name]) for name in names)
+        largest = max((abs(fit.values[name]) for name in names), default=0.0)
         apart |= dict.fromkeys(names, FOLLOWED * largest)
     return apart
