@@ -25,3 +25,9 @@ def parts(items: Sequence[pytest.Item], count: int) -> list[Sequence[pytest.Item
     """So many parts in their order, as even as can be."""
     ends = [len(items) * k // count for k in range(count + 1)]
     return [items[a:b] for a, b in pairwise(ends)]
+
+
+@pytest.fixture
+def one_by_one(monkeypatch):
+    """Helicopters fly one by one: no variant is compiled for some steps (test_simd.py has those)."""
+    monkeypatch.setattr("coax_env.env.fleet.SIMD_VARIANT_FROM", 10**9)

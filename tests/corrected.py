@@ -22,7 +22,6 @@ NINE = (
     .with_effect("vibration", tilt=2.1e-3, heave=3.3e-4)
 )
 """What the diagnosis of the real CoaX names."""
-LATE_AND_ASKEW = LAMA.with_effect("swash_offset", lon=0.03, lat=-0.02).with_effect(
-    "servo_delay", time=0.03
-)
-"""A servo that comes late, on a machine that hovers with its plate tilted."""
+ASKEW = LAMA.with_effect("swash_offset", lon=0.03, lat=-0.02)
+LATE_AND_ASKEW = ASKEW.with_effect("servo_delay", time=0.03)
+"""A machine that hovers with its plate tilted, and one whose servo comes late besides."""

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import coax_env
-from coax_env.env import fleet, hover, tasks
+from coax_env.env import hover, tasks
 from coax_env.env.period import DT
 from coax_env.errors import InputError
 from coax_env.model.dynamics import WORK_SIZE, kernel_input, step
@@ -859,13 +859,13 @@ def test_a_correction_is_judged_by_what_the_truth_removes():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_by_one")
 def test_policies_of_both_models_begin_alike_and_each_is_the_best_on_its_own(tmp_path, monkeypatch):
     pytest.importorskip("stable_baselines3")
     from controllers import machines, trainings
 
     few = partial(trainings.train_best, flights=20)
     monkeypatch.setattr(trainings, "train_best", few)
-    monkeypatch.setattr(fleet, "SIMD_VARIANT_FROM", 10**9)  # no variant for so few steps
     for module in (machines, trainings):
         monkeypatch.setattr(module, "evaluate", partial(evaluate, seconds=5.0))
     found = machines.fly_machine(16, LAMA, tmp_path, 2, ppo_steps=2048, truth=True)

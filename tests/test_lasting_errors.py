@@ -416,4 +416,5 @@ def test_what_an_onboard_filter_follows_is_named_and_doubted(tmp_path):
         number = causes["gyro_bias"]["parameters"][f"gyro_bias.{name}"]
         assert abs(number["value"] - true) < 2.0 * number["std"]
         assert number["std"] > 0.3 * 0.04  # to a half
-    assert any("an onboard filter's" in line for line in found.remarks)
+    (said,) = [line for line in found.remarks if "an onboard filter's" in line]
+    assert "known to a half" in said

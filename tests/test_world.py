@@ -8,7 +8,7 @@ from itertools import pairwise
 import gymnasium
 import numpy as np
 import pytest
-from corrected import LATE_AND_ASKEW
+from corrected import ASKEW, LATE_AND_ASKEW
 from gymnasium.utils.env_checker import check_env
 
 import coax_env
@@ -35,12 +35,6 @@ EYED = (
     .with_sensor("psi", rate=10.0)
 )
 TRIM = dynamics.hover_trim(LAMA)
-
-
-@pytest.fixture
-def one_by_one(monkeypatch):
-    """Helicopters fly one by one: no variant is compiled for some steps (test_simd.py has those)."""
-    monkeypatch.setattr(fleet, "SIMD_VARIANT_FROM", 10**9)
 
 
 def actions(seed: int, *shape: int, size: float = 0.4) -> np.ndarray:
@@ -362,9 +356,8 @@ def test_what_is_logged_is_what_is_flown(vehicle, name):
 def test_what_is_under_way_in_a_late_servo_at_reset_is_the_trim(monkeypatch, count):
     """A machine rigged askew hovers with its plate tilted: nothing moves before a command does."""
     monkeypatch.setattr(fleet, "SIMD_VARIANT_FROM", SIMD_WIDTH)
-    rigged = LAMA.with_effect("swash_offset", lon=0.03, lat=-0.02)
-    env = CoaxVectorEnv(count, LATE_AND_ASKEW, nominal=rigged)
-    trim, command = dynamics.hover_trim(rigged)
+    env = CoaxVectorEnv(count, LATE_AND_ASKEW, nominal=ASKEW)
+    trim, command = dynamics.hover_trim(ASKEW)
     assert np.abs(command[2:]).min() > 0.01
     env.reset(seed=0, options={"state": np.tile(trim, (count, 1))})
     for _ in range(6):

@@ -204,7 +204,8 @@ def diagnose(
     onsets = moments_of(problem, fit, quadratic, evidence, state.onsets)
     fit = confounding.beside_alternatives(problem, fit, quadratic, evidence, found)
     fit = confounding.beside_undecided(problem, fit, quadratic, evidence)
-    fit = less_sure(problem, fit, quadratic, evidence, onboard_filter.followed(problem, fit))
+    if circular:
+        fit = less_sure(problem, fit, quadratic, evidence, onboard_filter.followed(problem, fit))
     if not onsets:
         fit = slow_commands.beside_straight_lines(problem, fit, quadratic, evidence)
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)
