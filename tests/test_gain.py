@@ -7,24 +7,13 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from coax_env.diagnosis import gain as gain_module
-from coax_env.diagnosis.gain import (
-    BLOCK,
-    LEAST_BLOCKS,
-    flies_worse,
-    gain_of,
-    likelier_without,
-)
-from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.gain import BLOCK, LEAST_BLOCKS, flies_worse, gain_of
 from coax_env.diagnosis.remarks import lost_in_noise
 from coax_env.estimation.prediction import ChannelReplay, RunReplay
-from coax_env.estimation.quadratic import Linearised, Quadratic
-from coax_env.estimation.state_space import FreeParameter, Noise
 
 NOISE = {"h": 0.3, "q": 0.05, "psi": 0.01}
 
@@ -84,27 +73,6 @@ def test_it_flies_worse_where_chance_does_not_do_that(interval, worse):
     assert flies_worse({"ci95": interval}, begun=False) == worse
     assert not flies_worse({"ci95": interval}, begun=True), "they may have been flown before"
     assert not flies_worse(None, begun=False)
-
-
-def test_of_two_causes_one_was_there_in_the_held_out_runs(monkeypatch):
-    """100 readings of each, both 1 where they were fitted; in the held-out runs the second is 0."""
-    a, b = "axial_damping.coefficient", "rotor_drag.coefficient"
-    free = [FreeParameter(name, 0.0, 1e3) for name in (a, b)]
-    own = {f.name.partition(".")[0]: (f,) for f in free}
-    engine = SimpleNamespace(records=[], threads=1)
-    model = SimpleNamespace(bare_values={}, moments={})
-    problem = Problem(model, engine, (), own)  # type: ignore[arg-type]
-    fit = Fit(tuple(own), {a: 1.0, b: 1.0}, Noise({}))
-    none = np.zeros((1, 2))
-    lin = Linearised((a, b), 100.0 * np.eye(2)[None], none, none[..., None], none)
-    quadratic = Quadratic.of(lin, free, fit.values)
-
-    class Held:
-        def log_likelihood(self, values, noise):
-            return -0.5 * 100.0 * ((values[a] - 1.0) ** 2 + values[b] ** 2)
-
-    monkeypatch.setattr(gain_module, "engine_as_fitted", lambda *given: Held())
-    assert likelier_without(problem, fit, quadratic, []) == {"rotor_drag"}
 
 
 def test_below_the_noise_nothing_is_left_and_no_error_is_no_channel():

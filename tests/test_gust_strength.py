@@ -100,6 +100,26 @@ def test_the_prior_is_a_normal_of_the_logarithms():
     assert prior_cost([swing(8)]) == 0.0
 
 
+@pytest.mark.parametrize("seed", [3, 5])
+def test_strengths_believe_the_model_beside_which_they_were_taken(monkeypatch, seed):
+    """Two stiffnesses: which is likelier, and by how much, with the strengths of one and of each.
+
+    A bound that touches the posterior at one of them lies below it at the other.
+    """
+    monkeypatch.setattr(gust_strength, "TURNS", 60)
+    record = rough(np.where(np.arange(40) % 5 == 2, 60.0, 1.0), n=500, seed=seed)
+    values = (TRUTH, {**TRUTH, "stiffness": 1.3 * TRUTH["stiffness"]})
+    taken = [with_strengths(Engine(Pendulum(), [record]), v, NOISE, np.array([RATE])) for v in values]
+
+    def height(i: int, of: int) -> float:
+        engine = Engine(Pendulum(), taken[of])
+        return engine.log_likelihood(values[i], NOISE) - prior_cost(taken[of])
+
+    beside, without = (height(0, of) - height(1, of) for of in (0, 1))
+    each = height(0, 0) - height(1, 1)
+    assert beside > each + 0.1 and each > without + 0.1
+
+
 def test_steady_noise_has_hardly_any_strengths():
     (found,) = with_strengths(
         Engine(Pendulum(), [rough(np.ones(80), n=1000)]), TRUTH, NOISE, np.array([RATE])

@@ -97,6 +97,7 @@ def finding(effect, twins=(), **values):
             f"these flights cannot distinguish it from {plain_words.plain(t)}" for t in twins
         ],
         "since": None,
+        "unseen": None if twins else {"nats": 41.2, "expected": 40.0, "std": 9.0},
     }
 
 
@@ -733,6 +734,16 @@ def test_what_a_number_rests_on_is_said_beside_its_cause():
     said = "".join(str(block) for section in sections for block in section.blocks)
     assert "with it 0.03 fits as well." in said
     assert "wind is not asked" not in said
+
+
+@pytest.mark.parametrize(
+    ("unseen", "said"),
+    [({"nats": 41.2, "expected": 40.0, "std": 9.0}, "worth 41.2"), (None, "not asked")],
+)
+def test_what_a_cause_is_worth_on_the_held_out_runs_is_said(unseen, said):
+    cause = finding("cg_offset", x=0.05, y=0.0) | {"unseen": unseen}
+    sections = causes.cause_sections({"causes": [cause]}, LAMA, LAMA)
+    assert said in "".join(str(block) for section in sections for block in section.blocks)
 
 
 def test_a_cause_s_interval_knows_its_correlation():

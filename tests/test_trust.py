@@ -42,6 +42,7 @@ from coax_env.diagnosis.trust import (
     of_line,
     taken_back,
 )
+from coax_env.diagnosis.unseen import Unseen
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
@@ -321,11 +322,10 @@ def known_of(channels: Sequence[str] = ("q",), **but) -> Against:
     sound = Against(
         channels=tuple(channels), coloured=(), elsewhere=0.0, likelier_without={}, loud=(), falls_at=(),
         parts=Replication(1.0, 1.0, ()), runs=8, sizes={"gain": 1.0}, determined=True,
-        may_be_none=False, flies_worse=False, within_form=False, alternatives=(), nats=100.0,
-        of_moment=math.inf, shaken=False, poses_alone=False, clock_error=0.0, smoothed=False,
-        errors_left=0.0, beside_terms=(), beside_moved=(), taken_back_by="",
-        by_speeds_alone=False,
-        followed=False,
+        may_be_none=False, flies_worse=False, unseen=None, within_form=False, alternatives=(),
+        nats=100.0, of_moment=math.inf, shaken=False, poses_alone=False,
+        clock_error=0.0, smoothed=False, errors_left=0.0, beside_terms=(), beside_moved=(),
+        taken_back_by="", by_speeds_alone=False, followed=False,
     )  # fmt: skip
     return replace(sound, **but)
 
@@ -484,11 +484,40 @@ def test_what_an_onboard_filter_follows_is_doubted():
 
 
 @pytest.mark.parametrize("none", [False, True])
-def test_what_flies_the_held_out_runs_worse_is_doubted_and_with_one_thing_more_has_no_name(none):
+@pytest.mark.parametrize(
+    ("nats", "expected", "worse", "denied"),
+    [
+        (-0.3, 13.0, False, True),  # they should show it
+        (-0.3, 9.0, False, False),  # by chance
+        (-22.0, 1.0, True, True),  # and are flown worse
+        (3.0, 13.0, True, False),  # by a gust: they are likelier with it
+    ],
+)
+def test_what_the_held_out_runs_deny_is_doubted_and_with_one_thing_more_has_no_name(
+    nats, expected, worse, denied, none
+):
     one = EFFECTS[0]
-    of = known_of(flies_worse=True, may_be_none=none)
-    assert without_name({one: of}, SETTINGS) == ({one} if none else set())
-    assert any("flies the held-out runs worse" in text for text in doubts(one, {one: of}, SETTINGS))
+    much = SETTINGS.clear + 1.0
+    of = known_of(unseen=Unseen(nats, expected, 5.0), flies_worse=worse, may_be_none=none, nats=much)
+    said = [text for text in doubts(one, {one: of}, SETTINGS) if "held-out runs" in text]
+    assert bool(said) == denied and len(said) == denied * (1 + worse)
+    assert not denied or f"worth {nats:z.0f} nats" in said[0]
+    assert without_name({one: of}, SETTINGS) == ({one} if denied and none else set())
+    assert not list(doubts(one, {one: known_of(flies_worse=True)}, SETTINGS)), "none were asked"
+
+
+@pytest.mark.parametrize(
+    ("nats", "unseen", "named"),
+    [
+        (81.0, Unseen(-0.3, 13.0, 5.0), False),
+        (81.0, Unseen(-0.3, 9.0, 5.0), True),
+        (141.0, Unseen(-0.3, 13.0, 5.0), True),
+    ],
+)
+def test_what_is_not_clear_and_denied_by_the_held_out_runs_has_no_name(nats, unseen, named):
+    """A centre of gravity on a clean flight in gusts from one side (**synthetic**)."""
+    of = known_of(nats=nats, unseen=unseen)
+    assert without_name({"cg_offset": of}, SETTINGS) == (set() if named else {"cg_offset"})
 
 
 @pytest.mark.parametrize("coloured", [(), ("q",)])

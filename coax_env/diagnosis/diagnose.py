@@ -36,7 +36,7 @@ from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
 from coax_env.diagnosis.evidence import less_sure
-from coax_env.diagnosis.gain import TOO_SHORT, flies_worse, gain_of, likelier_without
+from coax_env.diagnosis.gain import TOO_SHORT, flies_worse, gain_of
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.late_readings import with_late
@@ -53,8 +53,10 @@ from coax_env.diagnosis.remarks import (
 )
 from coax_env.diagnosis.searches.searched import searched
 from coax_env.diagnosis.settings import SETTINGS, Settings
+from coax_env.diagnosis.shock_evidence import in_own_strengths
 from coax_env.diagnosis.shocks import engine_of
 from coax_env.diagnosis.trust import beside_large_axes, trusts
+from coax_env.diagnosis.unseen import worth_unseen
 from coax_env.errors import InputError
 from coax_env.estimation import vibration
 from coax_env.estimation.changing_model import clock_of
@@ -197,6 +199,7 @@ def diagnose(
     problem, fit, quadratic, evidence, passes_after, found = confounding.settled(
         beside_large_axes(problem, fit), fit
     )
+    evidence = in_own_strengths(problem, fit, evidence)
     white = {
         "before": whiteness(passes_before, CHANNELS),
         "after": whiteness(passes_after, CHANNELS),
@@ -212,12 +215,12 @@ def diagnose(
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     replays, gain = _gain(problem, (bare, refitted, fit), held, sensors, ceiling)
     report("asking left-out runs, halves and other noise whether the names hold")
-    worse = set()
-    if flies_worse(gain, begun=bool(onsets)):
-        worse = likelier_without(problem, fit, quadratic, held)
+    # what began in flight may have done so after them
+    unseen = {} if onsets else worth_unseen(problem, fit, quadratic, evidence, held)
+    worse = flies_worse(gain, begun=bool(onsets))
     swinging = oscillations(flight.runs)
     trust = trusts(
-        problem, fit, quadratic, evidence, found, white["after"], onsets, worse, bool(swinging)
+        problem, fit, quadratic, evidence, found, white["after"], onsets, unseen, worse, bool(swinging)
     )
     causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)

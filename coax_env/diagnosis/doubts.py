@@ -5,11 +5,13 @@ or on parts of the flights, stands for something else; so does what the readings
 should show it are likelier without; a motor's lag that measured rotor speeds alone show may be that of
 their readings. What changed in flight, by little evidence, has no name: a hub stiffness, a servo's
 delay, a centre of gravity and an accelerometer's bias did on four clean **synthetic** flights, for 18
-to 29 nats, and by poses alone a swash offset for 33. Two of these take a name, too: noise left where it
+to 29 nats, and by poses alone a swash offset for 33. Nor has what the held-out runs should show and
+deny, if it is not clear on the fitted ones. Two of these take a name, too: noise left where it
 shows, little evidence there or by poses alone, other noise, parts of the flights, such a one beside it,
-numbers of which none is known to be another than nothing, held-out runs that the model flies worse with
-the causes and that are likelier without it, a share of what all causes explain that their forms may be
-wrong by where the control loop oscillates, a change in flight that a single shock may have made.
+numbers of which none is known to be another than nothing, held-out runs that are likelier without it
+and should show it, or that the model flies worse with the causes, a share of what all causes explain
+that their forms may be wrong by where the control loop oscillates, a change in flight that a single
+shock may have made.
 """
 
 import math
@@ -19,6 +21,7 @@ from dataclasses import dataclass
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Replication
 from coax_env.diagnosis.settings import Settings
+from coax_env.diagnosis.unseen import Unseen
 from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
 from coax_env.plain_words import and_list, channel_name, plain
 
@@ -53,13 +56,14 @@ class Against:
         determined: whether the flights say more of one of its numbers than the prior did.
         may_be_none: whether nothing is within the 95 % interval of each of its numbers; in that is what
             models that do as well make of them.
-        flies_worse: whether the model with the causes flies the held-out runs worse than as given, and
-            these are likelier without it.
+        flies_worse: whether the model with the causes flies the held-out runs worse than as given.
+        unseen: what it is worth on these; None where none were asked.
         within_form: whether the control loop oscillates, and what the causes explain, by forms that are
             a little wrong, leaves as much.
         alternatives: effects that would do as well.
-        nats: its evidence. of_moment: what it is worth that it began or changed when it did; endless
-            where it did not. shaken: whether gusts come in single shocks.
+        nats: its evidence.
+        of_moment: what it is worth that it began or changed when it did; endless where it did not.
+        shaken: whether gusts come in single shocks that no strengths speak for.
         poses_alone: whether neither gyros nor accelerometers were read.
         clock_error: std by which the times of the log's rows are wrong [s].
         smoothed: whether a low-pass of a sensor too fast to be seen would do the same.
@@ -84,6 +88,7 @@ class Against:
     determined: bool
     may_be_none: bool
     flies_worse: bool
+    unseen: Unseen | None
     within_form: bool
     alternatives: tuple[str, ...]
     nats: float
@@ -104,6 +109,12 @@ class Against:
         """Whether one of its numbers is as large as is believed at most."""
         return has_limit(self.sizes)
 
+    @property
+    def is_denied(self) -> bool:
+        """Whether the held-out runs are likelier without it, and show it or are flown worse."""
+        known = self.unseen
+        return known is not None and (known.denied or (self.flies_worse and known.likelier_without))
+
     def may_have_been_constant(self, chosen: Settings) -> bool:
         """Whether it changed in flight, and that is worth little."""
         return self.of_moment < chosen.sure_evidence
@@ -115,6 +126,10 @@ class Against:
     def is_weak_and_falls(self, chosen: Settings) -> bool:
         """Whether it is worth little, and does not hold under other noise."""
         return bool(self.falls_at) and self.nats < chosen.holding_evidence
+
+    def is_not_clear_and_denied(self, chosen: Settings) -> bool:
+        """Whether the held-out runs should show it and do not, and the fitted ones not clearly."""
+        return self.unseen is not None and self.unseen.denied and self.nats < chosen.clear
 
     def may_be_shock(self, chosen: Settings) -> bool:
         """Whether that is so where gusts come in single shocks."""
@@ -173,7 +188,7 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         weak = unseen and of.nats < chosen.sure_evidence
         beside = any(_shows_beside(effect, of, standing_in))
         parts = of.is_gone_on_parts(chosen)
-        seen = (bool(of.coloured), bool(of.falls_at), of.may_be_none, of.flies_worse)
+        seen = (bool(of.coloured), bool(of.falls_at), of.may_be_none, of.is_denied)
         torn = of.may_be_none and bool(of.beside_moved)
         return sum((*seen, of.within_form, of.may_be_shock(chosen), weak, parts, beside, torn))
 
@@ -184,6 +199,7 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         or of.likelier_without
         or of.is_little_change(chosen)
         or of.is_weak_and_falls(chosen)
+        or of.is_not_clear_and_denied(chosen)
         or of.by_speeds_alone
         or voices(effect, of) >= SPEAKING_AGAINST
     }
@@ -241,9 +257,11 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
         yield "none of its numbers is determined"
     if of.may_be_none:
         yield "its numbers may as well be none: models that do as well have others"
-    if of.flies_worse:
-        worse = "with the causes the model flies the held-out runs worse than as given"
-        yield f"{worse}, and they are likelier without it"
+    if of.unseen and of.is_denied:
+        there, expected = f"{of.unseen.nats:z.0f}", f"{of.unseen.expected:.0f}"
+        yield f"on the held-out runs it is worth {there} nats, where {expected} were to be expected"
+        if of.flies_worse:
+            yield "with the causes the model flies the held-out runs worse than as given"
     if of.within_form:
         share = 100.0 * math.sqrt(chosen.oscillating_form)
         yield (

@@ -69,11 +69,12 @@ clean **synthetic** flight; ours."""
 class Evidence:
     """What a cause is worth. lost: nats without it. inflation: variance inflation in its direction.
     against: channels that should show it and whose readings are likelier without it, beyond chance, and
-    by how many nats."""
+    by how many nats. rest: the fit without it."""
 
     lost: float
     inflation: float
     against: Mapping[str, float] = field(default_factory=dict)
+    rest: Fit | None = None
 
     @property
     def nats(self) -> float:
@@ -199,7 +200,7 @@ def beside_channels(
         named = dict(zip(problem.model.channels, (gained - with_it).tolist(), strict=True))
         shown = [c for c in CATALOGUE[effect].channels if named.get(c, 0.0) > least]
         against = {c: named[c] / worth.inflation for c in shown}
-        found[effect] = replace(worth, against=against)
+        found[effect] = replace(worth, against=against, rest=rest)
     return found
 
 
@@ -308,8 +309,9 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
             asked, other = fitted(second, rest), {}
         if asked.active == pruned.active:
             lesser = {
-                e: replace(min(x, other.get(e, x), key=lambda w: w.nats), against=x.against)
+                e: replace(x, lost=least.lost, inflation=least.inflation)
                 for e, x in evidence.items()
+                for least in [min(x, other.get(e, x), key=lambda w: w.nats)]
             }
             if not _feels_gusts(problem):
                 pruned = beside_unseen_answers(problem, pruned, quadratic, evidence, asked)

@@ -11,12 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.fits import without
-from coax_env.diagnosis.input_innovations import engine_as_fitted
-from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.prediction import COMPARED, RunReplay
-from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.state_space import Record
 from coax_env.model.layout import CHANNEL_UNITS
 
 BLOCK = 8  # starts, 2 s
@@ -115,28 +110,6 @@ def flies_worse(gain: Mapping[str, Any] | None, begun: bool) -> bool:
     """
     most = None if gain is None else gain.get("beyond_noise", gain)["ci95"][1]
     return most is not None and most < 0.0 and not begun
-
-
-def likelier_without(
-    problem: Problem, fit: Fit, quadratic: Quadratic, held: Sequence[Record]
-) -> set[str]:
-    """Causes without which the likelihood of the held-out runs is larger.
-
-    A gust may make a model that is right fly one run worse: with a dynamic inflow of 0.19 s, worth 116
-    nats, a heading was 4 % further off in 12 s of gusts, which were likelier with it by 3 nats; with a
-    false offset of 0.2 mm less so by 22 (both **synthetic**).
-
-    Args:
-        problem, fit: with the causes. quadratic: linearised at the fit. held: runs held out.
-    """
-    engine = engine_as_fitted(problem, held, fit)
-    likelihood = engine.log_likelihood(fit.values, fit.noise)
-    rest = {effect: without(problem, fit, quadratic, effect) for effect in fit.active}
-    return {
-        effect
-        for effect, other in rest.items()
-        if engine.log_likelihood(other.values, other.noise) > likelihood
-    }
 
 
 def removed(before: Mapping[str, Any], after: Mapping[str, Any], noise: Mapping[str, float]) -> Any:

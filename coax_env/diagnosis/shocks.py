@@ -7,7 +7,7 @@ each arm): the largest excess kurtosis of an axis is 0.1 to 0.6 where gusts have
 do, each block of time gets a strength of its own (estimation/gust_strength.py).
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from scipy.stats import kurtosis
@@ -32,7 +32,7 @@ ROUNDS = 3
 
 def in_shocks(problem: Problem, fit: Fit) -> bool:
     """Whether some axis' gusts come in shocks that no strengths speak for."""
-    return not _has_strengths(problem) and gust_kurtosis(problem, fit) > problem.settings.shocks
+    return not has_strengths(problem) and gust_kurtosis(problem, fit) > problem.settings.shocks
 
 
 def gust_kurtosis(problem: Problem, fit: Fit) -> float:
@@ -82,16 +82,16 @@ def _largest_kurtosis(moved: np.ndarray) -> float:
     return float(np.max(kurtosis(moved, axis=0), initial=0.0)) if moved.size else 0.0
 
 
-def with_shocks(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+def with_shocks(problem: Problem, fit: Fit, held: Collection[str] = ()) -> tuple[Problem, Fit]:
     """The problem with a strength of the gusts for each block of time, and the fit to it.
 
     Args:
-        problem, fit: with the causes.
+        problem, fit: with the causes. held: names of free parameters that stay.
     """
     for _ in range(ROUNDS):
         records = with_strengths(problem.engine, fit.values, fit.noise, _moving(fit))
         problem = problem.with_records(records)
-        fit = noise_fitted(problem, fitted(problem, fit))
+        fit = noise_fitted(problem, fitted(problem, fit, held=held))
     return problem, fit
 
 
@@ -102,13 +102,14 @@ def engine_of(problem: Problem, records: Sequence[Record], fit: Fit) -> Engine:
         problem: whose model it has. records: that were not fitted. fit: of the model that flies them.
     """
     engine = like_fitted(problem, Engine(problem.model, records), fit)
-    if not _has_strengths(problem):
+    if not has_strengths(problem):
         return engine
     shaken = with_strengths(engine, fit.values, fit.noise, _moving(fit))
     return Engine(problem.model, shaken)
 
 
-def _has_strengths(problem: Problem) -> bool:
+def has_strengths(problem: Problem) -> bool:
+    """Whether blocks of time have strengths of their own."""
     return not problem.engine.records[0].strength.steady
 
 

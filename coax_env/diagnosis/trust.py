@@ -10,7 +10,7 @@ unexplained.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,6 +33,7 @@ from coax_env.diagnosis.sensor_low_pass import may_hide_behind
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.shocks import in_shocks
 from coax_env.diagnosis.unlisted import acted_on
+from coax_env.diagnosis.unseen import Unseen
 from coax_env.estimation.helicopter import UNUSUAL_FROM
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.vibration import Line
@@ -62,6 +63,7 @@ class Trust:
         doubts: reasons against the name, in plain words; none: it is sure.
         channels: in which it shows most, strongest first.
         named: whether it is stated as a cause; what is not is told among the unexplained.
+        unseen: what it is worth on the held-out runs; None where none were asked.
     """
 
     noise: bool
@@ -71,6 +73,7 @@ class Trust:
     doubts: tuple[str, ...]
     channels: tuple[str, ...]
     named: bool = True
+    unseen: Unseen | None = None
 
     @property
     def word(self) -> str:
@@ -84,6 +87,7 @@ class Trust:
             "trust": self.word,
             "doubts": list(self.doubts),
             "since": None,
+            "unseen": self.unseen and self.unseen.entry(),
         }
 
 
@@ -95,7 +99,8 @@ def trusts(
     found: Alternatives,
     white: Mapping[str, Whiteness],
     onsets: Mapping[str, Onset],
-    worse: Collection[str],
+    unseen: Mapping[str, Unseen],
+    worse: bool,
     oscillates: bool,
 ) -> dict[str, Trust]:
     """Every active effect judged.
@@ -107,8 +112,8 @@ def trusts(
         found: the confounded alternatives of each cause.
         white: whiteness of the innovations, by channel.
         onsets: of causes that began or changed.
-        worse: causes with which the model flies the held-out runs worse, and that these are likelier
-            without.
+        unseen: worth of each on the held-out runs, where that was asked.
+        worse: whether the model with the causes flies these worse.
         oscillates: whether the control loop oscillates through the flight.
     """
     worth = {effect: weighed.nats for effect, weighed in evidence.items()}
@@ -139,7 +144,8 @@ def trusts(
             sizes=sizes(problem, fit, effect),
             determined=any(known[effect][name] for name in problem.acting_names(effect)),
             may_be_none=may_be_none(problem, fit, quadratic, effect, evidence[effect].inflation),
-            flies_worse=effect in worse,
+            flies_worse=worse,
+            unseen=unseen.get(effect),
             within_form=worth[effect] < of_form,
             alternatives=(*found[effect], *untold(problem, fit, quadratic, effect)),
             nats=worth[effect],
@@ -160,6 +166,7 @@ def trusts(
         effect: Trust(
             not of.falls_at, of.parts.runs, of.parts.kept, known[effect],
             tuple(doubts(effect, against, problem.settings)), of.channels, effect not in nameless,
+            of.unseen,
         )
         for effect, of in against.items()
     }  # fmt: skip

@@ -90,12 +90,12 @@ TRUST = {
 """How far a cause's name may be believed -> the heading of such causes, and what that means."""
 AT_ONCE = 0.95
 """Probability from which on a cause is said to have come at once; ours."""
-_ROBUST_HEADER = ["cause", "name is", "under other noise", "left-out runs", "halves"]
+_ROBUST_HEADER = ["cause", "name is", "under other noise", "left-out runs", "halves", "held-out runs"]
 
 
 def _robust_row(cause: Mapping[str, Any]) -> list[str]:
     """What a cause's name withstood, in a table."""
-    robust = cause["robust"]
+    robust, unseen = cause["robust"], cause.get("unseen")
     return [
         capital(plain(cause["effect"])),
         cause["trust"],
@@ -104,6 +104,7 @@ def _robust_row(cause: Mapping[str, Any]) -> list[str]:
         "could not tell"
         if robust["kept"] is None
         else f"returns in {whole_percent(100.0 * robust['kept'])}",
+        f"worth {number(unseen['nats'])} nats" if unseen else "not asked",
     ]
 
 

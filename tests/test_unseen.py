@@ -1,0 +1,124 @@
+"""What a cause is worth on runs that were not fitted, on regressions whose truth is known.
+
+Linear in white noise, drawn here: what it should be worth, and by how much that scatters, is then a
+matter of the normal distribution.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+from test_trust import EFFECTS, drawn, fitted_to, problem_of
+
+from coax_env.diagnosis import unseen as unseen_module
+from coax_env.diagnosis.evidence import Evidence
+from coax_env.diagnosis.fits import without
+from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.unseen import BY_CHANCE, Unseen, worth_unseen
+from coax_env.estimation.quadratic import Linearised, Quadratic
+from coax_env.estimation.state_space import Noise
+
+ONE, TWO = EFFECTS[:2]
+RUNS = 8
+
+
+class Held:
+    """A held-out run: readings y (n,) on columns X (n, 4) in white noise of std 1."""
+
+    def __init__(self, X: np.ndarray, y: np.ndarray) -> None:
+        self.X, self.y = X, y
+
+    def linearise(self, values, noise, free, gains):
+        G = self.X[:, self._which(free)].T @ self.X[:, self._which(free)]
+        none = np.zeros((1, len(free)))
+        return [], Linearised(tuple(f.name for f in free), G[None], none, none[..., None], none)
+
+    def log_likelihood(self, values, noise):
+        left = self.y - self.X @ np.array(list(values.values()))
+        return -0.5 * float(left @ left)
+
+    @staticmethod
+    def _which(free) -> list[int]:
+        every = [f.name for f in problem_of(1).parameters]
+        return [every.index(f.name) for f in free]
+
+
+def of_no_colour(problem: Problem, fit: Fit, quadratic: Quadratic) -> dict[str, Evidence]:
+    """With the fits without each cause, which are all that matters here."""
+    return {
+        effect: Evidence(0.0, 1.0, rest=without(problem, fit, quadratic, effect))
+        for effect in fit.active
+    }
+
+
+def worth(monkeypatch, rng, size: float, size_unseen: float) -> Unseen:
+    """Of the first of two effects whose columns have half in common, of the given sizes."""
+    sizes = [size] * RUNS + [size_unseen]
+    designs, y = drawn(rng, sizes, [1.0] * len(sizes), len(sizes))
+    problem = problem_of(RUNS)
+    fit, quadratic, _ = fitted_to(problem, designs[:RUNS], y[:RUNS], (ONE, TWO))
+    held = Held(designs[-1], y[-1])
+    monkeypatch.setattr(unseen_module, "engine_as_fitted", lambda *given: held)
+    evidence = of_no_colour(problem, fit, quadratic)
+    return worth_unseen(problem, fit, quadratic, evidence, [None])[ONE]  # type: ignore[list-item]
+
+
+def test_what_it_is_worth_scatters_as_said_about_what_it_should_be(monkeypatch):
+    """200 draws of a cause worth 100 nats on the eight runs that were fitted, 12.5 on the other."""
+    rng = np.random.default_rng(4)
+    size = math.sqrt(2.0 * 100.0 / (100.0 * RUNS))
+    found = [worth(monkeypatch, rng, size, size) for _ in range(200)]
+    z = np.array([(one.nats - one.expected) / one.std for one in found])
+    assert np.mean([one.expected for one in found]) == pytest.approx(12.5, rel=0.1)
+    assert abs(z.mean()) < 3.0 / math.sqrt(z.size)
+    assert z.std() == pytest.approx(1.0, abs=3.0 / math.sqrt(2.0 * z.size))
+    assert np.mean([one.denied for one in found]) < norm.cdf(-BY_CHANCE) + 0.03
+
+
+def test_what_is_not_there_is_denied_where_it_should_show(monkeypatch):
+    rng = np.random.default_rng(5)
+    size = math.sqrt(2.0 * 250.0 / (100.0 * RUNS))  # 31 nats are to be expected
+    found = [worth(monkeypatch, rng, size, 0.0) for _ in range(50)]
+    assert np.mean([one.denied for one in found]) > 0.9
+    little = [worth(monkeypatch, rng, 0.1 * size, 0.0) for _ in range(50)]
+    assert not any(one.denied for one in little), "the run does not show it"
+
+
+def test_of_two_causes_one_was_there_in_the_held_out_runs(monkeypatch):
+    rng = np.random.default_rng(6)
+    designs, y = drawn(rng, [1.0] * (RUNS + 1), [1.0] * (RUNS + 1), RUNS + 1)
+    y = [target + X[:, 2] for X, target in zip(designs, y, strict=True)]
+    y[-1] = y[-1] - designs[-1][:, 2]  # the second one is gone
+    problem = problem_of(RUNS)
+    fit, quadratic, _ = fitted_to(problem, designs[:RUNS], y[:RUNS], (ONE, TWO))
+    monkeypatch.setattr(unseen_module, "engine_as_fitted", lambda *g: Held(designs[-1], y[-1]))
+    evidence = of_no_colour(problem, fit, quadratic)
+    found = worth_unseen(problem, fit, quadratic, evidence, [None])  # type: ignore[list-item]
+    assert found[TWO].denied and found[TWO].likelier_without
+    assert not found[ONE].denied and not found[ONE].likelier_without
+
+
+def test_coloured_innovations_make_it_scatter_more(monkeypatch):
+    one = Unseen(-1.0, 12.0, 5.0)
+    assert one.denied and not Unseen(-1.0, 12.0, 7.0).denied
+    assert not Unseen(1.0, 40.0, 5.0).denied, "it is worth something"
+    rng = np.random.default_rng(7)
+    designs, y = drawn(rng, [1.0] * RUNS, [1.0] * RUNS)
+    problem = problem_of(RUNS)
+    fit, quadratic, _ = fitted_to(problem, designs, y, (ONE,))
+    monkeypatch.setattr(unseen_module, "engine_as_fitted", lambda *given: Held(designs[0], y[0]))
+    evidence = of_no_colour(problem, fit, quadratic)
+    of = [
+        worth_unseen(
+            problem, fit, quadratic, {ONE: replace(evidence[ONE], inflation=factor)}, [None]
+        )[ONE]  # type: ignore[list-item]
+        for factor in (1.0, 4.0)
+    ]
+    assert of[0].std < of[1].std < 2.0 * of[0].std
+
+
+def test_of_nothing_held_out_nothing_is_said():
+    none = worth_unseen(problem_of(1), Fit((ONE,), {}, Noise({})), None, {}, [])  # type: ignore[arg-type]
+    assert none == {}
