@@ -548,9 +548,15 @@ def test_a_change_that_a_shock_may_have_made_has_no_name_with_one_thing_more(
     ("nats", "falls", "named"), [(27.0, True, False), (27.0, False, True), (29.0, True, True)]
 )
 def test_what_is_worth_little_and_does_not_hold_under_other_noise_has_no_name(nats, falls, named):
-    """An accelerometer's bias of 16 nats, gone at half a gust's memory (**synthetic**, clean)."""
+    """An accelerometer's bias of 16 nats, gone at half a gust's memory (**synthetic**, clean).
+
+    So is a rotor drag of 19 for an airframe's, with which a held-out run was flown worse.
+    """
     of = known_of(nats=nats, falls_at=("half of all",) * falls)
     assert without_name({"accel_bias": of}, SETTINGS) == (set() if named else {"accel_bias"})
+    of = known_of(nats=nats, unseen=Unseen(-2.0, 3.0, 2.4), flies_worse=falls)
+    few = without_name({"rotor_drag": of}, SETTINGS)
+    assert few == (set() if named else {"rotor_drag"})
 
 
 @pytest.mark.parametrize(

@@ -124,8 +124,9 @@ class Against:
         return self.may_have_been_constant(chosen) and self.nats < chosen.sure_evidence
 
     def is_weak_and_falls(self, chosen: Settings) -> bool:
-        """Whether it is worth little, and does not hold under other noise."""
-        return bool(self.falls_at) and self.nats < chosen.holding_evidence
+        """Whether it is worth little, and does not hold under other noise or on the held-out runs."""
+        falls = bool(self.falls_at) or self.is_denied
+        return falls and self.nats < chosen.holding_evidence
 
     def is_not_clear_and_denied(self, chosen: Settings) -> bool:
         """Whether the held-out runs should show it and do not, and the fitted ones not clearly."""
