@@ -57,6 +57,7 @@ def worth(monkeypatch, rng, size: float, size_unseen: float) -> Unseen:
     """Of the first of two effects whose columns have half in common, of the given sizes."""
     sizes = [size] * RUNS + [size_unseen]
     designs, y = drawn(rng, sizes, [1.0] * len(sizes), len(sizes))
+    y = [target + 3.0 * X[:, 0] for X, target in zip(designs, y, strict=True)]  # with it and without
     problem = problem_of(RUNS)
     fit, quadratic, _ = fitted_to(problem, designs[:RUNS], y[:RUNS], (ONE, TWO))
     held = Held(designs[-1], y[-1])
