@@ -89,7 +89,7 @@ def fitted_to(
     _, move = about().best(problem.free_names(active))
     at = about().moved(move)
     quadratic = about()
-    fit = Fit(tuple(active), at, Noise({}))
+    fit = Fit(tuple(active), at, Noise({}), objective=0.0)
     return fit, quadratic, {e: lost(problem, quadratic, active, e) for e in active}
 
 

@@ -45,24 +45,30 @@ class Held:
         return [every.index(f.name) for f in free]
 
 
-def of_no_colour(problem: Problem, fit: Fit, quadratic: Quadratic) -> dict[str, Evidence]:
-    """With the fits without each cause, which are all that matters here."""
-    return {
-        effect: Evidence(0.0, 1.0, rest=without(problem, fit, quadratic, effect))
-        for effect in fit.active
-    }
+def of_no_colour(
+    problem: Problem, fit: Fit, quadratic: Quadratic, worth: dict[str, float]
+) -> dict[str, Evidence]:
+    """Evidence with the fits without each cause, by what is lost then."""
+    found = {}
+    for effect in fit.active:
+        rest = without(problem, fit, quadratic, effect)
+        rest = replace(rest, objective=worth[effect])
+        found[effect] = Evidence(worth[effect], 1.0, rest=rest)
+    return found
 
 
 def worth(monkeypatch, rng, size: float, size_unseen: float) -> Unseen:
-    """Of the first of two effects whose columns have half in common, of the given sizes."""
+    """Of the first of two effects, of one size on the fitted runs and another on the held-out one."""
     sizes = [size] * RUNS + [size_unseen]
     designs, y = drawn(rng, sizes, [1.0] * len(sizes), len(sizes))
-    y = [target + 3.0 * X[:, 0] for X, target in zip(designs, y, strict=True)]  # with it and without
+    y = [
+        target + 3.0 * X[:, 0] for X, target in zip(designs, y, strict=True)
+    ]  # with it and without
     problem = problem_of(RUNS)
-    fit, quadratic, _ = fitted_to(problem, designs[:RUNS], y[:RUNS], (ONE, TWO))
+    fit, quadratic, known = fitted_to(problem, designs[:RUNS], y[:RUNS], (ONE, TWO))
     held = Held(designs[-1], y[-1])
     monkeypatch.setattr(unseen_module, "engine_as_fitted", lambda *given: held)
-    evidence = of_no_colour(problem, fit, quadratic)
+    evidence = of_no_colour(problem, fit, quadratic, known)
     return worth_unseen(problem, fit, quadratic, evidence, [None])[ONE]  # type: ignore[list-item]
 
 
@@ -93,24 +99,36 @@ def test_of_two_causes_one_was_there_in_the_held_out_runs(monkeypatch):
     y = [target + X[:, 2] for X, target in zip(designs, y, strict=True)]
     y[-1] = y[-1] - designs[-1][:, 2]  # the second one is gone
     problem = problem_of(RUNS)
-    fit, quadratic, _ = fitted_to(problem, designs[:RUNS], y[:RUNS], (ONE, TWO))
+    fit, quadratic, known = fitted_to(problem, designs[:RUNS], y[:RUNS], (ONE, TWO))
     monkeypatch.setattr(unseen_module, "engine_as_fitted", lambda *g: Held(designs[-1], y[-1]))
-    evidence = of_no_colour(problem, fit, quadratic)
+    evidence = of_no_colour(problem, fit, quadratic, known)
     found = worth_unseen(problem, fit, quadratic, evidence, [None])  # type: ignore[list-item]
     assert found[TWO].denied and found[TWO].likelier_without
     assert not found[ONE].denied and not found[ONE].likelier_without
 
 
+@pytest.mark.parametrize(
+    ("nats", "expected", "std", "denied"),
+    [
+        (0.9, 12.2, 5.2, True),  # a centre of gravity that is not there (**synthetic**, clean)
+        (-6.3, 3.2, 2.7, True),  # another, for what is in no list
+        (-1.6, 0.3, 0.8, False),  # a dynamic inflow that is: the run does not show it
+        (0.7, 4.0, 2.9, False),  # an upper rotor's blow-back that is: by chance
+        (4.0, 40.0, 5.0, False),  # it is worth something
+    ],
+)
+def test_what_is_denied(nats, expected, std, denied):
+    assert Unseen(nats, expected, std).denied == denied
+
+
 def test_coloured_innovations_make_it_scatter_more(monkeypatch):
-    one = Unseen(-1.0, 12.0, 5.0)
-    assert one.denied and not Unseen(-1.0, 12.0, 7.0).denied
-    assert not Unseen(1.0, 40.0, 5.0).denied, "it is worth something"
+    assert Unseen(-1.0, 12.0, 5.0).denied and not Unseen(-1.0, 12.0, 7.0).denied
     rng = np.random.default_rng(7)
     designs, y = drawn(rng, [1.0] * RUNS, [1.0] * RUNS)
     problem = problem_of(RUNS)
-    fit, quadratic, _ = fitted_to(problem, designs, y, (ONE,))
+    fit, quadratic, known = fitted_to(problem, designs, y, (ONE,))
     monkeypatch.setattr(unseen_module, "engine_as_fitted", lambda *given: Held(designs[0], y[0]))
-    evidence = of_no_colour(problem, fit, quadratic)
+    evidence = of_no_colour(problem, fit, quadratic, known)
     of = [
         worth_unseen(
             problem, fit, quadratic, {ONE: replace(evidence[ONE], inflation=factor)}, [None]
@@ -118,6 +136,25 @@ def test_coloured_innovations_make_it_scatter_more(monkeypatch):
         for factor in (1.0, 4.0)
     ]
     assert of[0].std < of[1].std < 2.0 * of[0].std
+
+
+def test_what_other_noise_takes_up_is_not_expected(monkeypatch):
+    """Noise levels without the cause are fitted, and leave a third of what it is worth."""
+    rng = np.random.default_rng(8)
+    designs, y = drawn(rng, [1.0] * RUNS, [1.0] * RUNS)
+    problem = problem_of(RUNS)
+    fit, quadratic, known = fitted_to(problem, designs, y, (ONE,))
+    monkeypatch.setattr(unseen_module, "engine_as_fitted", lambda *given: Held(designs[0], y[0]))
+    of = [
+        worth_unseen(
+            problem, fit, quadratic, of_no_colour(problem, fit, quadratic, {ONE: nats}), [None]
+        )[ONE]  # type: ignore[list-item]
+        for nats in (known[ONE], known[ONE] / 3.0, 2.0 * known[ONE])
+    ]
+    assert of[1].expected == pytest.approx(of[0].expected / 3.0) and of[1].std < of[0].std
+    assert of[2].expected == pytest.approx(of[0].expected, rel=0.01), (
+        "never more than the runs show"
+    )
 
 
 def test_of_nothing_held_out_nothing_is_said():

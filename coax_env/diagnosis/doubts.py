@@ -8,8 +8,8 @@ delay, a centre of gravity and an accelerometer's bias did on four clean **synth
 to 29 nats, and by poses alone a swash offset for 33. Nor has what the held-out runs should show and
 deny, if it is not clear on the fitted ones. Two of these take a name, too: noise left where it
 shows, little evidence there or by poses alone, other noise, parts of the flights, such a one beside it,
-numbers of which none is known to be another than nothing, held-out runs that are likelier without it
-and should show it, or that the model flies worse with the causes, a share of what all causes explain
+numbers of which none is known to be another than nothing, held-out runs that should show it and do not,
+or that are likelier without it and flown worse with the causes, a share of what all causes explain
 that their forms may be wrong by where the control loop oscillates, a change in flight that a single
 shock may have made.
 """
@@ -111,7 +111,7 @@ class Against:
 
     @property
     def is_denied(self) -> bool:
-        """Whether the held-out runs are likelier without it, and show it or are flown worse."""
+        """Whether the held-out runs should show it and do not, or deny it and are flown worse."""
         known = self.unseen
         return known is not None and (known.denied or (self.flies_worse and known.likelier_without))
 

@@ -4,13 +4,15 @@ With a cause the parameters are elsewhere than without it, by d. If it acts as f
 are likelier with it by a number whose mean is d'Gd/2, G being their information, and whose variance is
 d'Gd, times the inflation by coloured innovations, and d'GPGd, P being the covariance of what was
 fitted; if it does not act, the mean is -d'Gd/2 (the log-likelihood ratio of two normal models: Cox and
-Hinkley 1974, Theoretical Statistics, ch. 9). Where the runs show little of it, nothing is said.
+Hinkley 1974, Theoretical Statistics, ch. 9). Noise levels that are fitted without a strong cause take
+up most of it: what is to be expected is as many times less as on the runs that were fitted. Where the
+held-out runs show little of a cause, nothing is said.
 
 Of 19 true causes on **synthetic** flights (`study_diagnosis.py --arms all --seed 839`, one flight of
-each arm) 18 were worth something there, where 0.2 to 3,650 nats were to be expected; one was not, of
-which 0.0 were. A centre of gravity that is not there, of 166 nats on the seven runs that were fitted,
-should have been worth 13 +- 5 on the one held out, and was worth nothing. What is far from a straight
-line, as a delay, may be worth many times what is expected.
+each arm) 18 were worth something there; one was not, of which 0.0 nats were to be expected. A centre of
+gravity that is not there, of 166 nats on the seven runs that were fitted, should have been worth 12 +-
+5 on the one held out, and was worth 1. What is far from a straight line, as a delay, may be worth many
+times what is to be expected.
 """
 
 import math
@@ -26,7 +28,10 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Record
 
 BY_CHANCE = 2.0
-"""Std of what is expected above nothing, for the runs to show it."""
+"""Std that what is found may be below what is to be expected."""
+LITTLE = 3.0
+"""nats, odds of 20, that a cause is worth at most on runs that deny it, and more than which it should be;
+ours."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +54,9 @@ class Unseen:
 
     @property
     def denied(self) -> bool:
-        """Whether they are, although they should show it, beyond chance."""
-        return self.likelier_without and self.expected > BY_CHANCE * self.std
+        """Whether it is worth nothing there, although it should be, beyond chance."""
+        least = self.expected - BY_CHANCE * self.std
+        return self.expected > LITTLE and self.nats < min(LITTLE, least)
 
 
 def worth_unseen(
@@ -76,15 +82,17 @@ def worth_unseen(
     names = [f.name for f in free]
     _, there = engine.linearise(fit.values, fit.noise, free, gains=False)
     G, P = there.information.sum(0), quadratic.covariance(names)
+    of_fitted = quadratic.G[np.ix_(*2 * [quadratic.index(names)])]
     likelihood = engine.log_likelihood(fit.values, fit.noise)
 
     def of(rest: Fit, inflation: float) -> Unseen:
         d = np.array([fit.values[name] - rest.values[name] for name in names])
         shown, of_fit = float(d @ G @ d), float(d @ G @ P @ G @ d)
+        left = min(2.0 * (rest.objective - fit.objective) / float(d @ of_fitted @ d), 1.0)
         return Unseen(
             likelihood - engine.log_likelihood(rest.values, rest.noise),
-            0.5 * shown,
-            math.sqrt(shown * inflation + of_fit),
+            0.5 * left * shown,
+            math.sqrt(left * shown * inflation + left**2 * of_fit),
         )
 
     return {
