@@ -30,7 +30,7 @@ from coax_env.estimation.state_space import Record
 BY_CHANCE = 2.0
 """Std that what is found may be below what is to be expected."""
 LITTLE = 3.0
-"""nats, odds of 20, that a cause is worth at most on runs that deny it, and more than which it should be;
+"""nats, odds of 20, that a cause is worth at most on runs that deny it, where it should be worth more;
 ours."""
 
 
