@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import norm
-from test_trust import EFFECTS, drawn, fitted_to, problem_of
+from test_trust import EFFECTS, NAMES, drawn, fitted_to, problem_of
 
 from coax_env.diagnosis import unseen as unseen_module
 from coax_env.diagnosis.evidence import Evidence
@@ -21,6 +21,7 @@ from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import Noise
 
 ONE, TWO = EFFECTS[:2]
+ONE_OF = NAMES[0]
 RUNS = 8
 
 
@@ -155,6 +156,34 @@ def test_what_other_noise_takes_up_is_not_expected(monkeypatch):
     assert of[2].expected == pytest.approx(of[0].expected, rel=0.01), (
         "never more than the runs show"
     )
+
+
+@pytest.mark.parametrize("diverging", ["with", "without"])
+def test_where_a_filter_diverges_nothing_is_said(monkeypatch, diverging):
+    rng = np.random.default_rng(9)
+    designs, y = drawn(rng, [1.0] * RUNS, [1.0] * RUNS)
+    problem = problem_of(RUNS)
+    fit, quadratic, known = fitted_to(problem, designs, y, (ONE,))
+    held = Held(designs[0], y[0])
+
+    def log_likelihood(values, noise):
+        return -math.inf if (values[ONE_OF] != 0.0) == (diverging == "with") else -1.0
+
+    monkeypatch.setattr(held, "log_likelihood", log_likelihood)
+    monkeypatch.setattr(unseen_module, "engine_as_fitted", lambda *given: held)
+    evidence = of_no_colour(problem, fit, quadratic, known)
+    assert worth_unseen(problem, fit, quadratic, evidence, [None]) == {}  # type: ignore[list-item]
+
+
+def test_of_what_explains_nothing_nothing_is_expected(monkeypatch):
+    rng = np.random.default_rng(10)
+    designs, y = drawn(rng, [1.0] * RUNS, [1.0] * RUNS)
+    problem = problem_of(RUNS)
+    fit, quadratic, _ = fitted_to(problem, designs, y, (ONE,))
+    monkeypatch.setattr(unseen_module, "engine_as_fitted", lambda *given: Held(designs[0], y[0]))
+    evidence = of_no_colour(problem, fit, quadratic, {ONE: -1.0})
+    found = worth_unseen(problem, fit, quadratic, evidence, [None])[ONE]  # type: ignore[list-item]
+    assert found.expected == found.std == 0.0 and not found.denied
 
 
 def test_of_nothing_held_out_nothing_is_said():
