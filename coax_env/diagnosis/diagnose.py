@@ -60,6 +60,7 @@ from coax_env.diagnosis.unseen import worth_unseen
 from coax_env.errors import InputError
 from coax_env.estimation import vibration
 from coax_env.estimation.changing_model import clock_of
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.fitted_vehicle import double_counting
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of
@@ -213,10 +214,14 @@ def diagnose(
         fit = slow_commands.beside_straight_lines(problem, fit, quadratic, evidence)
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
-    replays, gain = _gain(problem, (bare, refitted, fit), held, sensors, ceiling)
+    own = None
+    if held:
+        problem.report("flying the held-out runs")
+        own = engine_as_fitted(problem, held, fit)
+    replays, gain = _gain(problem, (bare, refitted, fit), held, own, sensors, ceiling)
     report("asking left-out runs, halves and other noise whether the names hold")
     # what began in flight may have done so after them
-    unseen = {} if onsets else worth_unseen(problem, fit, quadratic, evidence, held)
+    unseen = worth_unseen(problem, fit, quadratic, evidence, None if onsets else own)
     worse = flies_worse(gain, begun=bool(onsets))
     swinging = oscillations(flight.runs)
     trust = trusts(
@@ -386,23 +391,23 @@ def _gain(
     problem: Problem,
     fits: tuple[Fit, Fit, Fit],
     held: Sequence[Record],
+    own: Engine | None,
     sensors: Mapping[str, float],
     ceiling: bool,
 ) -> tuple[list[list[RunReplay]], dict[str, Any] | None]:
     """Replays of the held-out runs by the bare, refitted and corrected model, and the gain.
 
-    Each by the very filter that was fitted, input innovations included.
+    Each by the very filter that was fitted, input innovations included: `own`; none is held out
+    where that is None.
     """
-    if not held:
+    if own is None:
         return [[], [], []], None
-    problem.report("flying the held-out runs")
     horizon = problem.settings.horizon
     bare, refitted, fit = fits
     before, own_numbers = (
         replay_runs(engine_of(problem, held, given), given.values, given.noise, horizon)
         for given in (bare, refitted)
     )
-    own = engine_as_fitted(problem, held, fit)
     after = replay_runs(own, fit.values, fit.noise, horizon, floor=True)
     flexible: list[RunReplay] = []
     if ceiling:

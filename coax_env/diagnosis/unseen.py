@@ -16,16 +16,15 @@ times what is to be expected.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from coax_env.diagnosis.evidence import Evidence
-from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.estimation.engine import Engine
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.state_space import Record
 
 BY_CHANCE = 2.0
 """Std that what is found may be below what is to be expected."""
@@ -45,7 +44,7 @@ class Unseen:
 
     def entry(self) -> dict[str, float]:
         """findings.json's `unseen`."""
-        return {"nats": self.nats, "expected": self.expected, "std": self.std}
+        return asdict(self)
 
     @property
     def likelier_without(self) -> bool:
@@ -64,7 +63,7 @@ def worth_unseen(
     fit: Fit,
     quadratic: Quadratic,
     evidence: Mapping[str, Evidence],
-    held: Sequence[Record],
+    held: Engine | None,
 ) -> dict[str, Unseen]:
     """Of each cause, against the fit without it.
 
@@ -73,17 +72,16 @@ def worth_unseen(
     Args:
         problem, fit: with the causes. quadratic: linearised at the fit.
         evidence: of the causes, with the fits without them and the inflation of their variances.
-        held: runs held out. Of none nothing is said, nor where a filter diverges on them.
+        held: of the runs held out, as fitted. Of none nothing is said, nor where a filter diverges.
     """
-    if not held or not fit.active:
+    if held is None or not fit.active:
         return {}
-    engine = engine_as_fitted(problem, held, fit)
     free = problem.free(fit.active)
     names = [f.name for f in free]
-    _, there = engine.linearise(fit.values, fit.noise, free, gains=False)
+    _, there = held.linearise(fit.values, fit.noise, free, gains=False)
     G, P = there.information.sum(0), quadratic.covariance(names)
     of_fitted = quadratic.G[np.ix_(*2 * [quadratic.index(names)])]
-    likelihood = engine.log_likelihood(fit.values, fit.noise)
+    likelihood = held.log_likelihood(fit.values, fit.noise)
 
     def of(rest: Fit, inflation: float) -> Unseen:
         d = np.array([fit.values[name] - rest.values[name] for name in names])
@@ -91,7 +89,7 @@ def worth_unseen(
         lost = max(rest.objective - fit.objective, 0.0)
         left = 2.0 * lost / max(float(d @ of_fitted @ d), 2.0 * lost, 1.0)  # of nothing, nothing
         return Unseen(
-            likelihood - engine.log_likelihood(rest.values, rest.noise),
+            likelihood - held.log_likelihood(rest.values, rest.noise),
             0.5 * left * shown,
             math.sqrt(left * shown * inflation + left**2 * of_fit),
         )
