@@ -52,7 +52,7 @@ def _steady_rotors(monkeypatch):
 def _commands_on_time(monkeypatch):
     """Written when they act, held between the rows, gyros on time, but where a test says otherwise."""
     stand_in(monkeypatch, "likeliest_between", lambda problem, noise: problem)
-    stand_in(monkeypatch, "held_after_all", lambda first: None)
+    stand_in(monkeypatch, "are_held", lambda problem: True)
     stand_in(monkeypatch, "commands_late", lambda first: 0.0)
     stand_in(monkeypatch, "with_imu_on_time", lambda first, smoothed, noise: None)
 
@@ -77,9 +77,10 @@ def test_errors_are_compared_by_their_geometric_mean(monkeypatch, ours, better):
     theirs = {"h": 1.0, "q": 1.0, "ax": 0.0}
     stand_in(monkeypatch, "replay_runs", lambda engine, values, noise, horizon: values["rms"])
     stand_in(monkeypatch, "pooled_rms", lambda rms: rms)
-    fit, other = (Fit((), {"rms": rms}, Noise({})) for rms in (ours, theirs))  # type: ignore
-    problem = SimpleNamespace(settings=SETTINGS, engine=None)
-    assert unrest._flies_better(problem, fit, other) == better  # type: ignore[arg-type]
+    problem: Any = SimpleNamespace(settings=SETTINGS, engine=None)
+    fits: Any = [Fit((), {"rms": rms}, Noise({})) for rms in (ours, theirs)]  # type: ignore
+    found, other = (Searched(problem, f, f, f, None) for f in fits)  # type: ignore[arg-type]
+    assert once.flies_nearer(found, other) == better
 
 
 FINE = Noise({}, {"phi": 0.001})
@@ -111,7 +112,7 @@ def test_readings_are_believed_less_where_that_flies_better(monkeypatch, white, 
     stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
     stand_in(monkeypatch, "in_shocks", lambda problem, fit: False)
     stand_in(monkeypatch, "is_white", lambda passes, channels: white)
-    stand_in(monkeypatch, "_flies_better", lambda *fits: answers.pop(0))
+    stand_in(monkeypatch, "flies_nearer", lambda *found: answers.pop(0))
     engine = SimpleNamespace(filter=lambda values, noise: [])
     problem = SimpleNamespace(
         engine=engine, model=SimpleNamespace(channels=()), report=lambda text: None, smoothed=False
@@ -136,7 +137,7 @@ def test_readings_that_are_coarse_enough_are_held_as_they_were_fitted(monkeypatc
     stand_in(monkeypatch, "in_shocks", lambda problem, fit: False)
     stand_in(monkeypatch, "with_swings", lambda problem, fit: None)
     stand_in(monkeypatch, "is_white", lambda passes, channels: False)
-    stand_in(monkeypatch, "_flies_better", lambda *fits: False)
+    stand_in(monkeypatch, "flies_nearer", lambda *found: False)
     problem: Any = SimpleNamespace(
         engine=SimpleNamespace(filter=lambda values, noise: []), report=lambda text: None,
         model=SimpleNamespace(channels=()),
@@ -926,15 +927,32 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
     assert asked == (["again", (True, True)] if erring else [(False, False)])
 
 
-@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize(
+    ("likelier", "coloured", "nearer", "names"),
+    [
+        (False, False, False, ["on the way"]),
+        (True, False, False, ["on the way", "held"]),  # whatever is flown
+        (False, True, True, ["on the way", "held"]),
+        (False, True, False, ["on the way", "held", "on the way"]),
+        (False, False, True, ["on the way"]),  # a likelihood of white innovations is believed
+    ],
+)
 def test_what_commands_do_between_rows_is_asked_first_and_again_beside_what_was_found(
-    monkeypatch, held
+    monkeypatch, likelier, coloured, nearer, names
 ):
+    """The last name is that of what is taken."""
+
+    def held(problem: Any) -> Any:
+        return problem.called("held")
+
     stand_in(monkeypatch, "likeliest_between", lambda problem, noise: problem.called("on the way"))
-    stand_in(
-        monkeypatch, "held_after_all", lambda first: first.problem.called("held") if held else None
-    )
-    assert searched_names(monkeypatch) == ["on the way", *["held"] * held]
+    stand_in(monkeypatch, "are_held", lambda problem: problem.name == "held")
+    stand_in(monkeypatch, "with_held", held)
+    stand_in(monkeypatch, "held_after_all", lambda first: held(first.problem) if likelier else None)
+    stand_in(monkeypatch, "flies_nearer",
+        lambda found, other: nearer and (found.problem.name, other.problem.name) == tuple(names[::-1])
+    )  # fmt: skip
+    assert searched_names(monkeypatch, coloured) == names
 
 
 def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
@@ -945,8 +963,11 @@ def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
     assert searched_names(monkeypatch) == ["logged", "0.03 sooner"]
 
 
-def searched_names(monkeypatch) -> list[str]:
-    """What a log called "logged" is called at each search; each begins at the levels given."""
+def searched_names(monkeypatch, coloured: bool = False) -> list[str]:
+    """What a log called "logged" is called at each search, and what is taken, if not the last.
+
+    Each begins at the levels given. coloured: whether channels are, all of them together.
+    """
     levels, asked = Noise({}, {"phi": 0.1}), []
 
     def once_more(problem: Any, noise: Noise) -> Searched:
@@ -958,20 +979,21 @@ def searched_names(monkeypatch) -> list[str]:
     def of(name: str) -> Any:
         return SimpleNamespace(
             name=name, report=lambda text: None, smoothed=False, called=of,
+            model=SimpleNamespace(channels="all"),
             with_commands_sooner=lambda seconds: of(f"{seconds:g} sooner"),
         )  # fmt: skip
 
     stand_in(monkeypatch, "rotors_first", lambda problem, noise: None)
     stand_in(monkeypatch, "searched_once", once_more)
-    stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
+    stand_in(monkeypatch, "is_coloured", lambda found, channels: coloured and channels == "all")
     stand_in(monkeypatch, "is_lag_unshown", lambda found: False)
     stand_in(monkeypatch, "with_true_times", lambda first, noise: first)
     stand_in(monkeypatch, "before_low_passes", lambda first, noise: None)
     stand_in(monkeypatch, "with_errors", lambda found, noise, clock: (found, noise))
     stand_in(monkeypatch, "in_unrest", lambda best, noise, clock, erring: best)
     found = searched.searched(of("logged"), levels, {})
-    assert found.problem.name == asked[-1]  # type: ignore[attr-defined]
-    return asked
+    taken = found.problem.name  # type: ignore[attr-defined]
+    return asked if taken == asked[-1] else [*asked, taken]
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ part.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis import late_readings
@@ -17,6 +18,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
 from coax_env.estimation.helicopter_noise import LEAST_READING_STD
+from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import are_white, whiteness
@@ -164,3 +166,18 @@ def is_coloured(found: Searched, channels: Sequence[str]) -> bool:
     passes = found.problem.engine.filter(found.fit.values, found.fit.noise)
     shown = whiteness(passes, found.problem.model.channels)
     return not are_white(shown, channels)
+
+
+def flies_nearer(found: Searched, other: Searched) -> bool:
+    """Whether the open-loop errors of one on the fitted runs are smaller, by their geometric mean.
+
+    Args:
+        found, other: each with commands and readings as it takes them to be.
+    """
+    horizon = found.problem.settings.horizon
+    ours, theirs = (
+        pooled_rms(replay_runs(f.problem.engine, f.fit.values, f.fit.noise, horizon))
+        for f in (found, other)
+    )
+    logs = [np.log(ours[c] / theirs[c]) for c in ours if theirs.get(c, 0.0) > 0.0]
+    return bool(logs) and float(np.mean(logs)) < 0.0

@@ -3,7 +3,7 @@
 A search may leave innovations coloured, or name what another noise explains. So it is asked in this
 order what the log has, and where it has that, the search is done again with it:
 
-- what commands do between slow rows (slow_commands.py), before the first search
+- what commands do between slow rows (slow_commands.py), before the first search, and after it
 - commands that are written later than they act (estimation/late_commands.py)
 - what moves the rotors, alone; rotor speeds that come late, or jitter (rotors.py): nothing else touches
   these readings
@@ -22,7 +22,12 @@ from collections.abc import Mapping
 
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.rotor_jitter import share_of
-from coax_env.diagnosis.searches.once import Searched, is_coloured, searched_once
+from coax_env.diagnosis.searches.once import (
+    Searched,
+    flies_nearer,
+    is_coloured,
+    searched_once,
+)
 from coax_env.diagnosis.searches.readings import (
     before_low_passes,
     behind_other_low_passes,
@@ -38,7 +43,12 @@ from coax_env.diagnosis.searches.rotors import (
     with_late_speeds,
 )
 from coax_env.diagnosis.searches.unrest import in_own_air, in_unrest
-from coax_env.diagnosis.slow_commands import held_after_all, likeliest_between
+from coax_env.diagnosis.slow_commands import (
+    are_held,
+    held_after_all,
+    likeliest_between,
+    with_held,
+)
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.late_commands import written_late
 from coax_env.estimation.state_space import Noise
@@ -53,13 +63,7 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
         clock: of all runs in the order in which they were flown.
     """
     given = noise
-    problem = likeliest_between(problem, given)
-    first, noise = _first(problem, given)
-    held = held_after_all(first)
-    if held is not None:
-        problem = held
-        problem.report("searching again with commands that are held between the rows")
-        first, noise = _first(problem, given)
+    problem, first, noise = _between_rows(problem, given)
     late_by = commands_late(first)
     if late_by > 0.0:
         problem = problem.with_commands_sooner(late_by)
@@ -95,6 +99,30 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
     if found.problem.smoothed and not erring and is_coloured(found, INERTIAL):
         return _without_low_passes(first, found, noise, clock)
     return found
+
+
+def _between_rows(problem: Problem, given: Noise) -> tuple[Problem, Searched, Noise]:
+    """The problem with commands between slow rows as they are likeliest, and `_first` of that.
+
+    Held where that is likelier beside what was found; or, where a model that is wrong is left and its
+    likelihood tells little, where the fitted runs are flown nearer so.
+
+    Args:
+        problem: with commands that are held. given: levels to start from.
+    """
+    problem = likeliest_between(problem, given)
+    first, noise = _first(problem, given)
+    if are_held(problem):
+        return problem, first, noise
+    likelier = held_after_all(first)
+    if likelier is None and not is_coloured(first, problem.model.channels):
+        return problem, first, noise
+    held = likelier or with_held(problem)
+    held.report("searching again with commands that are held between the rows")
+    other, begun = _first(held, given)
+    if likelier is None and not flies_nearer(other, first):
+        return problem, first, noise
+    return held, other, begun
 
 
 def _first(problem: Problem, noise: Noise) -> tuple[Searched, Noise]:

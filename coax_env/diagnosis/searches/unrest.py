@@ -21,22 +21,18 @@ J. Am. Stat. Assoc. 114; from one step to output error, Ljung 1999, System Ident
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
 from coax_env.diagnosis.doubts import has_limit, sizes
 from coax_env.diagnosis.fits import is_much_coloured
 from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.search import with_onsets
-from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.run_air import with_own_air
-from coax_env.diagnosis.searches.once import Searched, likelier, searched_once
+from coax_env.diagnosis.searches.once import Searched, flies_nearer, likelier, searched_once
 from coax_env.diagnosis.searches.rotors import jittery_if_asked
 from coax_env.diagnosis.shocks import in_shocks, only_shock, with_shocks
 from coax_env.diagnosis.swings import with_other_swings, with_swings
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.gust_strength import prior_cost
 from coax_env.estimation.helicopter_noise import LEAST_READING_STD
-from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import is_white
 
@@ -85,7 +81,7 @@ def in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bo
         problem.report("the innovations stay coloured: searching again with readings believed less")
         levels = as_fitted | {channel: factor * std for channel, std in coarser.items()}
         other = searched_once(problem, noise.with_levels(levels), coarse=True)
-        if _flies_better(problem, other.fit, best.fit):
+        if flies_nearer(other, best):
             best = other
     return best
 
@@ -218,13 +214,3 @@ def _coarser(noise: Noise) -> dict[str, float]:
         for c, std in noise.reading.items()
         if FINER * std < LEAST_READING_STD[c]
     }
-
-
-def _flies_better(problem: Problem, fit: Fit, other: Fit) -> bool:
-    """Whether the open-loop errors of a fit on the fitted runs are smaller, by their geometric mean."""
-    horizon = problem.settings.horizon
-    ours, theirs = (
-        pooled_rms(replay_runs(problem.engine, f.values, f.noise, horizon)) for f in (fit, other)
-    )
-    logs = [np.log(ours[c] / theirs[c]) for c in ours if theirs.get(c, 0.0) > 0.0]
-    return bool(logs) and float(np.mean(logs)) < 0.0
