@@ -116,13 +116,17 @@ def test_a_change_is_the_second_flights_share_of_a_number():
 
 
 def test_rotors_that_turn_faster_per_command_are_commands_that_are_larger():
+    """What the rotors end slow rows above the means of theirs is larger, too."""
     vehicle = load_vehicle("lama400d")
     run = flight().runs[0]
     values = vehicle.values()
     model = MachineModel(vehicle)
-    faster = model.inputs(record_of(run), model.vector({**values, ROTOR_SPEED: 0.04}))
+    sent = replace(record_of(run), of_next=0.375)
+    faster = model.inputs(sent, model.vector({**values, ROTOR_SPEED: 0.04}))
     larger = record_of(edited(flight(), {"rotor_scale": 1.04}).runs[0])
-    np.testing.assert_allclose(faster, model.inputs(larger, model.vector(values)), rtol=1e-12)
+    larger = replace(larger, of_next=0.375)
+    expected = model.inputs(larger, model.vector(values))
+    np.testing.assert_allclose(faster, expected, rtol=1e-12, atol=1e-10)
 
 
 def test_a_changes_score_is_its_log_bayes_factor():

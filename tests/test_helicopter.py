@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 
 from coax_env import load_vehicle
-from coax_env.estimation.helicopter import HELD, MOST_USUAL_SIZES, READ, HeliModel, record_of
+from coax_env.estimation.helicopter import (
+    HELD,
+    MOST_USUAL_SIZES,
+    READ,
+    RISE,
+    HeliModel,
+    record_of,
+)
 from coax_env.estimation.helicopter_noise import (
     GUST_LEVELS,
     LEAST_READING_STD,
@@ -147,14 +154,16 @@ def test_inputs_are_commands_time_and_innovations():
     one = record()
     u = MODEL.inputs(one, LAMA.vector)
     step, read = u[:, :N_INPUTS], u[:, READ]
-    assert u.shape == (one.t.size, 2 * N_INPUTS) and np.array_equal(step, read)
+    assert u.shape == (one.t.size, RISE.stop) and np.array_equal(step, read)
+    assert not u[:, RISE].any()
     assert np.array_equal(step[:, :4], one.command)
     np.testing.assert_allclose(step[:, 4], one.t - 4.0)
     assert not step[:, 5].any()
     charged = replace(one, battery=12.0 - 0.01 * one.t)
     at = {"battery_voltage.per_volt": 0.05, "battery_voltage.nominal": 11.5}
     half = np.column_stack([step[:, :5], 0.5 - 0.01 * one.t])
-    np.testing.assert_allclose(MODEL.inputs(charged, MODEL.vector(at)), np.hstack([half, half]))
+    both = MODEL.inputs(charged, MODEL.vector(at))[:, : RISE.start]
+    np.testing.assert_allclose(both, np.hstack([half, half]))
     innovations = np.random.default_rng(0).standard_normal((one.t.size, 4))
     with_innovations = Record(one.name, one.t, one.command, one.z, one.origin, innovations)
     assert np.array_equal(MODEL.inputs(with_innovations, LAMA.vector), np.hstack([u, innovations]))
@@ -220,10 +229,66 @@ def test_drift_is_that_of_the_step_and_readings_are_those_of_their_own_input():
     read = dynamics.kernel_input(np.array([214.0, 217.0, -0.03, 0.02]))
     work, both = np.zeros(MODEL.work_size), np.zeros(N_FULL + len(CHANNELS))
     flown, shown = np.zeros_like(both), np.zeros(len(CHANNELS))
-    MODEL.drift_and_readings.__wrapped__(x, np.append(step, read), 0.01, p, work, both)
+    u = np.concatenate([step, read, [0.0, 0.0]])
+    MODEL.drift_and_readings.__wrapped__(x, u, 0.01, p, work, both)
     dynamics.drift_and_readings(x, step, 0.01, p, work, flown)
     dynamics.measure(x, read, p, work, shown)
     assert np.array_equal(both, np.append(flown[:N_FULL], shown))
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.002, 0.03, 0.2, 50.0])
+def test_rotors_whose_commands_rise_through_rows_turn_the_body_as_in_many_small_ones(lag):
+    """Eight rows of 40 ms, with a lag or none, reaction and all, against 0.1 ms of a command held."""
+    heli = LAMA.with_effect("spin_up_reaction", gain=1.0).with_effect(
+        "motor_lag", upper=lag, lower=lag
+    )
+    model, p, rows = HeliModel(heli), heli.vector, 8
+    rng = np.random.default_rng(2)
+    t = 0.04 * np.arange(rows + 1)
+    scatter = rng.normal(0.0, [8.0, 8.0, 0.0, 0.0], (rows + 1, 4))
+    command = np.array([210.0, 215.0, 0.0, 0.0]) + scatter
+    log = Record("ramps", t, command, np.full((rows + 1, len(CHANNELS)), np.nan), of_next=0.5)
+    u, work = model.inputs(log, p), np.zeros(model.work_size)
+    start = np.zeros(N_FULL)
+    start[X["z"]], start[[X["omega_u"], X["omega_l"]]] = -2.0, command[0, :2]
+    shown = {True: start.copy(), False: start.copy()}
+    fine, parts = start.copy(), 400
+    off = {True: [], False: []}  # yaw rate, by whether rises are known
+    for row in range(rows):
+        between = np.linspace(command[row], command[row + 1], 2 * parts + 1)[1::2]
+        for now in between:
+            dynamics.step(fine, dynamics.kernel_input(now), 0.04 / parts, p, work, fine)
+        for known, x in shown.items():
+            flown = u[row] if known else np.concatenate([u[row, : RISE.start], [0.0, 0.0]])
+            model.step.__wrapped__(x, flown, 0.04, p, work, x)
+            off[known].append(x[X["r"]] - fine[X["r"]])
+    rotors, last = [X["omega_u"], X["omega_l"]], np.abs(np.diff(between, axis=0)[0, :2]).max()
+    np.testing.assert_allclose(shown[True][rotors], fine[rotors], rtol=0.0, atol=last)
+    worst, before = (np.abs(off[known]).max() for known in (True, False))
+    assert worst < 0.004 * before
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.02, 3.0])
+def test_the_drift_of_rotors_whose_commands_rise_is_the_steps(lag):
+    """Exactly, and the state that it is asked of stays."""
+    heli = LAMA.with_effect("motor_lag", upper=lag, lower=2.0 * lag)
+    model = HeliModel(heli)
+    p, work = heli.vector, np.zeros(model.work_size)
+    x, after, drift = np.zeros(N_FULL), np.zeros(N_FULL), np.zeros(N_FULL + len(CHANNELS))
+    x[[X["omega_u"], X["omega_l"]]] = 205.0, 215.0
+    rise = np.array([3.0, -2.0])
+    step, read = (
+        dynamics.kernel_input(np.append(speeds, [0.0, 0.0]))
+        for speeds in (np.array([210.0, 212.0]), np.array([207.0, 214.0]))
+    )
+    u, before = np.concatenate([step, read, rise]), x.copy()
+    model.step.__wrapped__(x, u, 0.04, p, work, after)
+    model.drift_and_readings.__wrapped__(x, u, 0.04, p, work, drift)
+    rotors = [X["omega_u"], X["omega_l"]]
+    np.testing.assert_allclose(x[rotors] + drift[rotors], after[rotors], rtol=1e-14)
+    assert np.array_equal(x, before)
+    if lag == 0.0:
+        np.testing.assert_allclose(after[rotors], np.array([210.0, 212.0]) + rise, rtol=1e-14)
 
 
 def test_a_command_that_has_long_been_held_is_itself_however_late():
@@ -259,7 +324,7 @@ def test_an_input_innovation_corrects_its_states(gain):
         corrected[X[state]] += 0.01 * np.dot(weights, innovations)
     expected = np.zeros(N_FULL)
     dynamics.step(corrected, dynamics.kernel_input(command), 0.01, LAMA.vector, work, expected)
-    both_halves = np.tile(dynamics.kernel_input(command), 2)
+    both_halves = np.append(np.tile(dynamics.kernel_input(command), 2), [0.0, 0.0])
     u_with_innovations = np.append(both_halves, innovations)
     MODEL.step.__wrapped__(x, u_with_innovations, 0.01, vector, work, out)
     np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-14)

@@ -53,6 +53,7 @@ def _commands_on_time(monkeypatch):
     """Written when they act, held between the rows, gyros on time, but where a test says otherwise."""
     stand_in(monkeypatch, "likeliest_between", lambda problem, noise: problem)
     stand_in(monkeypatch, "are_held", lambda problem: True)
+    stand_in(monkeypatch, "from_reaction", lambda first: first)
     stand_in(monkeypatch, "commands_late", lambda first: 0.0)
     stand_in(monkeypatch, "with_imu_on_time", lambda first, smoothed, noise: None)
 
@@ -934,7 +935,7 @@ def test_errors_of_every_memory_may_stand_in_a_low_passs_place(
         (True, False, False, ["on the way", "held"]),  # whatever is flown
         (False, True, True, ["on the way", "held"]),
         (False, True, False, ["on the way", "held", "on the way"]),
-        (False, False, True, ["on the way"]),  # a likelihood of white innovations is believed
+        (False, False, True, ["on the way"]),  # where little is coloured the likelihood is believed
     ],
 )
 def test_what_commands_do_between_rows_is_asked_first_and_again_beside_what_was_found(
@@ -945,6 +946,7 @@ def test_what_commands_do_between_rows_is_asked_first_and_again_beside_what_was_
     def held(problem: Any) -> Any:
         return problem.called("held")
 
+    stand_in(monkeypatch, "is_much_coloured", lambda problem, fit: coloured)
     stand_in(monkeypatch, "likeliest_between", lambda problem, noise: problem.called("on the way"))
     stand_in(monkeypatch, "are_held", lambda problem: problem.name == "held")
     stand_in(monkeypatch, "with_held", held)
@@ -952,7 +954,7 @@ def test_what_commands_do_between_rows_is_asked_first_and_again_beside_what_was_
     stand_in(monkeypatch, "flies_nearer",
         lambda found, other: nearer and (found.problem.name, other.problem.name) == tuple(names[::-1])
     )  # fmt: skip
-    assert searched_names(monkeypatch, coloured) == names
+    assert searched_names(monkeypatch) == names
 
 
 def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
@@ -963,10 +965,10 @@ def test_the_search_is_done_again_with_commands_when_they_act(monkeypatch):
     assert searched_names(monkeypatch) == ["logged", "0.03 sooner"]
 
 
-def searched_names(monkeypatch, coloured: bool = False) -> list[str]:
-    """What a log called "logged" is called at each search, and what is taken, if not the last.
+def searched_names(monkeypatch) -> list[str]:
+    """What a log called "logged" is called at each search, each from the levels given.
 
-    Each begins at the levels given. coloured: whether channels are, all of them together.
+    And what is taken, if not the last.
     """
     levels, asked = Noise({}, {"phi": 0.1}), []
 
@@ -979,13 +981,12 @@ def searched_names(monkeypatch, coloured: bool = False) -> list[str]:
     def of(name: str) -> Any:
         return SimpleNamespace(
             name=name, report=lambda text: None, smoothed=False, called=of,
-            model=SimpleNamespace(channels="all"),
             with_commands_sooner=lambda seconds: of(f"{seconds:g} sooner"),
         )  # fmt: skip
 
     stand_in(monkeypatch, "rotors_first", lambda problem, noise: None)
     stand_in(monkeypatch, "searched_once", once_more)
-    stand_in(monkeypatch, "is_coloured", lambda found, channels: coloured and channels == "all")
+    stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
     stand_in(monkeypatch, "is_lag_unshown", lambda found: False)
     stand_in(monkeypatch, "with_true_times", lambda first, noise: first)
     stand_in(monkeypatch, "before_low_passes", lambda first, noise: None)

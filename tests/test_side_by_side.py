@@ -1,5 +1,7 @@
 """Derivatives by SIMD lanes, in portions of a run, against one move after the other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bundled_flight import bundled
@@ -59,7 +61,7 @@ def flown():
     flight = bundled()
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     record = record_of(flight.runs[0])
-    record = part(record, record.t < record.t[0] + 3.0)
+    record = replace(part(record, record.t < record.t[0] + 3.0), of_next=0.375)
     model = HeliModel(vehicle)
     free = model.base_parameters()
     for name, entry in effects.CATALOGUE.items():

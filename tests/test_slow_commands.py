@@ -16,9 +16,11 @@ from coax_env.diagnosis.settings import SETTINGS
 from coax_env.diagnosis.slow_commands import (
     EVENLY,
     ON_LINES,
+    REACTION,
     beside_straight_lines,
     between_known,
     between_rows,
+    from_reaction,
     held_after_all,
     likelier_on_the_way,
     likeliest_between,
@@ -43,8 +45,9 @@ def problem_of(slow: bool = True, row: float = 0.04) -> Any:
     said: list[str] = []
     engine = SimpleNamespace(records=[ramp()])
     made = SimpleNamespace(
-        engine=engine, has_slow_rows=slow, row=row, settings=SETTINGS, report=said.append, said=said
-    )
+        engine=engine, has_slow_rows=slow, row=row, settings=SETTINGS, report=said.append, said=said,
+        candidates=(),
+    )  # fmt: skip
 
     def with_records(records: Any) -> Any:
         other = SimpleNamespace(**vars(made))
@@ -147,6 +150,59 @@ def test_before_the_search_the_likeliest_of_shares_and_variances_is_taken(
     found = likeliest_between(problem, Noise({}))
     assert of_rows(found) == taken
     assert len(problem.said) == (taken != (0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("worth", "taken"),
+    [
+        ({"plain": {(0.25, 0.0): 93.0}, "reacting": {(0.375, EVENLY): 50.0}}, (0.375, EVENLY)),
+        ({"plain": {(0.25, 0.0): 93.0}, "reacting": {(0.375, EVENLY): 94.0}}, (0.25, 0.0)),
+        ({"plain": {}, "reacting": {(0.0, 0.0): 50.0, (0.25, 0.0): 45.0}}, (0.0, 0.0)),  # a tie is 6
+    ],
+)
+def test_rotors_that_react_may_tell_when_commands_were_sent(ends, monkeypatch, worth, taken):
+    """Compared is with commands that are held, of rotors that react as well."""
+    problem, refitted = problem_of(), fit_of()
+    problem.candidates = (REACTION,)
+
+    def likelihood(trial: Any, fit: Fit) -> float:
+        kind = "reacting" if fit.values.get(f"{REACTION}.gain") == 1.0 else "plain"
+        return -worth[kind].get(of_rows(trial), 100.0)
+
+    monkeypatch.setattr(module, "_likelihood", likelihood)
+    assert of_rows(module.likeliest_at(problem, refitted)) == taken
+
+
+@pytest.mark.parametrize(
+    ("row", "active", "end", "again"),
+    [
+        (0.04, ("yaw_damping",), 93.0, True),
+        (0.02, (), 93.0, True),
+        (0.04, ("yaw_damping",), 95.0, False),  # a tie is 6
+        (0.04, (REACTION,), 93.0, False),
+        (0.01, ("yaw_damping",), 93.0, False),
+    ],
+)
+def test_the_search_is_done_from_rotors_that_react_where_these_end_likelier(
+    monkeypatch, row, active, end, again
+):
+    """Begun from the model as given, at the gain that physics has."""
+    problem, fit, refitted = problem_of(row=row), fit_of(*active), fit_of(objective=200.0)
+    problem.candidates = (REACTION,)
+
+    def fitted(problem: Any, begun: Fit) -> Fit:
+        assert (begun.active, begun.values) == ((REACTION,), {f"{REACTION}.gain": 1.0})
+        return replace(begun, objective=end)
+
+    monkeypatch.setattr(module, "noise_fitted", lambda problem, begun: begun)
+    monkeypatch.setattr(module, "fitted", fitted)
+    monkeypatch.setattr(module, "converged", lambda problem, begun: begun)
+    monkeypatch.setattr(module, "likelier", lambda found, begun: replace(found, fit=begun))
+    given: Any = None
+    before = Searched(problem, refitted, refitted, fit, given)
+    found = from_reaction(before)
+    assert (found is not before) == again
+    assert found.fit.active == ((REACTION,) if again else active)
 
 
 @pytest.mark.parametrize(

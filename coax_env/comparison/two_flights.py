@@ -12,7 +12,7 @@ from coax_env.errors import InputError
 from coax_env.estimation import vibration
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.flown import flown_parts
-from coax_env.estimation.helicopter import ROTORS, HeliModel, record_of
+from coax_env.estimation.helicopter import RISE, ROTORS, HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.fast_rows import decimated
@@ -44,6 +44,7 @@ class MachineModel(HeliModel):
         u = super().inputs(record, vector)
         for half in (0, N_INPUTS):
             u[:, [half + rotor for rotor in ROTORS]] *= 1.0 + vector[-1]
+        u[:, RISE] *= 1.0 + vector[-1]
         return u
 
 

@@ -31,6 +31,8 @@ from coax_env.estimation.helicopter import (
     HeliModel,
     Motion,
     _reads_another,
+    _slower,
+    _speed_up,
     _take_in_innovations,
     kernel_drift,
     kernel_measure,
@@ -124,9 +126,11 @@ def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     for i in range(N_JITTERY):
         out[i] = x[i]
     _take_in_innovations(u, p, out)
-    taken = _shaken(out, u, p, work)
+    taken, (upper, lower) = _shaken(out, u, p, work), _slower(u, dt, p)
     state = work[_STATE:_INPUT]
+    _speed_up(state, -upper, -lower)
     kernel_step(state, work[_INPUT:_OUT], dt, p, work, state)
+    _speed_up(state, upper, lower)
     for i in range(N_FULL):
         out[i] = state[i]
     out[S.R] -= taken
@@ -151,6 +155,8 @@ def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) 
     """The helicopter's; jitter fades exactly, and what that does in a row the exponential knows."""
     own = work[_OUT:_WORK_SIZE]
     _shaken(x, u, p, work)
+    upper, lower = _slower(u, dt, p)
+    _speed_up(work[_STATE:_INPUT], -upper, -lower)
     kernel_drift(work[_STATE:_INPUT], work[_INPUT:_OUT], dt, p, work, own)
     if _reads_another(u):
         _shaken(x, u[READ], p, work)

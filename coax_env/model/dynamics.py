@@ -238,7 +238,7 @@ def _mean_acceleration(start, asked, h, lag):
 
 
 @compiled()
-def _earliness(h, lag):
+def earliness(h, lag):
     """How early in `h` seconds a rotor with a lag speeds up: 0 evenly, 1 all at first.
 
     Of what r gains by its reaction, times `h`, half is in the heading if it speeds up evenly, all
@@ -484,8 +484,8 @@ def _step(x, u, dt, p, work, out):
         if WITH_EFFECTS:
             upper, lower = _speeds_asked_for(u, f)
             lag_u, lag_l = f[F.MOTOR_LAG_U], f[F.MOTOR_LAG_L]
-            mean_u, early_u = _mean_acceleration(out[S.OMEGA_U], upper, h, lag_u), _earliness(h, lag_u)
-            mean_l, early_l = _mean_acceleration(out[S.OMEGA_L], lower, h, lag_l), _earliness(h, lag_l)
+            mean_u, early_u = _mean_acceleration(out[S.OMEGA_U], upper, h, lag_u), earliness(h, lag_u)
+            mean_l, early_l = _mean_acceleration(out[S.OMEGA_L], lower, h, lag_l), earliness(h, lag_l)
         half_fade = _fade(0.5 * h, p) if gusty else _STAYS
         for i in range(S.GUST_X, N_FULL):
             stage[i] = out[i]

@@ -20,6 +20,7 @@ Where they stay so in the end, the gusts as they are then are asked there, too: 
 
 from collections.abc import Mapping
 
+from coax_env.diagnosis.fits import is_much_coloured
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.rotor_jitter import share_of
 from coax_env.diagnosis.searches.once import (
@@ -45,6 +46,7 @@ from coax_env.diagnosis.searches.rotors import (
 from coax_env.diagnosis.searches.unrest import in_own_air, in_unrest
 from coax_env.diagnosis.slow_commands import (
     are_held,
+    from_reaction,
     held_after_all,
     likeliest_between,
     with_held,
@@ -104,8 +106,8 @@ def searched(problem: Problem, noise: Noise, clock: Mapping[str, Lap]) -> Search
 def _between_rows(problem: Problem, given: Noise) -> tuple[Problem, Searched, Noise]:
     """The problem with commands between slow rows as they are likeliest, and `_first` of that.
 
-    Held where that is likelier beside what was found; or, where a model that is wrong is left and its
-    likelihood tells little, where the fitted runs are flown nearer so.
+    Held where that is likelier beside what was found; or, where what is left is a model that lacks much
+    and whose likelihood tells little, where the fitted runs are flown nearer so.
 
     Args:
         problem: with commands that are held. given: levels to start from.
@@ -115,7 +117,7 @@ def _between_rows(problem: Problem, given: Noise) -> tuple[Problem, Searched, No
     if are_held(problem):
         return problem, first, noise
     likelier = held_after_all(first)
-    if likelier is None and not is_coloured(first, problem.model.channels):
+    if likelier is None and not is_much_coloured(first.problem, first.fit):
         return problem, first, noise
     held = likelier or with_held(problem)
     held.report("searching again with commands that are held between the rows")
@@ -127,7 +129,8 @@ def _between_rows(problem: Problem, given: Noise) -> tuple[Problem, Searched, No
 
 def _first(problem: Problem, noise: Noise) -> tuple[Searched, Noise]:
     """The first search, and the levels that it started from."""
-    return rotors_first(problem, noise) or (searched_once(problem, noise), noise)
+    first, begun = rotors_first(problem, noise) or (searched_once(problem, noise), noise)
+    return from_reaction(first), begun
 
 
 def commands_late(first: Searched) -> float:
