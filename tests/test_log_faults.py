@@ -10,7 +10,7 @@ from coax_env import load_vehicle
 from coax_env.diagnosis.log_faults import remarks, undone
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.searches.once import Searched
-from coax_env.diagnosis.slow_commands import EVENLY, between_rows
+from coax_env.estimation.between_rows import EVENLY, Between, with_between
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.low_pass import LowPass
 from coax_env.estimation.state_space import Noise, Record
@@ -34,7 +34,7 @@ def found(**but: Any) -> Searched:
     fit = Fit((), {}, Noise({}))
     records = but.pop("records", GIVEN.engine.records)
     between = but.pop("between", (0.0, 0.0))
-    problem = replace(GIVEN.with_records(between_rows(records, *between)), **but)
+    problem = replace(GIVEN.with_records(with_between(records, Between(*between))), **but)
     return Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
 
 

@@ -1,4 +1,4 @@
-"""Commands between slow rows: held, or on straight lines, and what that makes of the numbers."""
+"""Commands between slow rows: what the diagnosis takes them to do, and what numbers make of it."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,20 +14,16 @@ from coax_env.diagnosis.remarks import _seen_late
 from coax_env.diagnosis.searches.once import Searched
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.diagnosis.slow_commands import (
-    EVENLY,
-    ON_LINES,
     REACTION,
     beside_straight_lines,
     between_known,
-    between_rows,
     from_reaction,
     held_after_all,
     likelier_on_the_way,
     likeliest_between,
-    of_rows,
-    remarks,
 )
-from coax_env.estimation.helicopter import READ, HeliModel
+from coax_env.estimation.between_rows import EVENLY, TRIED, Between, of_rows, with_between
+from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.model.layout import CHANNELS
 
@@ -62,73 +58,22 @@ def fit_of(*active: str, objective: float = 100.0) -> Fit:
     return Fit(active, {}, Noise({}), objective=objective)
 
 
-def test_a_rows_command_is_on_the_way_to_the_next_and_readings_see_it_as_written():
-    """Of a ramp that of its middle; the last row's has no next. The log itself stays."""
-    sound = ramp()
-    (found,) = between_rows([sound], ON_LINES, 0.0)
-    u = HeliModel(LAMA).inputs(found, LAMA.vector)
-    np.testing.assert_allclose(u[:-1, :4], np.outer(np.arange(4) + 0.5, [1.0, 2.0, 3.0, 4.0]))
-    np.testing.assert_array_equal(u[-1, :4], sound.command[-1])
-    np.testing.assert_array_equal(u[:, READ][:, :4], sound.command)
-    assert found.command is sound.command and found.z is sound.z
-
-
-@pytest.mark.parametrize("step", [1, 2, 4])
-def test_of_commands_between_rows_the_mean_is_a_share_of_the_next(step):
-    """One of two that were logged, on a line, has a quarter of the next; of very many a half."""
-    fine = np.linspace(0.0, 1.0, step + 1)[:step]
-    record = ramp(2)
-    (found,) = between_rows([record], (step - 1) / (2 * step), 0.0)
-    u = HeliModel(LAMA).inputs(found, LAMA.vector)
-    np.testing.assert_allclose(u[0, :4], fine.mean() * record.command[1])
-
-
-def test_a_step_within_a_row_comes_anywhere_in_it():
-    """Its mean over the row is that of a share that is uniform from 0 to 1, of variance 1 / 12."""
-    rng = np.random.default_rng(0)
-    size, where = 0.3, rng.uniform(0.0, 1.0, 200_000)
-    command = np.zeros((6, 4))
-    command[3:] = size * np.array([1.0, -1.0, 2.0, 0.0])
-    record = Record("a", 0.04 * np.arange(6), command, np.zeros((6, 1)), between=EVENLY)
-    variance = HeliModel(LAMA).between(record, LAMA.vector)
-    assert np.flatnonzero(variance.any(axis=1)).tolist() == [2]
-    np.testing.assert_allclose(
-        variance[2], np.var(size * where) * np.array([1.0, 1.0, 4.0, 0.0]), rtol=0.01
-    )
-
-
-@pytest.mark.parametrize(
-    ("delay", "share"), [(0.0, (1.0, 0.0)), (0.04, (0.0, 1.0)), (0.01, (0.75, 0.25))]
-)
-def test_it_comes_as_late_as_the_command(delay, share):
-    """By servos' delay the swash plate's alone; all of it is there."""
-    record = Record(
-        "a", 0.04 * np.arange(5), np.repeat([[0.0], [0.0], [1.0], [1.0], [1.0]], 4, axis=1),
-        np.zeros((5, 1)), between=1.0,
-    )  # fmt: skip
-    late = LAMA.with_effect("servo_delay", time=delay) if delay else LAMA
-    variance = HeliModel(late).between(record, late.vector)
-    np.testing.assert_allclose(
-        variance[:, :2], [[0.0] * 2, [1.0] * 2, *[[0.0] * 2] * 3], atol=1e-12
-    )
-    np.testing.assert_allclose(variance[1:3, 2], share, atol=1e-12)
-    np.testing.assert_allclose(variance[:, 2].sum(), 1.0)
-
-
 @pytest.fixture
 def ends(monkeypatch) -> dict[tuple[float, float], float]:
     """Minus the likelihoods by share and variance; 100 where none is said. Fits end there."""
     made: dict[tuple[float, float], float] = {}
 
     def end(problem: Any, fit: Fit, *steps: int) -> Fit:
-        return fit_of(*fit.active, objective=made.get(of_rows(problem), 100.0))
+        return fit_of(*fit.active, objective=made.get(of_rows(problem.engine.records), 100.0))
 
     monkeypatch.setattr(module, "fitted", end)
     monkeypatch.setattr(module, "converged", end)
     monkeypatch.setattr(module, "noise_fitted", lambda problem, fit: fit)
     monkeypatch.setattr(module, "quadratic_at", lambda problem, fit: (fit, "there"))
     monkeypatch.setattr(module, "as_given", lambda problem, noise: (fit_of(), fit_of()))
-    monkeypatch.setattr(module, "_likelihood", lambda problem, fit: -end(problem, fit).objective)
+    monkeypatch.setattr(
+        module, "likelihoods", lambda *at: {of: -made.get(of, 100.0) for of in TRIED}
+    )
     return made
 
 
@@ -148,7 +93,7 @@ def test_before_the_search_the_likeliest_of_shares_and_variances_is_taken(
     ends[likeliest] = worth
     problem = problem_of(row=row)
     found = likeliest_between(problem, Noise({}))
-    assert of_rows(found) == taken
+    assert of_rows(found.engine.records) == taken
     assert len(problem.said) == (taken != (0.0, 0.0))
 
 
@@ -165,12 +110,12 @@ def test_rotors_that_react_may_tell_when_commands_were_sent(ends, monkeypatch, w
     problem, refitted = problem_of(), fit_of()
     problem.candidates = (REACTION,)
 
-    def likelihood(trial: Any, fit: Fit) -> float:
-        kind = "reacting" if fit.values.get(f"{REACTION}.gain") == 1.0 else "plain"
-        return -worth[kind].get(of_rows(trial), 100.0)
+    def likelihoods(engine: Any, values: Any, noise: Any) -> Any:
+        kind = "reacting" if values.get(f"{REACTION}.gain") == 1.0 else "plain"
+        return {of: -worth[kind].get(of, 100.0) for of in TRIED}
 
-    monkeypatch.setattr(module, "_likelihood", likelihood)
-    assert of_rows(module.likeliest_at(problem, refitted)) == taken
+    monkeypatch.setattr(module, "likelihoods", likelihoods)
+    assert of_rows(module.likeliest_at(problem, refitted).engine.records) == taken
 
 
 @pytest.mark.parametrize(
@@ -220,13 +165,13 @@ def test_beside_what_was_found_commands_that_are_held_may_be_likelier(
 ):
     """Both are fitted alike from there."""
     problem = problem_of()
-    problem = problem.with_records(between_rows(problem.engine.records, *now))
+    problem = problem.with_records(with_between(problem.engine.records, Between(*now)))
     fit = fit_of(*active, objective=999.0)
     ends[0.0, 0.0] = held
     given: Any = None
     found = held_after_all(Searched(problem, fit, fit, fit, given))
     assert (found is not None) == again
-    assert found is None or of_rows(found) == (0.0, 0.0)
+    assert found is None or of_rows(found.engine.records) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -248,32 +193,18 @@ def test_commands_are_on_the_way_where_that_is_likelier_beside_a_cause(
     ends[likeliest, EVENLY] = worth
     problem, fit = problem_of(row=row), fit_of(*active)
     said = problem.said
-    problem = problem.with_records(between_rows(problem.engine.records, now, EVENLY))
+    problem = problem.with_records(with_between(problem.engine.records, Between(now, EVENLY)))
     before: Any = Searched(problem, fit, fit, fit, None, changing=changing)  # type: ignore[arg-type]
     found = likelier_on_the_way(before)
     if taken is None:
         assert found is before
         return
-    assert of_rows(found.problem) == (taken, EVENLY)
+    assert of_rows(found.problem.engine.records) == (taken, EVENLY)
     assert (found.fit.active, found.fit.objective) == (active, worth)
     assert found.quadratic == "there" and found.bare is fit
-    assert said == [f"commands at {taken:g} of the way to the next row's: 7.0 nats"]
-
-
-@pytest.mark.parametrize(
-    ("share", "variance", "words"),
-    [
-        (0.0, 0.0, []),
-        (0.25, 0.0, ["0.25 of the way"]),
-        (0.0, EVENLY, ["when is not known"]),
-        (0.375, EVENLY, ["0.375 of the way", "when is not known"]),
-    ],
-)
-def test_what_was_done_between_the_rows_is_said(share, variance, words):
-    problem = problem_of()
-    found = remarks(problem.with_records(between_rows(problem.engine.records, share, variance)))
-    assert len(found) == len(words)
-    assert all(word in text for word, text in zip(words, found, strict=True))
+    (text,) = said
+    assert text.startswith(f"commands at {taken:g} of the way to the next row's")
+    assert text.endswith(": 7.0 nats")
 
 
 def test_where_commands_are_held_the_other_fit_is_in_the_std(monkeypatch):
@@ -289,7 +220,7 @@ def test_where_commands_are_held_the_other_fit_is_in_the_std(monkeypatch):
     ((_, _, _, _, other),) = asked
     assert other.objective == 7.0
     on_the_way = problem_of()
-    on_the_way.engine.records = between_rows(on_the_way.engine.records, 0.25, 0.0)
+    on_the_way.engine.records = with_between(on_the_way.engine.records, Between(0.25, 0.0))
     for problem, same in (
         (problem_of(slow=False), fit), (problem_of(), fit_of()), (on_the_way, fit)
     ):  # fmt: skip

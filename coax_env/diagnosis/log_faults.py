@@ -6,11 +6,10 @@ from coax_env.diagnosis import (
     late_imu,
     late_rotor_speeds,
     sensor_low_pass,
-    slow_commands,
 )
 from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.searches.once import Searched
-from coax_env.estimation import late_commands
+from coax_env.estimation import between_rows, late_commands
 from coax_env.estimation.clock_errors import with_clock_error
 from coax_env.estimation.low_pass import records_before
 from coax_env.estimation.state_space import Record
@@ -30,7 +29,7 @@ def undone(held: Sequence[Record], given: Problem, found: Searched) -> list[Reco
     records = late_imu.on_time(records, problem.late_imu, problem.row)
     records = records_before(records, CHANNELS, problem.low_passes)
     records = with_clock_error(records, problem.clock_error)
-    return slow_commands.between_rows(records, *slow_commands.of_rows(problem))
+    return between_rows.with_between(records, between_rows.of_rows(problem.engine.records))
 
 
 def remarks(given: Problem, found: Searched) -> list[str]:
@@ -50,7 +49,7 @@ def remarks(given: Problem, found: Searched) -> list[str]:
         said.append(late_commands.remark(problem.commands_late))
     if problem.late_imu:
         said.append(late_imu.remark(problem.late_imu, problem.row))
-    return said + slow_commands.remarks(problem)
+    return said + between_rows.remarks(between_rows.of_rows(problem.engine.records))
 
 
 def _without_rotor_speeds(given: Problem, problem: Problem) -> bool:

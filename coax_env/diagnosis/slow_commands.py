@@ -1,14 +1,11 @@
-"""What commands did between slow rows: held until the next, on the way to it, or not known.
+"""What commands did between slow rows (estimation/between_rows.py), of a machine that lacks something.
 
-A log at 25 Hz has one command of four. Held until the next, each acts 15 ms late in the mean, which a
-lag or a delay of the machine gives back: on six **synthetic** flights by telemetry motor lags of 60 ms
-were 25 to 52, and the body's reaction to them 0.3 to 0.7 of its size. On straight lines to the next
-row those of four are 56 to 78 ms. But the next command answers what gusts do within the row, which on
-a clean flight makes straight lines 17 to 49 nats less likely. A log at 50 Hz has one command of two: a
-quarter of the next one in the mean. And when within a row a command changed is not known: evenly
-anywhere, its mean over the row has a variance of a twelfth of the change squared, by which rows in
-which commands change much are believed less. Without that, at 25 Hz in still air, a turned swash plate
-had a thrust exponent beside it, 44 and 64 nats (**synthetic**).
+Held until the next, each command acts half a row late in the mean: on six **synthetic** flights by
+telemetry motor lags of 60 ms were 25 to 52, and the body's reaction to them 0.3 to 0.7 of its size. On
+straight lines to the next row those of four are 56 to 78 ms. But the next command answers what gusts do
+within the row, which on a clean flight makes straight lines 17 to 49 nats less likely. Without the
+variance of a command that changes anywhere in a row, at 25 Hz in still air, a turned swash plate had a
+thrust exponent beside it, 44 and 64 nats (**synthetic**).
 
 So before anything is named a command is taken to have the share of the next one, and that variance or
 none, that are likeliest together, if that is likelier by a tie; beside the causes that were found the
@@ -25,7 +22,6 @@ the step (`HeliModel.inputs`), and the search is done from that reaction, too (`
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 
@@ -34,24 +30,24 @@ from coax_env.diagnosis.fits import converged, fitted, noise_fitted, quadratic_a
 from coax_env.diagnosis.from_afar import STEPS
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.searches.once import Searched, as_given, likelier
+from coax_env.estimation.between_rows import (
+    HELD,
+    ON_LINES,
+    SLOWER,
+    TRIED,
+    Between,
+    likelihoods,
+    of_rows,
+    with_between,
+)
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise, Record
 from coax_env.logs.held import interpolated
 
-SLOWER = 0.015
-"""s between rows from which it is asked: between 100 Hz, at which small machines are flown, and 50 Hz;
-ours."""
-ON_LINES = 0.5
-"""Share of the next command in a row's where commands are on a straight line."""
 MOST_KNOWN = 0.6
 """Share of the rows that are on no line at most, where commands are on lines: one of two, and some;
 ours."""
 REACTION = "spin_up_reaction"
-EVENLY = 1.0 / 12.0
-"""Variance of a share that may be anything from 0 to 1."""
-SHARES = (0.125, 0.25, 0.375, ON_LINES)
-"""That are tried: where one command of two is logged the mean has 0.25 of the next, of four 0.375, of
-very many 0.5; an eighth is between."""
 
 
 def between_known(records: Sequence[Record]) -> float:
@@ -102,17 +98,15 @@ def likeliest_at(problem: Problem, fit: Fit) -> Problem:
     Args:
         problem: with commands that are held, of slow rows. fit: of anything.
     """
-    trials = {of: _between(problem, *of) for of in product((0.0, *SHARES), (0.0, EVENLY))}
     fits = [fit, *_with_reaction(problem, fit)]
-    nats = {(of, k): _likelihood(trials[of], f) for of in trials for k, f in enumerate(fits)}
-    likeliest, reacting = max(nats, key=lambda of: nats[of])
-    share, variance = likeliest
-    gained = nats[likeliest, reacting] - nats[(0.0, 0.0), reacting]
+    nats = [likelihoods(problem.engine, f.values, f.noise) for f in fits]
+    of_fit = max(nats, key=lambda of_fit: max(of_fit.values()))
+    likeliest = max(of_fit, key=lambda of: of_fit[of])
+    gained = of_fit[likeliest] - of_fit[HELD]
     if not gained > problem.settings.tie:
         return problem
-    when = ", changing at unknown times" if variance else ""
-    problem.report(f"commands at {share:g} of the way to the next row's{when}: {gained:.1f} nats")
-    return trials[likeliest]
+    problem.report(f"{likeliest}: {gained:.1f} nats")
+    return _between(problem, likeliest)
 
 
 def _with_reaction(problem: Problem, fit: Fit) -> list[Fit]:
@@ -163,57 +157,16 @@ def held_after_all(found: Searched) -> Problem | None:
 
 def are_held(problem: Problem) -> bool:
     """Whether commands are taken to be held between the rows."""
-    return of_rows(problem) == (0.0, 0.0)
+    return of_rows(problem.engine.records) == HELD
 
 
 def with_held(problem: Problem) -> Problem:
     """The problem with commands that are held between the rows."""
-    return _between(problem, 0.0, 0.0)
+    return _between(problem, HELD)
 
 
-def of_rows(problem: Problem) -> tuple[float, float]:
-    """Share of the next command in a row's, and the variance of its mean; see Record."""
-    record = problem.engine.records[0]
-    return record.of_next, record.between
-
-
-def between_rows(records: Sequence[Record], share: float, variance: float) -> list[Record]:
-    """Records whose commands are so between the rows; see Record.
-
-    Args:
-        records: with commands as logged. share: of the next one; ON_LINES are the means of straight
-            lines. variance: of the mean.
-    """
-    return [replace(record, of_next=share, between=variance) for record in records]
-
-
-def _between(problem: Problem, share: float, variance: float) -> Problem:
-    return problem.with_records(between_rows(problem.engine.records, share, variance))
-
-
-def _likelihood(problem: Problem, fit: Fit) -> float:
-    return problem.engine.log_likelihood(fit.values, fit.noise)
-
-
-def remarks(problem: Problem) -> list[str]:
-    """What was done between the rows, for who reads the findings.
-
-    Args:
-        problem: with commands as they were taken to be.
-    """
-    share, variance = of_rows(problem)
-    said = []
-    if share:
-        said.append(
-            "commands between the rows are taken to be, in the mean, at"
-            f" {share:.3g} of the way from each to the next, which is likelier than that they are held"
-        )
-    if variance:
-        said.append(
-            "commands change between the rows, when is not known: rows in which they change much are"
-            " believed less"
-        )
-    return said
+def _between(problem: Problem, between: Between) -> Problem:
+    return problem.with_records(with_between(problem.engine.records, between))
 
 
 def likelier_on_the_way(found: Searched) -> Searched:
@@ -225,14 +178,16 @@ def likelier_on_the_way(found: Searched) -> Searched:
     problem, fit = found.problem, found.fit
     if not problem.row > SLOWER or not fit.active or found.changing is not None:
         return found
-    now, variance = of_rows(problem)
-    trials = {s: _fitted(problem, fit, s, variance) for s in (0.0, *SHARES) if s != now}
-    share = min(trials, key=lambda s: trials[s][1].objective)
-    between, other = trials[share]
+    now = of_rows(problem.engine.records)
+    trials = {
+        of: _fitted(problem, fit, of) for of in TRIED if of.variance == now.variance if of != now
+    }
+    likeliest = min(trials, key=lambda of: trials[of][1].objective)
+    between, other = trials[likeliest]
     gained = fit.objective - other.objective
     if not gained > problem.settings.tie:
         return found
-    problem.report(f"commands at {share:g} of the way to the next row's: {gained:.1f} nats")
+    problem.report(f"{likeliest}: {gained:.1f} nats")
     other, quadratic = quadratic_at(between, other)
     return replace(found, problem=between, fit=other, quadratic=quadratic)
 
@@ -246,14 +201,14 @@ def beside_straight_lines(
         problem, fit: with the causes, and commands that are held. quadratic: linearised at the fit.
         evidence: of the causes.
     """
-    share, variance = of_rows(problem)
-    if not problem.has_slow_rows or not fit.active or share:
+    now = of_rows(problem.engine.records)
+    if not problem.has_slow_rows or not fit.active or now.share:
         return fit
-    _, other = _fitted(problem, fit, ON_LINES, variance)
+    _, other = _fitted(problem, fit, now._replace(share=ON_LINES))
     return as_far_apart(problem, fit, quadratic, evidence, other)
 
 
-def _fitted(problem: Problem, fit: Fit, share: float, variance: float) -> tuple[Problem, Fit]:
+def _fitted(problem: Problem, fit: Fit, between: Between) -> tuple[Problem, Fit]:
     """The problem with other commands between the rows, and the fit of the same effects to it."""
-    other = _between(problem, share, variance)
+    other = _between(problem, between)
     return other, converged(other, fitted(other, fit, STEPS))

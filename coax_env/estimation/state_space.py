@@ -78,7 +78,7 @@ class Record:
     (input_innovations.py). battery: (n,) its voltage [V], or None. strength: of its process noise.
     blur: (n, m) variance of each reading beyond its level's (clock_errors.py), or None.
     of_next: share of the next row's command in what is commanded over a row in the mean, which readings
-    at its beginning do not see (slow_commands.py); 0: it is held. between: variance of that mean, in
+    at its beginning do not see (between_rows.py); 0: it is held. between: variance of that mean, in
     squares of the change to the next row; 0: it was so.
     air: level of the process noise -> times which it is on this run (run_air.py).
     late: which readings can be moved back, or None.

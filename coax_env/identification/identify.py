@@ -15,7 +15,7 @@ import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
-from coax_env.estimation import late_commands, vibration
+from coax_env.estimation import between_rows, late_commands, vibration
 from coax_env.estimation.engine import Engine, Estimate
 from coax_env.estimation.fitted_vehicle import (
     double_counting,
@@ -145,8 +145,7 @@ def identify(
 
     Raises:
         InputError: no such method, nothing to identify, a log that contradicts itself, or sensors
-        missing
-            that the method needs.
+            missing that the method needs.
     """
     if method not in METHODS:
         raise InputError(f"no method {method!r}; there are {', '.join(METHODS)}")
@@ -200,6 +199,17 @@ def _by_maximum_likelihood(
         engine = Engine(model, late_commands.acting_sooner(engine.records, late))
         first, found, values = fitted(engine)
         known = (*known, late_commands.remark(late))
+    between = between_rows.likeliest(engine, values, found.noise, report)
+    while between != between_rows.of_rows(engine.records):
+        report("estimating again with commands as they are between the rows")
+        other = Engine(model, between_rows.with_between(engine.records, between))
+        trial = fitted(other)
+        if not trial[1].estimate.objective < found.estimate.objective:
+            break
+        engine, (first, found, values) = other, trial
+        between = between_rows.next_larger(between)
+    between = between_rows.of_rows(engine.records)
+    known = (*known, *between_rows.remarks(between))
     found = over_roughness(engine, found, values)
     values = {**model.bare_values, **found.estimate.values}
     _, lin = engine.linearise(values, found.noise, found.free)
@@ -211,7 +221,8 @@ def _by_maximum_likelihood(
     dt = median_step(engine.records)
     after = _identified_vehicle(vehicle, found, inflation, apart, dt, flight)
     report("flying the runs open loop")
-    again = Engine(model, late_commands.acting_sooner([record_of(run) for run in held.runs], late))
+    sooner = late_commands.acting_sooner([record_of(run) for run in held.runs], late)
+    again = Engine(model, between_rows.with_between(sooner, between))
     return Identification(
         held,
         vehicle,

@@ -21,7 +21,8 @@ from injector_sensors import kit
 
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.shocks import in_shocks, with_shocks
-from coax_env.diagnosis.slow_commands import SLOWER, likeliest_at
+from coax_env.diagnosis.slow_commands import likeliest_at
+from coax_env.estimation.between_rows import SLOWER
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import fitted_levels, starting_noise, still_air
 from coax_env.estimation.run_passes import GATE, RunPass
