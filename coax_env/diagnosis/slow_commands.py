@@ -12,7 +12,7 @@ none, that are likeliest together, if that is likelier by a tie; beside the caus
 share is asked again. A model that is wrong looks like rows believed less, too: where innovations stay
 much coloured commands are held if the fitted runs are flown nearer so. On a **real** helicopter at
 25 Hz "changing at unknown times" is worth 30 to 38 nats by the model as given on three of four choices
-of the held-out run; held on two of these it removes 53 % of the error on `15ft_1` (40 to 66) where it
+of the held-out run; held on two of these it removes 63 % of the error on `15ft_1` (43 to 70) where it
 removed 21 % (-21 to 47), and as much as before on the other. Between slow rows where neither is
 likelier how far straight lines have each number elsewhere is a part of its std.
 

@@ -33,6 +33,7 @@ from coax_env.model import dynamics, effects, usual_sizes
 from coax_env.model import inputs as U
 from coax_env.model import parameters as P
 from coax_env.model import state as S
+from coax_env.model import workspace as F
 from coax_env.model.layout import (
     ACTUATORS,
     ANGLES,
@@ -75,6 +76,8 @@ _INNOVATIONS = RISE.stop
 """Column of the input at which input innovations begin, where it has them."""
 
 _LAG_U, _LAG_L = (effects.parameter_index(f"motor_lag.{rotor}") for rotor in ("upper", "lower"))
+
+_REACTION = effects.parameter_index("spin_up_reaction.gain")
 
 _A = float64[::1]
 STEP = types.void(_A, _A, float64, _A, _A, _A)
@@ -129,7 +132,8 @@ def _slower(u: Any, dt: Any, p: Any) -> tuple[Any, Any]:
 
     Exact for commands that rise evenly, with a lag or none: such a rotor is as fast in the mean, and
     gains what it gains, which the body feels (`spin_up_reaction`): 459 nats of that had been a yaw
-    damping at 25 Hz (**synthetic**).
+    damping at 25 Hz (**synthetic**). What the slower beginning would give to the heading of that
+    reaction, `_turn_back` takes out.
     """
     upper, lower = u[RISE.start], u[RISE.start + 1]
     if not (any_lane(upper != 0.0) or any_lane(lower != 0.0)):
@@ -144,6 +148,17 @@ def _speed_up(x: Any, upper: Any, lower: Any) -> None:
     x[S.OMEGA_L] += lower
 
 
+@compiled()
+def _turn_back(x: Any, work: Any, dt: Any, p: Any, upper: Any, lower: Any) -> None:
+    """The heading of a state, in place, by what rotors that begin so much slower turn the body before.
+
+    Args:
+        work: the kernel's, after its step. upper, lower: of `_slower`.
+    """
+    angular = (p[P.ROTOR_INERTIA_U] + p[P.FLYBAR_INERTIA]) * upper - p[P.ROTOR_INERTIA_L] * lower
+    x[S.PSI] -= dt * p[_REACTION] * angular / work[F.INERTIA_ZZ]
+
+
 def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """The kernel's step after the input innovations are taken in, in the engine's form."""
     upper, lower = _slower(u, dt, p)
@@ -151,6 +166,7 @@ def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     _speed_up(out, -upper, -lower)
     kernel_step(out, u, dt, p, work, out)
     _speed_up(out, upper, lower)
+    _turn_back(out, work, dt, p, upper, lower)
 
 
 def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:

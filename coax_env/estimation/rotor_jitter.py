@@ -34,6 +34,7 @@ from coax_env.estimation.helicopter import (
     _slower,
     _speed_up,
     _take_in_innovations,
+    _turn_back,
     kernel_drift,
     kernel_measure,
     kernel_step,
@@ -131,6 +132,7 @@ def _step(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     _speed_up(state, -upper, -lower)
     kernel_step(state, work[_INPUT:_OUT], dt, p, work, state)
     _speed_up(state, upper, lower)
+    _turn_back(state, work, dt, p, upper, lower)
     for i in range(N_FULL):
         out[i] = state[i]
     out[S.R] -= taken
