@@ -1,11 +1,11 @@
 """What commands do between slow rows: held until the next, on the way to it, or changed at some time.
 
 A log at 25 Hz has one command of four. Held until the next, each acts 15 ms late in the mean, which a
-lag or a delay of the machine gives back: motor lags of 60 ms were 49, 50 and 50 +- 0.4 ms on three
-**synthetic** flights, and are 59 to 60 where their mean is found (`scripts/identify.py --also
-motor_lag`). So a row's command has in the mean a share of the next one's; and as it may change anywhere
-in the row, evenly, that mean may have a variance of a twelfth of the change squared. Readings at the
-row's beginning see it as written.
+lag or a delay of the machine gives back: motor lags of 60 ms were identified as 49, 50 and 50 +- 0.4 ms
+on three **synthetic** flights, and as 59.4, 60.1 and 60.1 since their mean is found. So a row's command
+has in the mean a share of the next one's; and as it may change anywhere in the row, evenly, that mean
+may have a variance of a twelfth of the change squared. Readings at the row's beginning see it as
+written.
 """
 
 from collections.abc import Mapping, Sequence
