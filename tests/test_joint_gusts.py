@@ -45,7 +45,7 @@ JOINED = {LEVER: -0.03, LIFT: 0.5, TURN: 0.01}
 MEMORY = dict(zip(AXES, (0.4, 0.8, 0.2, 1.5), strict=True))
 NOISE = Noise({f"memory_{axes}": seconds for axes, seconds in MEMORY.items()})
 HOVER, COMMAND = dynamics.hover_trim(LAMA)
-INPUT = np.tile(dynamics.kernel_input(COMMAND), 2)
+INPUT = np.append(np.tile(dynamics.kernel_input(COMMAND), 2), [0.0, 0.0])
 SHOWN = np.append(INPUT, [0.3, -0.2, 0.1, 0.2, 0.0, 0.0])  # innovations of rotors and swash plate
 GAINS = {name: 0.01 * (1.0 + k) for k, name in enumerate(P.COMMAND_GAINS)}
 GUST = np.array([0.2, -0.1, 0.3, 0.004, -0.002, 0.001])

@@ -52,7 +52,7 @@ NOISE = Noise(
 )
 GROUP = {channel: group for group, channels in SENSOR_GROUPS.items() for channel in channels}
 HOVER, COMMAND = dynamics.hover_trim(LAMA)
-INPUT = np.tile(dynamics.kernel_input(COMMAND), 2)
+INPUT = np.append(np.tile(dynamics.kernel_input(COMMAND), 2), [0.0, 0.0])
 ANGLE_PAIRS = list(zip(GYROS, ANGLES, strict=True))
 
 

@@ -58,9 +58,14 @@ def state(upper: float, lower: float) -> np.ndarray:
     return x
 
 
+def of(command: np.ndarray) -> np.ndarray:
+    """The model's input: a command that is held, to the step and to the readings."""
+    return np.append(np.tile(dynamics.kernel_input(command), 2), [0.0, 0.0])
+
+
 def read(model: HeliModel, x: np.ndarray, command: np.ndarray, p: np.ndarray) -> np.ndarray:
     out, work = np.zeros(N_CHANNELS), np.zeros(model.work_size)
-    model.measure.__wrapped__(x, np.tile(dynamics.kernel_input(command), 2), p, work, out)
+    model.measure.__wrapped__(x, of(command), p, work, out)
     return out
 
 
@@ -68,7 +73,7 @@ def stepped(
     model: HeliModel, x: np.ndarray, command: np.ndarray, p: np.ndarray, dt: float = DT
 ) -> np.ndarray:
     out, work = np.zeros(x.size), np.zeros(model.work_size)
-    model.step.__wrapped__(x, np.tile(dynamics.kernel_input(command), 2), dt, p, work, out)
+    model.step.__wrapped__(x, of(command), dt, p, work, out)
     return out
 
 
@@ -201,7 +206,7 @@ def test_without_jitter_it_is_the_helicopters_own_model_to_the_last_digit():
 def test_the_drift_is_what_the_step_adds_to_first_order(reaction):
     x, p = state(1.5, -0.8), vector(reaction)
     out, work = np.zeros(N_JITTERY + N_CHANNELS), np.zeros(MODEL.work_size)
-    u = np.tile(dynamics.kernel_input(COMMAND), 2)
+    u = of(COMMAND)
     MODEL.drift_and_readings.__wrapped__(x, u, 1e-4, p, work, out)
     later = np.zeros(N_JITTERY)
     MODEL.step.__wrapped__(x, u, 1e-4, p, work, later)

@@ -37,7 +37,7 @@ N_SWINGING = MODEL.exact.size
 LEVELS = dict(zip(AXES, (0.2, 0.3, 0.006, 0.003), strict=True))
 NOISE = Noise({**LEVELS, **{f"memory_{axes}": 0.8 for axes in AXES}})
 HOVER, COMMAND = dynamics.hover_trim(LAMA)
-INPUT = np.tile(dynamics.kernel_input(COMMAND), 2)
+INPUT = np.append(np.tile(dynamics.kernel_input(COMMAND), 2), [0.0, 0.0])
 DT = 0.01
 
 
