@@ -76,7 +76,6 @@ _INNOVATIONS = RISE.stop
 """Column of the input at which input innovations begin, where it has them."""
 
 _LAG_U, _LAG_L = (effects.parameter_index(f"motor_lag.{rotor}") for rotor in ("upper", "lower"))
-
 _REACTION = effects.parameter_index("spin_up_reaction.gain")
 
 _A = float64[::1]
@@ -177,7 +176,7 @@ def _measure(x: Any, u: Any, p: Any, work: Any, out: Any) -> None:
 def _drift_and_readings(x: Any, u: Any, dt: float, p: Any, work: Any, out: Any) -> None:
     """The kernel's drift and readings with the input innovations, in the engine's form."""
     upper, lower = _slower(u, dt, p)
-    omega_u, omega_l = x[S.OMEGA_U], x[S.OMEGA_L]
+    omega_u, omega_l = x[S.OMEGA_U], x[S.OMEGA_L]  # put back below: the state is the caller's
     _speed_up(x, -upper, -lower)
     kernel_drift(x, u, dt, p, work, out)
     x[S.OMEGA_U], x[S.OMEGA_L] = omega_u, omega_l
@@ -372,8 +371,8 @@ class HeliModel:
     def inputs(self, record: Record, vector: np.ndarray) -> np.ndarray:
         """The kernel's inputs (inputs.py) of steps and of readings, (n, 14), input innovations behind.
 
-        A command is its mean over the row to the step, that in force as it begins to the readings; then
-        come what the rotors' end the row above their means, as far again from where they begin.
+        A command is its mean over the row to the step, that in force as it begins to the readings. Then
+        follows by how much the rotors' end the row above their means.
         """
         rise = record.of_next * np.diff(record.command, axis=0, append=record.command[-1:])
         flown = record.command + rise
