@@ -441,15 +441,26 @@ def test_a_swing_that_what_was_found_had_hidden_is_searched_beside_where_that_is
     assert found.fit.noise.level("force_xy") == (0.9 if used else 0.7)
 
 
-@pytest.mark.parametrize(("left", "asked"), [(False, ["swings"]), (True, ["swings", "shocks"])])
-def test_swings_are_asked_before_shocks_and_stand_where_none_are_left(monkeypatch, left, asked):
+@pytest.mark.parametrize(
+    ("left", "white", "likelier", "asked", "ends"),
+    [
+        (False, True, False, ["swings"], "swinging"),
+        (True, True, False, ["swings", "shocks"], "shaken"),
+        (False, False, False, ["swings", "shocks"], "shaken"),
+        (True, True, True, ["swings", "shocks"], "swinging"),
+        (False, False, True, ["swings", "shocks"], "swinging"),
+    ],
+)
+def test_swings_are_asked_before_shocks_and_stand_where_none_are_left_or_they_are_likelier(
+    monkeypatch, left, white, likelier, asked, ends
+):
     """A model of gusts that fade sees shocks in them."""
     done: list[str] = []
     fit = Fit((), {}, FINE)
-    fading, swinging, shaken = (
-        Searched(SimpleNamespace(name=name), fit, fit, fit, None)  # type: ignore[arg-type]
+    found = {
+        name: Searched(SimpleNamespace(name=name), fit, fit, fit, None)  # type: ignore[arg-type]
         for name in ("fading", "swinging", "shaken")
-    )
+    }
 
     def of(name: str, found: Searched) -> Searched:
         done.append(name)
@@ -457,11 +468,40 @@ def test_swings_are_asked_before_shocks_and_stand_where_none_are_left(monkeypatc
 
     believes_its_sensors(monkeypatch)
     stand_in(monkeypatch, "in_shocks", lambda problem, fit: problem.name == "fading" or left)
-    stand_in(monkeypatch, "_in_swings", lambda best, noise: of("swings", swinging))
+    stand_in(monkeypatch, "_in_swings", lambda best, noise: of("swings", found["swinging"]))
+    stand_in(monkeypatch, "_all_white", lambda found: white)
+    stand_in(monkeypatch, "_are_swings", lambda swung, shaken: likelier)
     stand_in(monkeypatch, "_changed", lambda best, clock: None)
-    stand_in(monkeypatch, "_searched_in_shocks", lambda best, noise: of("shocks", shaken))
-    found = unrest.in_unrest(fading, FINE, {}, erring=True)
-    assert done == asked and found is (shaken if left else swinging)
+    stand_in(monkeypatch, "_searched_in_shocks", lambda best, noise: of("shocks", found["shaken"]))
+    end = unrest.in_unrest(found["fading"], FINE, {}, erring=True)
+    assert done == asked and end is found[ends]
+
+
+@pytest.mark.parametrize(
+    ("gained", "coloured", "changed", "swings"),
+    [
+        (42.1, False, False, True),
+        (41.9, False, False, False),
+        (900.0, True, False, False),  # the model lacks something else
+        (900.0, False, True, False),  # a change looked like a shock
+    ],
+)
+def test_gusts_swing_where_that_is_likelier_than_shocks_by_what_makes_a_name_sure(
+    monkeypatch, gained, coloured, changed, swings
+):
+    """Strengths cost their prior."""
+    fit = Fit((), {}, FINE)
+    swinging, shocks = (
+        SimpleNamespace(settings=SETTINGS, cost=cost, engine=SimpleNamespace(records=[]))
+        for cost in (-1000.0, gained - 1030.0)
+    )
+    stand_in(monkeypatch, "is_much_coloured", lambda problem, fit: coloured)
+    stand_in(monkeypatch, "cost", lambda problem, fit, quadratic: problem.cost)
+    stand_in(monkeypatch, "prior_cost", lambda records: 30.0)
+    swung = Searched(swinging, fit, fit, fit, None)  # type: ignore[arg-type]
+    shaken = Searched(shocks, fit, fit, fit, None)  # type: ignore[arg-type]
+    changing: Any = SimpleNamespace() if changed else None
+    assert unrest._are_swings(swung, replace(shaken, changing=changing)) == swings
 
 
 @pytest.mark.parametrize(
