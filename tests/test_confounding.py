@@ -182,6 +182,45 @@ def test_a_likelier_alternative_stays_where_it_stands_once_weighed(monkeypatch, 
     assert there.active == (("rotor_drag",) if kept else ("axial_damping",))
 
 
+@pytest.mark.parametrize(
+    ("hides", "adds", "stands", "named"),
+    [
+        (True, "sonar_delay", True, ("wind", "sonar_delay")),
+        (True, "sonar_delay", False, ("wind",)),  # it does not stand, nor what stood before
+        (True, None, True, ("wind",)),
+        (False, "sonar_delay", True, ("wind",)),
+    ],
+)
+def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
+    monkeypatch, hides, adds, stands, named
+):
+    """Where noise may hide it; what fell is not added again."""
+    problem, fit, quadratic = fitted_with(0.0)
+    fit = replace(fit, active=("wind", "motor_lag"))
+
+    def weighed(problem: Problem, fit: Fit) -> tuple[Any, ...]:
+        kept = [e for e in fit.active if e != "motor_lag"]
+        if "sonar_delay" in kept and not stands:
+            kept = ["sonar_delay"]
+        return problem, replace(fit, active=tuple(kept)), quadratic, {}
+
+    def search(problem: Problem, fit: Fit, gone: Any) -> tuple[Fit, Quadratic]:
+        assert fit.active == ("wind",) and gone == {"motor_lag"}
+        return replace(fit, active=(*fit.active, adds) if adds else fit.active), quadratic
+
+    monkeypatch.setattr(confounding, "noise_may_hide", lambda problem, fit: hides)
+    monkeypatch.setattr(confounding, "weighed", weighed)
+    monkeypatch.setattr(confounding, "search", search)
+    monkeypatch.setattr(confounding, "as_named", lambda problem, fit, other: other)
+    monkeypatch.setattr(confounding, "fitted", lambda problem, fit: fit)
+    monkeypatch.setattr(confounding, "noise_fitted", lambda problem, fit: fit)
+    monkeypatch.setattr(confounding, "whiteness", lambda passes, channels: {})
+    monkeypatch.setattr(confounding, "alternatives", lambda *given: {})
+    monkeypatch.setattr(confounding, "likelier", lambda *given: None)
+    engine = SimpleNamespace(filter=lambda values, noise: [])
+    assert settled(replace(problem, engine=engine), fit).fit.active == named
+
+
 def test_nothing_is_averaged_over_without_a_cause_nor_what_no_model_has_beside_it():
     problem, fit, quadratic = fitted_with(-8.0)
     none = replace(fit, active=())

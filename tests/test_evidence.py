@@ -192,7 +192,7 @@ def test_a_refit_that_loses_too_little_need_not_converge(monkeypatch):
     )
     problem: Any = SimpleNamespace(
         settings=SETTINGS, file_values=lambda effect: {}, answers_unseen=False,
-        sees_poses_alone=False,
+        times_unseen=lambda effect: 1.0,
         for_each=lambda one, which: {e: one(e) for e in which},
     )  # fmt: skip
     found = evidence.weigh(problem, fit, None, fit.active, THRESHOLD)  # type: ignore[arg-type]
@@ -560,6 +560,7 @@ def test_what_looks_like_a_late_answer_must_be_worth_more_where_gusts_are_seen_l
     problem = SimpleNamespace(settings=SETTINGS, **{name: name in unseen for name in conditions})
     for of_all in ("answers_unseen", "unseen_times"):
         setattr(problem, of_all, getattr(Problem, of_all).fget(problem))
+    problem.times_unseen = lambda effect: Problem.times_unseen(problem, effect)  # type: ignore[arg-type]
     monkeypatch.setattr(evidence, "inflation", lambda problem, quadratic, active, effect: colour)
     fit = SimpleNamespace(active=(effect,))
     assert evidence.inflation_of(problem, fit, None, effect) == factor  # type: ignore[arg-type]

@@ -161,6 +161,40 @@ def test_noise_and_numbers_are_fitted_by_turns_until_a_turn_gains_little(monkeyp
     assert found.objective == 50.0 - sum(gains[:turns])
 
 
+@pytest.mark.parametrize(
+    ("seconds", "slow", "promised"),
+    [(math.inf, True, 0.2), (math.inf, False, 2.0), (None, True, 2.0), (90.0, True, 2.0)],
+)
+def test_on_all_of_a_flight_with_slow_rows_noise_is_fitted_where_less_is_promised(
+    monkeypatch, seconds, slow, promised
+):
+    """A fifth of a nat; else what a step of the numbers must gain."""
+    asked: list[tuple[float, float]] = []
+
+    def fit_noise(*given: Any, tolerance: float, seconds: float, **other: Any) -> Noise:
+        asked.append((tolerance, seconds))
+        return noise()
+
+    monkeypatch.setattr(fits, "fit_noise", fit_noise)
+    problem: Any = SimpleNamespace(
+        settings=SETTINGS, engine=None, noise_fit_seconds=60.0, has_slow_rows=slow
+    )
+    fits.noise_fitted(problem, Fit((), {}, noise()), seconds)
+    assert asked == [(promised, 60.0 if seconds is None else seconds)]
+
+
+@pytest.mark.parametrize(
+    ("slow", "coloured", "hides"),
+    [(True, False, True), (True, True, False), (False, False, False)],
+)
+def test_noise_may_hide_what_acts_between_slow_rows_but_not_where_a_model_lacks_much(
+    monkeypatch, slow, coloured, hides
+):
+    monkeypatch.setattr(fits, "is_much_coloured", lambda problem, fit: coloured)
+    problem: Any = SimpleNamespace(has_slow_rows=slow)
+    assert fits.noise_may_hide(problem, Fit((), {}, noise())) == hides
+
+
 # --- what a cause is worth ----------------------------------------------------------------------------
 
 

@@ -155,6 +155,84 @@ def test_trials_are_those_nearly_strong_and_dampings_with_half_the_evidence(monk
     assert tried({}) == ([], ["yaw_damping"])
 
 
+@pytest.fixture
+def hidden_by_noise(monkeypatch, usual):
+    """Nats by which effects gain once their numbers are fitted, and by how many more with the noise."""
+    gains: dict[str, tuple[float, float]] = {}
+    base: list[float] = [0.0]  # what noise alone gains without an effect
+    asked: list[str] = []
+
+    def fitted(problem: Problem, fit: Fit, steps: int) -> Fit:
+        numbers, noise = gains[fit.active[-1]]
+        if fit.active[-1] not in asked:
+            asked.append(fit.active[-1])
+            return replace(fit, objective=500.0 - numbers)
+        return replace(fit, objective=500.0 - numbers - noise)
+
+    monkeypatch.setattr(
+        moves, "at_optimum", lambda problem, fit, q, active, at: replace(fit, active=active)
+    )
+    monkeypatch.setattr(moves, "fitted", fitted)
+    monkeypatch.setattr(moves, "noise_fitted", lambda problem, fit, seconds: fit)
+    monkeypatch.setattr(
+        moves, "converged", lambda problem, fit: replace(fit, objective=500.0 - base[0])
+    )
+    monkeypatch.setattr(moves, "is_large", lambda *given: True)
+    return gains, base, asked
+
+
+def anew(nats: dict[str, float], tried: Any = (), made: Problem = PROBLEM) -> Any:
+    """What is added of candidates of so many nats."""
+    fit = replace(FIT, active=("gyro_bias",))
+    candidates = [Score(e, n, n, True) for e, n in nats.items()]
+    return moves.with_noise_anew(made, fit, OCCAM, candidates, tried)  # type: ignore[arg-type]
+
+
+def test_the_best_with_its_own_noise_is_added_whatever_its_score(hidden_by_noise):
+    """Of those from 3.5 nats on that gain as much once fitted; 3 nats are the Occam factor."""
+    gains, _, _ = hidden_by_noise
+    made = problem("gyro_bias", "wind", "swash_offset", "yaw_inertia", "thrust_exponent")
+    gains |= {"wind": (20.0, 1.0), "swash_offset": (8.0, 30.0), "thrust_exponent": (6.4, 900.0)}
+    scores = {"wind": 17.0, "swash_offset": 3.6, "thrust_exponent": 5.0, "yaw_inertia": 3.4}
+    found, asked = anew(scores, made=made)
+    assert found.active == ("gyro_bias", "swash_offset")
+    assert found.history[-1] == ("+ swash_offset", 35.0)
+    assert asked == ["wind", "thrust_exponent", "swash_offset"]
+
+
+@pytest.mark.parametrize(("with_noise", "alone", "taken"), [
+    (9.1, 0.0, True), (8.9, 0.0, False), (12.0, 2.9, True), (12.0, 3.1, False),
+])  # fmt: skip
+def test_no_effect_is_credited_with_what_noise_gains_alone(
+    hidden_by_noise, with_noise, alone, taken
+):
+    gains, base, _ = hidden_by_noise
+    gains["wind"], base[0] = (8.0, with_noise), alone
+    found, asked = anew({"wind": 4.0})
+    assert (found is not None) == taken and asked == ["wind"]
+
+
+def test_what_looks_like_a_weak_answer_must_gain_three_times_as_much_unseen(
+    monkeypatch, hidden_by_noise
+):
+    gains, _, _ = hidden_by_noise
+    monkeypatch.setattr(Problem, "answers_unseen", True)
+    monkeypatch.setattr(Problem, "sees_poses_alone", False)
+    gains |= {"servo_lag": (40.0, 4.9), "wind": (10.0, 7.1)}
+    assert anew({"servo_lag": 40.0, "wind": 4.0})[0].active[-1] == "wind"
+    assert anew({"servo_lag": 10.4})[1] == [], "a third of its score is under 3.5"
+    gains["servo_lag"] = (40.0, 50.0)
+    assert anew({"servo_lag": 40.0, "wind": 4.0})[0].active[-1] == "servo_lag"
+
+
+def test_what_was_tried_with_its_noise_is_not_again_nor_beside_too_many(hidden_by_noise):
+    gains, _, _ = hidden_by_noise
+    gains["wind"] = (20.0, 0.0)
+    assert anew({"wind": 20.0}, {("gyro_bias", "wind")}) == (None, [])
+    full = replace(PROBLEM, settings=replace(SETTINGS, most_causes=1))
+    assert anew({"wind": 20.0}, made=full) == (None, [])
+
+
 def test_no_more_causes_than_are_allowed(monkeypatch):
     strong = [Score("yaw_damping", 30.0, 30.0, True)]
     monkeypatch.setattr(moves, "stepped", lambda problem, fit, passes, q: fit)

@@ -63,6 +63,7 @@ def moves(monkeypatch):
     monkeypatch.setattr(module, "with_latent_noise", latent)
     monkeypatch.setattr(module, "noise_fitted", noise_fitted)
     monkeypatch.setattr(module, "_in_brief_gusts", lambda *given: None)
+    monkeypatch.setattr(module, "noise_may_hide", lambda problem, fit: False)
     monkeypatch.setattr(module, "_nearest", lambda problem, *given: problem)
     monkeypatch.setattr(module, "threshold", lambda problem, q, active: SETTINGS.evidence)
     monkeypatch.setattr(module, "swaps", lambda *given: iter(()))
@@ -142,6 +143,44 @@ def test_what_was_dropped_is_not_added_at_once_again(moves):
     assert done[5:7] == ["drop?", "add rotor_drag"] and fit.active == ("rotor_drag",)
 
 
+def test_what_fell_before_the_search_is_not_added_by_it(moves):
+    """However many additions hold meanwhile."""
+    given, _ = moves
+    wind, drag, bias = score("wind", 90.0), score("rotor_drag", 40.0), score("gyro_bias", 30.0)
+    given["scores"] = [[wind, drag, bias], [wind, bias], [wind], [wind]]
+    given["add"] = ["rotor_drag", "gyro_bias"]
+    fit, _ = search(PROBLEM, FIT, ["wind"])
+    assert fit.active == ("rotor_drag", "gyro_bias")
+
+
+@pytest.mark.parametrize("found", [True, False])
+@pytest.mark.parametrize(
+    ("nats", "hides", "first"), [(41.9, True, True), (42.1, True, False), (41.9, False, False)]
+)
+def test_a_weak_addition_waits_for_what_noise_may_hide(
+    moves, monkeypatch, nats, hides, first, found
+):
+    """Under three thresholds, where it may; each set of effects is asked for once."""
+    given, done = moves
+    asked: list[tuple[str, ...]] = []
+
+    def anew(problem: Any, fit: Fit, quadratic: Any, candidates: Any, tried: Any) -> Any:
+        asked.append(tuple(c.effect for c in candidates if (*fit.active, c.effect) not in tried))
+        done.append("noise anew")
+        there = replace(fit, active=(*fit.active, "sonar_delay")).noted("+ sonar_delay", 58.0)
+        return (there if found and not fit.active else None), ["wind", "sonar_delay"]
+
+    monkeypatch.setattr(module, "with_noise_anew", anew)
+    monkeypatch.setattr(module, "noise_may_hide", lambda problem, fit: hides)
+    given["scores"] = [[score("wind", nats), score("sonar_delay", 4.3)]]
+    given["add"] = ["wind"]
+    fit, _ = search(PROBLEM, FIT)
+    assert fit.active == (("sonar_delay",) if first and found else ("wind",))
+    assert done[1] == ("noise anew" if first else "add wind")
+    assert not first or asked[0] == ("wind", "sonar_delay")
+    assert fit.strongest == ((58.0, "sonar_delay") if first and found else (nats, "wind"))
+
+
 def test_a_coloured_drop_ends_the_additions(moves):
     given, done = moves
     begin = replace(FIT, active=("wind",))
@@ -182,14 +221,14 @@ def test_after_three_additions_that_did_not_hold_no_more_are_made(moves):
     memory = _Memory(failures=2)
     strong = [score("wind", 30.0)]
     given["add"] = ["wind", "rotor_drag", "gyro_bias"]
-    one = _forward(PROBLEM, FIT, [], None, strong, memory)  # type: ignore[arg-type]
+    one = _forward(PROBLEM, FIT, [], None, strong, strong, memory)  # type: ignore[arg-type]
     assert one is not None and memory.failures == 2 and memory.most == 0
     memory.banned, memory.drops = {"a", "b"}, module.Counter({"a": 2, "b": 1})
-    two = _forward(PROBLEM, one, [], None, strong, memory)  # type: ignore[arg-type]
+    two = _forward(PROBLEM, one, [], None, strong, strong, memory)  # type: ignore[arg-type]
     assert two is not None and memory.failures == 0 and memory.most == 1
     assert memory.banned == {"a"}, "what was dropped twice stays banned"
     memory.failures = 3
-    assert _forward(PROBLEM, two, [], None, strong, memory) is None  # type: ignore[arg-type]
+    assert _forward(PROBLEM, two, [], None, strong, strong, memory) is None  # type: ignore[arg-type]
 
 
 def test_in_brief_gusts_all_weak_effects_leave_but_what_was_worth_most_when_it_came(monkeypatch):

@@ -45,7 +45,6 @@ from coax_env.diagnosis.input_innovations import has_command_gains, with_command
 from coax_env.diagnosis.moves import TOO_SMALL, dropped_in_brief_gusts
 from coax_env.diagnosis.problem import (
     OWN_WEAK_OR_LATE,
-    PURE_DELAYS,
     WEAK_OR_LATE,
     Fit,
     Problem,
@@ -434,11 +433,9 @@ def inflation_of(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) 
     colour = inflation(problem, quadratic, fit.active, effect)
     if effect not in WEAK_OR_LATE:
         return colour
-    if problem.answers_unseen:
-        return colour * problem.unseen_times
+    times = problem.times_unseen(effect)
     # what poses show late colours them, where they are fine enough to show it
-    slack = problem.sees_poses_alone and effect not in PURE_DELAYS
-    return max(colour, problem.unseen_times) if slack else colour
+    return colour * times if problem.answers_unseen else max(colour, times)
 
 
 def _worth(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:

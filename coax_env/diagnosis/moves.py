@@ -176,6 +176,66 @@ def trials(
     return proposals, hidden
 
 
+def with_noise_anew(
+    problem: Problem,
+    fit: Fit,
+    quadratic: Quadratic,
+    candidates: Sequence[Score],
+    tried: Collection[tuple[str, ...]],
+) -> tuple[Fit | None, list[str]]:
+    """Add the best of what the quadratic nearly carries, each fitted with the noise.
+
+    Noise that was fitted without an effect has taken a part of it up, gusts that last above all: from
+    there neither a slope nor a fit of the effect's own numbers shows what it is worth.
+
+    Args:
+        problem, fit: what may be free, and where.
+        quadratic: linearised at the fit.
+        candidates: scores of what may be added.
+        tried: sets of effects that need no second trial.
+
+    Returns:
+        the fit with that effect, where it gains enough, and which effects were asked.
+    """
+    chosen = problem.settings
+    if len(fit.active) >= chosen.most_causes:
+        return None, []
+    enough = threshold(problem, quadratic, fit.active)
+    least = chosen.noise_trial_share * enough
+    share = {
+        c.effect: c.evidence / problem.times_unseen(c.effect)
+        for c in candidates
+        if not problem.file_values(c.effect) and (*fit.active, c.effect) not in tried
+    }
+    near = sorted((e for e in share if share[e] > least), key=lambda e: -share[e])
+    near = near[: chosen.most_noise_trials]
+    free = problem.free_names(fit.active)
+    occam = {e: quadratic.occam(problem.acting_names(e), free) for e in near}
+
+    def one(effect: str) -> Fit:
+        begin = at_optimum(problem, fit, quadratic, (*fit.active, effect), {})
+        trial = fitted(problem, begin, steps=1)
+        if fit.objective - trial.objective - occam[effect] < least:
+            return trial
+        return fitted(problem, noise_fitted(problem, trial, math.inf), steps=1)
+
+    def beyond(effect: str, now: Fit) -> float:
+        """Nats gained over those that are needed."""
+        gained = now.objective - ends[effect].objective - occam[effect]
+        return gained - enough * problem.times_unseen(effect)
+
+    ends = problem.for_each(one, near)
+    if not any(beyond(e, fit) > 0.0 for e in near):
+        return None, near
+    now = converged(problem, fit)  # or an effect is credited with what its noise alone gains
+    best = max(near, key=lambda e: beyond(e, now))
+    if beyond(best, now) <= 0.0 or not is_large(problem, best, ends[best].values):
+        return None, near
+    gained = now.objective - ends[best].objective - occam[best]
+    problem.report(f"added {best}: {gained:.1f} nats, once fitted with the noise")
+    return ends[best].noted(f"+ {best}", gained), near
+
+
 # --- swap -------------------------------------------------------------------------------------------
 
 

@@ -306,6 +306,13 @@ class Problem:
         seldom = self.sees_poses_alone and self.reads_seldom
         return self.settings.seldom_poses_inflation if seldom else self.settings.unseen_inflation
 
+    def times_unseen(self, effect: str) -> float:
+        """Times that an effect must be worth more because weak or late answers are not seen."""
+        if effect not in WEAK_OR_LATE:
+            return 1.0
+        slack = self.sees_poses_alone and effect not in PURE_DELAYS
+        return self.unseen_times if slack or self.answers_unseen else 1.0
+
     def is_hidden_by_gains(self, effect: str) -> bool:
         """Whether an effect's slope with the filter's gains held says little of what it is worth.
 

@@ -19,6 +19,7 @@ from coax_env.diagnosis.fits import (
     from_steady_noise,
     linearise,
     noise_fitted,
+    noise_may_hide,
     stepped,
     with_latent_noise,
 )
@@ -32,6 +33,7 @@ from coax_env.diagnosis.moves import (
     late_rotors,
     swaps,
     trials,
+    with_noise_anew,
 )
 from coax_env.diagnosis.problem import (
     LATE_ROTORS,
@@ -45,19 +47,24 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 from coax_env.model.layout import ROTOR_SPEEDS
 
+WEAK = 3.0
+"""Thresholds below which the best score does not decide yet: noise may hide a better cause; ours."""
 MOST_ROTORED = 2
 """Sets of effects beside which one search tries rotors that follow late: each takes as long as some
 additions; ours."""
 
 
-def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
+def search(problem: Problem, fit: Fit, gone: Collection[str] = ()) -> tuple[Fit, Quadratic]:
     """Add, drop and swap effects from a fitted model until nothing is gained.
+
+    Args:
+        problem, fit: what may be free, and where. gone: effects that are not added again.
 
     Returns:
         the fit, and the quadratic at it.
     """
     chosen = problem.settings
-    memory = _Memory()
+    memory = _Memory(banned=set(gone), drops=Counter(dict.fromkeys(gone, 2)))
     near = problem  # with the candidates that are linearised
     complete = False  # nothing is left to add
     just_fitted = False
@@ -81,7 +88,7 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
         moved = None
         if not complete:
             moved = _backward(near, fit, quadratic, memory) if converged else None
-            moved = moved or _forward(near, fit, passes, quadratic, strong, memory)
+            moved = moved or _forward(near, fit, passes, quadratic, candidates, strong, memory)
         del passes
         if moved is None and near is not problem:
             near, just_fitted = problem, converged
@@ -93,6 +100,7 @@ def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
             moved = moved or _trial(problem, fit, quadratic, candidates, memory)
             moved = moved or _with_late_rotors(problem, fit, quadratic, memory)
             moved = moved or with_latent_noise(problem, fit)
+            moved = moved or _with_noise_anew(problem, fit, quadratic, candidates, memory)
             moved = moved or _in_brief_gusts(problem, fit, quadratic, memory)
         if moved is None:  # what is active must also stand against coloured innovations
             complete = True
@@ -160,6 +168,7 @@ class _Memory:
     """What one search must not do again.
 
     banned: effects dropped since an addition last held. tried: sets of effects that were fitted.
+    renewed: sets of effects that were fitted with the noise.
     steadied: sets of effects beside which steadier noise was asked for. briefed: and brief gusts.
     rotored: beside which rotors that follow late were tried.
     behind: effects that were added -> their runners-up. exchanged: sets of effects in which these were
@@ -170,6 +179,7 @@ class _Memory:
 
     banned: set[str] = field(default_factory=set)
     tried: set[tuple[str, ...]] = field(default_factory=set)
+    renewed: set[tuple[str, ...]] = field(default_factory=set)
     steadied: set[tuple[str, ...]] = field(default_factory=set)
     briefed: set[tuple[str, ...]] = field(default_factory=set)
     rotored: set[tuple[str, ...]] = field(default_factory=set)
@@ -195,14 +205,19 @@ def _forward(
     fit: Fit,
     passes: Sequence[RunPass],
     quadratic: Quadratic,
+    candidates: Sequence[Score],
     strong: Sequence[Score],
     memory: _Memory,
 ) -> Fit | None:
     if memory.failures >= problem.settings.most_failures:
         return None
-    moved = add(problem, fit, passes, quadratic, strong)
-    if moved:
-        memory.behind[strong[0].effect] = runners_up(problem, fit, quadratic, strong)
+    moved = None
+    if strong and strong[0].nats < WEAK * threshold(problem, quadratic, fit.active):
+        moved = _with_noise_anew(problem, fit, quadratic, candidates, memory)
+    if moved is None:
+        moved = add(problem, fit, passes, quadratic, strong)
+        if moved:
+            memory.behind[strong[0].effect] = runners_up(problem, fit, quadratic, strong)
     if moved and len(moved.active) > memory.most + 1:  # the addition before this one held
         memory.most, memory.failures = len(moved.active) - 1, 0
         memory.banned = {e for e, count in memory.drops.items() if count > 1}
@@ -259,6 +274,20 @@ def _trial(
     proposals, evaluated = trials(problem, fit, quadratic, candidates, memory.banned, memory.tried)
     memory.tried |= {(*fit.active, effect) for effect in evaluated}
     moved = _first_accepted(problem, fit, proposals, memory)
+    if moved:
+        move, nats = moved.history[-1]
+        return _noting_strongest(moved, [(nats, move.removeprefix("+ "))])
+    return None
+
+
+def _with_noise_anew(
+    problem: Problem, fit: Fit, quadratic: Quadratic, candidates: Sequence[Score], memory: _Memory
+) -> Fit | None:
+    """With the best of what noise may hide."""
+    if not noise_may_hide(problem, fit):
+        return None
+    moved, asked = with_noise_anew(problem, fit, quadratic, candidates, memory.renewed)
+    memory.renewed |= {(*fit.active, effect) for effect in asked}
     if moved:
         move, nats = moved.history[-1]
         return _noting_strongest(moved, [(nats, move.removeprefix("+ "))])

@@ -73,6 +73,11 @@ class Settings:
     Levels from a part cost the whole about half a nat each, times the whole over the part: with a
     third 1.5 each; with 60 s of 840 s it was 160 nats in all, which effects that are not there took up.
     """
+    noise_gain: float = 0.2
+    """nats that the slopes of the noise levels must promise in all, for these to be fitted once more on
+    all of a flight with slow rows; elsewhere `step_gain`. Where slopes scatter they promise too little:
+    less than 2 where 15 came, beside a swash offset that the gusts' memory had taken up
+    (`study_diagnosis.py --arms telemetry --seed 845`, one 372)."""
     noise_evaluations: int = 5
     """Likelihoods of a fit of the noise levels from where they stand; ours."""
     first_noise_evaluations: int = 10
@@ -95,6 +100,11 @@ class Settings:
 
     Measured: a damping worth 29 nats once fitted had a predicted gain of 11.
     """
+    noise_trial_share: float = 0.25
+    """The same of one that is fitted with the noise, which may have taken it up: a swash offset worth
+    35 nats then had a score of 7.1, 18.5 once its numbers were fitted (as under `noise_gain`)."""
+    most_noise_trials: int = 6
+    """Such effects that are fitted at once, best first; ours."""
     damping_probe: float = 4.0
     """std by the signatures, at which a damping is given to the likelihood itself; ours."""
     add_before_fitted: float = 10.0
