@@ -197,8 +197,10 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
     """Where noise may hide it; what fell is not added again."""
     problem, fit, quadratic = fitted_with(0.0)
     fit = replace(fit, active=("wind", "motor_lag"))
+    asked: list[tuple[str, ...]] = []
 
     def weighed(problem: Problem, fit: Fit) -> tuple[Any, ...]:
+        asked.append(fit.active)
         kept = [e for e in fit.active if e != "motor_lag"]
         if "sonar_delay" in kept and not stands:
             kept = ["sonar_delay"]
@@ -219,6 +221,7 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
     monkeypatch.setattr(confounding, "likelier", lambda *given: None)
     engine = SimpleNamespace(filter=lambda values, noise: [])
     assert settled(replace(problem, engine=engine), fit).fit.active == named
+    assert len(asked) == (2 if hides and adds else 1)
 
 
 def test_nothing_is_averaged_over_without_a_cause_nor_what_no_model_has_beside_it():

@@ -210,6 +210,8 @@ def test_no_effect_is_credited_with_what_noise_gains_alone(
     gains["wind"], base[0] = (8.0, with_noise), alone
     found, asked = anew({"wind": 4.0})
     assert (found is not None) == taken and asked == ["wind"]
+    if found is not None:
+        assert found.history[-1] == ("+ wind", pytest.approx(8.0 + with_noise - 3.0 - alone))
 
 
 def test_what_looks_like_a_weak_answer_must_gain_three_times_as_much_unseen(
@@ -223,6 +225,17 @@ def test_what_looks_like_a_weak_answer_must_gain_three_times_as_much_unseen(
     assert anew({"servo_lag": 10.4})[1] == [], "a third of its score is under 3.5"
     gains["servo_lag"] = (40.0, 50.0)
     assert anew({"servo_lag": 40.0, "wind": 4.0})[0].active[-1] == "servo_lag"
+
+
+def test_what_is_too_small_or_takes_a_numbers_place_is_not_added_with_its_noise(
+    monkeypatch, hidden_by_noise
+):
+    gains, _, _ = hidden_by_noise
+    made = problem("gyro_bias", "wind", "added_mass")
+    gains |= {"wind": (20.0, 9.0), "added_mass": (20.0, 9.0)}
+    assert anew({"added_mass": 20.0}, made=made) == (None, [])
+    monkeypatch.setattr(moves, "is_large", lambda problem, effect, values: effect != "wind")
+    assert anew({"wind": 20.0}, made=made) == (None, ["wind"])
 
 
 def test_what_was_tried_with_its_noise_is_not_again_nor_beside_too_many(hidden_by_noise):

@@ -145,12 +145,13 @@ def test_what_was_dropped_is_not_added_at_once_again(moves):
 
 def test_what_fell_before_the_search_is_not_added_by_it(moves):
     """However many additions hold meanwhile."""
-    given, _ = moves
+    given, done = moves
     wind, drag, bias = score("wind", 90.0), score("rotor_drag", 40.0), score("gyro_bias", 30.0)
     given["scores"] = [[wind, drag, bias], [wind, bias], [wind], [wind]]
-    given["add"] = ["rotor_drag", "gyro_bias"]
+    given["add"] = ["rotor_drag", "gyro_bias", "wind"]
     fit, _ = search(PROBLEM, FIT, ["wind"])
     assert fit.active == ("rotor_drag", "gyro_bias")
+    assert [what for what in done if what.startswith("add")] == ["add rotor_drag", "add gyro_bias"]
 
 
 @pytest.mark.parametrize("found", [True, False])
@@ -179,6 +180,23 @@ def test_a_weak_addition_waits_for_what_noise_may_hide(
     assert done[1] == ("noise anew" if first else "add wind")
     assert not first or asked[0] == ("wind", "sonar_delay")
     assert fit.strongest == ((58.0, "sonar_delay") if first and found else (nats, "wind"))
+
+
+def test_before_the_search_ends_what_noise_may_hide_is_asked_for_once(moves, monkeypatch):
+    given, done = moves
+    tried_before: list[Any] = []
+
+    def anew(problem: Any, fit: Fit, quadratic: Any, candidates: Any, tried: Any) -> Any:
+        tried_before.append(set(tried))
+        there = replace(fit, active=("wind",)).noted("+ wind", 20.0) if not fit.active else None
+        return there, ["wind", "gyro_bias"]
+
+    monkeypatch.setattr(module, "with_noise_anew", anew)
+    monkeypatch.setattr(module, "noise_may_hide", lambda problem, fit: True)
+    given["scores"] = [[score("wind", 5.0)]]
+    fit, _ = search(PROBLEM, FIT)
+    assert fit.active == ("wind",) and "add wind" not in done
+    assert tried_before == [set(), {("wind",), ("gyro_bias",)}]
 
 
 def test_a_coloured_drop_ends_the_additions(moves):
