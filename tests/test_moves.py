@@ -238,6 +238,16 @@ def test_what_is_too_small_or_takes_a_numbers_place_is_not_added_with_its_noise(
     assert anew({"wind": 20.0}, made=made) == (None, ["wind"])
 
 
+def test_a_trial_whose_filter_diverges_is_none_and_hides_no_other(hidden_by_noise):
+    gains, _, asked = hidden_by_noise
+    gains |= {"wind": (math.nan, 0.0), "swash_offset": (8.0, 30.0)}
+    made = problem("gyro_bias", "wind", "swash_offset")
+    found, _ = anew({"wind": 20.0, "swash_offset": 5.0}, made=made)
+    assert found.active == ("gyro_bias", "swash_offset")
+    asked.clear()
+    assert anew({"wind": 20.0}, made=made)[0] is None
+
+
 def test_what_was_tried_with_its_noise_is_not_again_nor_beside_too_many(hidden_by_noise):
     gains, _, _ = hidden_by_noise
     gains["wind"] = (20.0, 0.0)

@@ -469,7 +469,7 @@ def test_swings_are_asked_before_shocks_and_stand_where_none_are_left_or_they_ar
     believes_its_sensors(monkeypatch)
     stand_in(monkeypatch, "in_shocks", lambda problem, fit: problem.name == "fading" or left)
     stand_in(monkeypatch, "_in_swings", lambda best, noise: of("swings", found["swinging"]))
-    stand_in(monkeypatch, "_all_white", lambda found: white)
+    stand_in(monkeypatch, "_all_white", lambda problem, fit: white)
     stand_in(monkeypatch, "_are_swings", lambda swung, shaken: likelier)
     stand_in(monkeypatch, "_changed", lambda best, clock: None)
     stand_in(monkeypatch, "_searched_in_shocks", lambda best, noise: of("shocks", found["shaken"]))

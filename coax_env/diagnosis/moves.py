@@ -212,28 +212,34 @@ def with_noise_anew(
     free = problem.free_names(fit.active)
     occam = {e: quadratic.occam(problem.acting_names(e), free) for e in near}
 
+    needed = {e: enough * problem.times_unseen(e) for e in near}
+
+    def gained(effect: str, now: Fit, trial: Fit) -> float:
+        return now.objective - trial.objective - occam[effect]
+
     def one(effect: str) -> Fit:
         begin = at_optimum(problem, fit, quadratic, (*fit.active, effect), {})
         trial = fitted(problem, begin, steps=1)
-        if fit.objective - trial.objective - occam[effect] < least:
+        if not gained(effect, fit, trial) >= least:
             return trial
         return fitted(problem, noise_fitted(problem, trial, math.inf), steps=1)
 
-    def beyond(effect: str, now: Fit) -> float:
-        """Nats gained over those that are needed."""
-        gained = now.objective - ends[effect].objective - occam[effect]
-        return gained - enough * problem.times_unseen(effect)
+    def beyond(now: Fit) -> dict[str, float]:
+        """Nats gained over those that are needed, of those that gain as much."""
+        more = {e: gained(e, now, ends[e]) - needed[e] for e in near}
+        return {e: nats for e, nats in more.items() if nats > 0.0}
 
     ends = problem.for_each(one, near)
-    if not any(beyond(e, fit) > 0.0 for e in near):
+    if not beyond(fit):
         return None, near
     now = converged(problem, fit)  # or an effect is credited with what its noise alone gains
-    best = max(near, key=lambda e: beyond(e, now))
-    if beyond(best, now) <= 0.0 or not is_large(problem, best, ends[best].values):
+    good = beyond(now)
+    best = max(good, key=lambda e: good[e], default=None)
+    if best is None or not is_large(problem, best, ends[best].values):
         return None, near
-    gained = now.objective - ends[best].objective - occam[best]
-    problem.report(f"added {best}: {gained:.1f} nats, once fitted with the noise")
-    return ends[best].noted(f"+ {best}", gained), near
+    nats = gained(best, now, ends[best])
+    problem.report(f"added {best}: {nats:.1f} nats, once fitted with the noise")
+    return ends[best].noted(f"+ {best}", nats), near
 
 
 # --- swap -------------------------------------------------------------------------------------------

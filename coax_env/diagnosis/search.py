@@ -274,10 +274,7 @@ def _trial(
     proposals, evaluated = trials(problem, fit, quadratic, candidates, memory.banned, memory.tried)
     memory.tried |= {(*fit.active, effect) for effect in evaluated}
     moved = _first_accepted(problem, fit, proposals, memory)
-    if moved:
-        move, nats = moved.history[-1]
-        return _noting_strongest(moved, [(nats, move.removeprefix("+ "))])
-    return None
+    return _noting_added(moved) if moved else None
 
 
 def _with_noise_anew(
@@ -288,10 +285,7 @@ def _with_noise_anew(
         return None
     moved, asked = with_noise_anew(problem, fit, quadratic, candidates, memory.renewed)
     memory.renewed |= {(*fit.active, effect) for effect in asked}
-    if moved:
-        move, nats = moved.history[-1]
-        return _noting_strongest(moved, [(nats, move.removeprefix("+ "))])
-    return None
+    return _noting_added(moved) if moved else None
 
 
 def _with_late_rotors(
@@ -324,3 +318,9 @@ def _first_accepted(
 
 def _noting_strongest(fit: Fit, found: Iterable[tuple[float, str]]) -> Fit:
     return replace(fit, strongest=max([fit.strongest, *found]))
+
+
+def _noting_added(fit: Fit) -> Fit:
+    """The fit whose last move added an effect, which may be the strongest so far."""
+    move, nats = fit.history[-1]
+    return _noting_strongest(fit, [(nats, move.removeprefix("+ "))])

@@ -27,6 +27,7 @@ from coax_env.diagnosis.doubts import has_limit, sizes
 from coax_env.diagnosis.fits import is_much_coloured
 from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.search import with_onsets
+from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.run_air import with_own_air
 from coax_env.diagnosis.searches.once import Searched, flies_nearer, likelier, searched_once
 from coax_env.diagnosis.searches.rotors import jittery_if_asked
@@ -56,7 +57,7 @@ def in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bo
     shaken = in_shocks(best.problem, best.fit)
     swung = _in_swings(best, noise) if shaken else None
     if shaken:
-        if swung is not None and _all_white(swung) and not in_shocks(swung.problem, swung.fit):
+        if swung is not None and _leave_nothing(swung):
             return swung
         best, noise = jittery_if_asked(best, noise)
         shaken = in_shocks(best.problem, best.fit)
@@ -68,7 +69,7 @@ def in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bo
     while best is not asked:
         asked = best
         swung = None if shaken else _in_swings(best, noise)
-        if swung is not None and _all_white(swung):
+        if swung is not None and _all_white(swung.problem, swung.fit):
             return swung
         best, noise = jittery_if_asked(best, noise)
     best = _with_joint_gusts(best, noise)
@@ -76,8 +77,7 @@ def in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bo
         return best
     problem = best.problem
     coarser = _coarser(best.fit.noise)
-    passes = problem.engine.filter(best.fit.values, best.fit.noise)
-    if not coarser or is_white(passes, problem.model.channels):
+    if not coarser or _all_white(problem, best.fit):
         return best
     reading = best.fit.noise.reading
     as_fitted = {c: reading[c] for c in LEAST_READING_STD if c in reading}  # they are held, too
@@ -125,12 +125,15 @@ def _in_swings(found: Searched, noise: Noise) -> Searched | None:
     return other
 
 
-def _all_white(found: Searched) -> bool:
+def _all_white(problem: Problem, fit: Fit) -> bool:
     """Whether nothing is coloured."""
-    problem = found.problem
-    return is_white(
-        problem.engine.filter(found.fit.values, found.fit.noise), problem.model.channels
-    )
+    return is_white(problem.engine.filter(fit.values, fit.noise), problem.model.channels)
+
+
+def _leave_nothing(swung: Searched) -> bool:
+    """Whether gusts that swing leave nothing coloured, and no shocks."""
+    problem, fit = swung.problem, swung.fit
+    return _all_white(problem, fit) and not in_shocks(problem, fit)
 
 
 def _are_swings(swung: Searched, shaken: Searched) -> bool:
@@ -179,8 +182,7 @@ def _searched_in_shocks(first: Searched, noise: Noise) -> Searched:
     """
     problem = first.problem
     beside, with_causes = with_shocks(problem, first.fit)
-    passes = beside.engine.filter(with_causes.values, with_causes.noise)
-    if not is_white(passes, problem.model.channels):
+    if not _all_white(beside, with_causes):
         return first
     problem.report("gusts come in single shocks: searching again with a strength for each")
     shaken, _ = with_shocks(problem, first.refitted)
