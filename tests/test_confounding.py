@@ -160,6 +160,36 @@ def test_a_limited_rate_is_no_surer_than_a_servo_is_late(monkeypatch, lost, behi
     assert list(found) == (["servo_delay"] if alike else [])
 
 
+@pytest.mark.parametrize(
+    ("effect", "poses_alone", "behind", "alike"),
+    [
+        ("command_delay", True, 79.0, ["servo_delay"]),  # a tenth of what it is worth
+        ("command_delay", True, 81.0, []),
+        ("command_delay", False, 79.0, []),  # gyros show what the swash plate does
+        ("servo_delay", True, 79.0, ["command_delay"]),
+        ("servo_play", True, 79.0, []),
+    ],
+)
+def test_by_poses_alone_a_late_command_and_a_late_servo_stand_for_each_other(
+    monkeypatch, effect, poses_alone, behind, alike
+):
+    names = ("command_delay.time", "servo_delay.time", "servo_play.width")
+    own = {n.partition(".")[0]: (FreeParameter(n, 0.0, 1.0),) for n in names}
+    problem = Problem(HeliModel(load_vehicle("lama400d")), None, (), own)  # type: ignore[arg-type]
+    fit = Fit((effect,), dict.fromkeys(names, 0.0), Noise({}), objective=0.0)
+    behind_it = replace(fit, objective=behind)
+    monkeypatch.setattr(Problem, "sees_poses_alone", poses_alone)
+    monkeypatch.setattr(confounding, "FAR", {})
+    monkeypatch.setattr(confounding, "_near", lambda *given: [])
+    monkeypatch.setattr(confounding, "swap", lambda *given: (0.0, None))
+    monkeypatch.setattr(confounding, "score", lambda *given: SimpleNamespace(evidence=0.0))
+    for name in ("fitted", "converged"):
+        monkeypatch.setattr(confounding, name, lambda *given: behind_it)
+    quadratic = SimpleNamespace(moved=lambda move: {})
+    found = confounding._of_one(problem, fit, quadratic, effect, 1.0, 800.0)  # type: ignore[arg-type]
+    assert sorted(found) == alike
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_likelier_alternative_stays_where_it_stands_once_weighed(monkeypatch, kept):
     problem, fit, quadratic = fitted_with(0.0)
@@ -194,8 +224,10 @@ def test_a_likelier_alternative_stays_where_it_stands_once_weighed(monkeypatch, 
 def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
     monkeypatch, hides, adds, stands, named
 ):
-    """Where noise may hide it; what fell is not added again."""
+    """Where noise may hide it; what fell is not looked for again, nor put in another's place."""
     problem, fit, quadratic = fitted_with(0.0)
+    own = {e: (FreeParameter(f"{e}.time", 0.0, 1.0),) for e in ("wind", "motor_lag", "sonar_delay")}
+    problem = replace(problem, own=own)
     fit = replace(fit, active=("wind", "motor_lag"))
     asked: list[tuple[str, ...]] = []
 
@@ -206,8 +238,8 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
             kept = ["sonar_delay"]
         return problem, replace(fit, active=tuple(kept)), quadratic, {}
 
-    def search(problem: Problem, fit: Fit, gone: Any) -> tuple[Fit, Quadratic]:
-        assert fit.active == ("wind",) and gone == {"motor_lag"}
+    def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
+        assert fit.active == ("wind",) and set(problem.candidates) == {"wind", "sonar_delay"}
         return replace(fit, active=(*fit.active, adds) if adds else fit.active), quadratic
 
     monkeypatch.setattr(confounding, "noise_may_hide", lambda problem, fit: hides)

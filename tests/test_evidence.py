@@ -6,6 +6,7 @@ what its noise levels have not converged by.
 Two clean flights of the study had names that stood by one of the two likelihoods alone.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,6 +27,7 @@ from coax_env.diagnosis.evidence import Evidence, prune, weighed
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.low_pass import LowPass
+from coax_env.estimation.parted_engine import PartedEngine
 from coax_env.estimation.state_space import Noise
 from coax_env.model.layout import CHANNELS
 
@@ -42,6 +44,7 @@ def noise_as_it_is(request, monkeypatch):
         monkeypatch.setattr(evidence, "with_latent_noise", lambda problem, fit: None)
         monkeypatch.setattr(evidence, "dropped_in_brief_gusts", lambda *given: None)
         monkeypatch.setattr(evidence, "is_large", lambda problem, effect, values: True)
+        monkeypatch.setattr(evidence, "is_much_coloured", lambda problem, fit: False)
 
 
 class Flights:
@@ -121,6 +124,73 @@ def test_a_weak_or_late_answer_to_what_the_filter_does_not_see_must_be_worth_mor
     assert set(fit.active) == set(found) == stay
     assert found["gyro_bias"].nats == pytest.approx(2.9 * THRESHOLD)
     assert found["rate_damping"].nats == pytest.approx(3.1 * THRESHOLD / (3.0 if unseen else 1.0))
+
+
+@pytest.mark.parametrize(
+    ("coloured", "flown", "worth", "stays"),
+    [
+        (True, 0.9, 2.0, True),
+        (True, 1.1, 2.0, False),  # the runs are flown nearer without it
+        (False, 0.9, 2.0, False),
+        (True, 0.9, 0.9, False),  # worth too little, colour or not
+    ],
+)
+def test_where_much_is_coloured_what_flies_the_runs_nearer_stays_in_the_model(
+    monkeypatch, coloured, flown, worth, stays
+):
+    """Worth the threshold, of which colour leaves a third; a name it has none (doubts.py)."""
+    errors = itertools.cycle([{"p": flown}, {"p": 1.0}])  # with it, without
+    monkeypatch.setattr(evidence, "is_much_coloured", lambda problem, fit: coloured)
+    monkeypatch.setattr(evidence, "replay_runs", lambda *given: next(errors))
+    monkeypatch.setattr(evidence, "pooled_rms", lambda runs: runs)
+    flights = Flights({"motor_droop": worth * THRESHOLD, "gyro_bias": 5.0 * THRESHOLD})
+    fit, found = flights.pruned(monkeypatch, GOOD, unseen={"unlike_gusts": True})
+    assert ("motor_droop" in fit.active) == stays and "gyro_bias" in fit.active
+    if stays:
+        assert found["motor_droop"].nats == pytest.approx(worth * THRESHOLD / 3.0)
+
+
+@pytest.mark.parametrize(
+    ("lost", "enough", "parted", "stays"),
+    [
+        (30.0, THRESHOLD, False, True),
+        (
+            60.0,
+            30.0,
+            False,
+            False,
+        ),  # 20 nats are a name's, but for the form of what is strong beside it
+        (20.0, 30.0, False, False),
+        (30.0, THRESHOLD, True, False),  # two flights at once: nothing is flown
+    ],
+)
+def test_what_stays_is_worth_enough_but_for_colour(monkeypatch, lost, enough, parted, stays):
+    asked = []
+
+    def replayed(engine: object, values: object, noise: object, horizon: float) -> dict[str, float]:
+        asked.append(values)
+        assert horizon == SETTINGS.horizon
+        return {"p": 1.0 if values == "without" else 0.9, "q": 1.0}
+
+    monkeypatch.setattr(evidence, "is_much_coloured", lambda problem, fit: True)
+    monkeypatch.setattr(evidence, "replay_runs", replayed)
+    monkeypatch.setattr(evidence, "pooled_rms", lambda runs: runs)
+    engine = PartedEngine.__new__(PartedEngine) if parted else None
+    problem = SimpleNamespace(settings=SETTINGS, engine=engine)
+    removal = evidence.Removal(Evidence(lost, 3.0), Fit((), "without", GOOD))  # type: ignore[arg-type]
+    fit = Fit(("wind",), "with", GOOD)  # type: ignore[arg-type]
+    assert evidence.stays_without_a_name(problem, fit, removal, enough) == stays  # type: ignore[arg-type]
+    assert asked == (["with", "without"] if stays else [])
+
+
+def test_a_weaker_cause_that_stays_does_not_keep_another_that_falls(monkeypatch):
+    def stays(problem: Problem, fit: Fit, removal: evidence.Removal, enough: float) -> bool:
+        return "motor_droop" not in removal.rest.active
+
+    monkeypatch.setattr(evidence, "stays_without_a_name", stays)
+    flights = Flights({"motor_droop": 1.5 * THRESHOLD, "motor_lag": 2.0 * THRESHOLD})
+    fit, _ = flights.pruned(monkeypatch, GOOD, unseen={"unlike_gusts": True})
+    assert fit.active == ("motor_droop",)
 
 
 @pytest.mark.parametrize(

@@ -143,17 +143,6 @@ def test_what_was_dropped_is_not_added_at_once_again(moves):
     assert done[5:7] == ["drop?", "add rotor_drag"] and fit.active == ("rotor_drag",)
 
 
-def test_what_fell_before_the_search_is_not_added_by_it(moves):
-    """However many additions hold meanwhile."""
-    given, done = moves
-    wind, drag, bias = score("wind", 90.0), score("rotor_drag", 40.0), score("gyro_bias", 30.0)
-    given["scores"] = [[wind, drag, bias], [wind, bias], [wind], [wind]]
-    given["add"] = ["rotor_drag", "gyro_bias", "wind"]
-    fit, _ = search(PROBLEM, FIT, ["wind"])
-    assert fit.active == ("rotor_drag", "gyro_bias")
-    assert [what for what in done if what.startswith("add")] == ["add rotor_drag", "add gyro_bias"]
-
-
 @pytest.mark.parametrize("found", [True, False])
 @pytest.mark.parametrize(
     ("nats", "hides", "first"), [(41.9, True, True), (42.1, True, False), (41.9, False, False)]

@@ -36,11 +36,14 @@ from study import (
 from study import expected as expecting
 from study.baselines import Gram, by_bic, by_f, sparse, stepwise
 from study.expected import catalogue_values, expected_evidence, gust_levels, true_noise
+from study.likelier import likelier_than_nothing
 from study.one_flight import fly_and_diagnose, hide
 from study.plan import PlannedFlight
 
 from coax_env import load_vehicle, read_flight
 from coax_env.diagnosis import calibration
+from coax_env.diagnosis.fits import converged, start
+from coax_env.diagnosis.problem import Problem
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.errors import InputError
 from coax_env.estimation.engine import Engine
@@ -785,6 +788,39 @@ def test_expected_evidence_is_what_the_likelihood_has_in_gusts(tmp_path: Path) -
         expected.append(nats)
         had.append(with_it - engine.log_likelihood(bare, noise))
     assert 0.5 * sum(had) < sum(expected) < 2.0 * sum(had), (expected, had)
+
+
+@pytest.mark.slow
+def test_the_truth_is_likelier_than_nothing_by_what_two_whole_fits_say(damped: tuple) -> None:
+    """Of a damping that is there, by hand; of one that nobody hid nothing but the Occam factor."""
+    _, folder, truth = damped
+    flight = read_flight(folder)
+    vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
+    records = [record_of(run) for run in flight.runs]
+    candidates = ("yaw_damping", "rate_damping")
+    problem = Problem.of(HeliModel(vehicle), records, candidates)
+    nothing = converged(problem, start(problem, starting_noise(flight, vehicle)))
+    hidden = {"yaw_damping.coefficient": 0.006, "rate_damping.coefficient": 0.0}
+    both = {"hidden": [*candidates, "servo_lag"], "values": hidden}
+    found = likelier_than_nothing(problem, nothing, both)
+    assert found["servo_lag"] is None  # no candidate
+    there = replace(nothing.at({"yaw_damping.coefficient": 0.006}), active=("yaw_damping",))
+    gained = nothing.objective - converged(problem, there).objective
+    assert gained > 100.0
+    one = likelier_than_nothing(problem, nothing, truth)["yaw_damping"]
+    assert one == pytest.approx(gained, rel=0.1) and one < gained  # less the Occam factor
+    assert found["rate_damping"] is not None and found["rate_damping"] < 2.0
+    assert found["yaw_damping"] == pytest.approx(one, rel=0.2)
+
+
+def test_a_row_shows_what_the_likelihood_has_and_an_old_one_does_not_say() -> None:
+    row = {"hidden": ["wind"], "likelier": {"wind": 28.0}}
+    assert judge.is_likelier(row, 14.0)
+    for other in ({}, {"wind": None}, {"wind": 27.9}):
+        assert not judge.is_likelier(row | {"likelier": other}, 14.0)
+    assert not judge.is_likelier({"hidden": ["wind"]}, 14.0)
+    two = {"hidden": ["wind", "servo_lag"], "likelier": {"wind": 28.0, "servo_lag": 20.0}}
+    assert not judge.is_likelier(two, 14.0)
 
 
 def test_sizes_in_the_catalogues_form() -> None:

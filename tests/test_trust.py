@@ -442,6 +442,25 @@ def test_a_number_that_may_be_none_is_doubted_and_with_one_thing_more_has_no_nam
     assert any("may as well be none" in text for text in doubts(one, {one: of}, SETTINGS))
 
 
+@pytest.mark.parametrize(("more", "named"), [({}, True), ({"coloured": ("q",)}, False)])
+def test_what_is_none_only_with_another_in_its_place_is_one_of_the_two(more, named):
+    """A blow-back of the lower rotor may be the upper's: one of them is there, and both are stated."""
+    one, other = EFFECTS[:2]
+    of = known_of(may_be_none=True, falls_at=("half of all",), alternatives=(other,), **more)
+    assert (one not in without_name({one: of}, SETTINGS)) == named
+    alone = known_of(may_be_none=True, falls_at=("half of all",))
+    assert without_name({one: alone}, SETTINGS) == {one}
+    said = list(doubts(one, {one: of}, SETTINGS))
+    assert any("cannot distinguish" in text for text in said)
+    assert any("may as well be none" in text for text in said)
+
+
+@pytest.mark.parametrize(("nats", "named"), [(13.9, False), (14.1, True)])
+def test_what_is_in_the_model_by_what_it_flies_alone_has_no_name(nats, named):
+    of = known_of(nats=nats)
+    assert (not without_name({EFFECTS[0]: of}, SETTINGS)) == named
+
+
 def test_what_a_channel_is_likelier_without_has_no_name():
     """Rotor speeds read through a filter: a motor lag that the accelerometer denies."""
     of = known_of(likelier_without={"az": 276.0})
@@ -498,7 +517,9 @@ def test_what_the_held_out_runs_deny_is_doubted_and_with_one_thing_more_has_no_n
 ):
     one = EFFECTS[0]
     much = SETTINGS.clear + 1.0
-    of = known_of(unseen=Unseen(nats, expected, 5.0), flies_worse=worse, may_be_none=none, nats=much)
+    of = known_of(
+        unseen=Unseen(nats, expected, 5.0), flies_worse=worse, may_be_none=none, nats=much
+    )
     said = [text for text in doubts(one, {one: of}, SETTINGS) if "held-out runs" in text]
     assert bool(said) == denied and len(said) == denied * (1 + worse)
     assert not denied or f"worth {nats:z.0f} nats" in said[0]

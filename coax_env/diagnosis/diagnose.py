@@ -102,6 +102,8 @@ class Diagnosis:
         noise: the sensors' std by channel.
         design: the maneuvers that separate the strongest confounded cause from its alternatives.
         strongest: candidate of most evidence, named or not.
+        problem: what was searched for causes, readings, commands and noise as they were found.
+        refitted: the model without a cause in it.
     """
 
     findings: dict[str, Any]
@@ -119,6 +121,8 @@ class Diagnosis:
     noise: dict[str, float] = field(default_factory=dict)
     design: next_maneuver.Design | None = None
     strongest: tuple[float, str] = (-math.inf, "")
+    problem: Problem | None = None
+    refitted: Fit | None = None
 
 
 SHARES = {
@@ -267,6 +271,8 @@ def diagnose(
         whiteness=white,
         evidence_history=list(fit.history),
         strongest=fit.strongest,
+        problem=first.problem,
+        refitted=refitted,
         remarks=(
             *flight.notes,
             *passed_over,

@@ -8,7 +8,8 @@ delay, a centre of gravity and an accelerometer's bias did on four clean **synth
 to 29 nats, and by poses alone a swash offset for 33. Nor has what the held-out runs should show and
 deny, if it is not clear on the fitted ones. Two of these take a name, too: noise left where it
 shows, little evidence there or by poses alone, other noise, parts of the flights, such a one beside it,
-numbers of which none is known to be another than nothing, held-out runs that should show it and do not,
+numbers of which none is known to be another than nothing, but where another effect would do as well (it
+is none then), held-out runs that should show it and do not,
 or that are likelier without it and flown worse with the causes, a share of what all causes explain
 that their forms may be wrong by where the control loop oscillates, a change in flight that a single
 shock may have made.
@@ -189,7 +190,8 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         weak = unseen and of.nats < chosen.sure_evidence
         beside = any(_shows_beside(effect, of, standing_in))
         parts = of.is_gone_on_parts(chosen)
-        seen = (bool(of.coloured), bool(of.falls_at), of.may_be_none, of.is_denied)
+        none = of.may_be_none and not of.alternatives  # else one of these is in its place
+        seen = (bool(of.coloured), bool(of.falls_at), none, of.is_denied)
         torn = of.may_be_none and bool(of.beside_moved)
         return sum((*seen, of.within_form, of.may_be_shock(chosen), weak, parts, beside, torn))
 
@@ -198,6 +200,7 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         for effect, of in against.items()
         if of.at_limit
         or of.likelier_without
+        or of.nats < chosen.evidence  # in the model by what it flies (evidence.stays_without_a_name)
         or of.is_little_change(chosen)
         or of.is_weak_and_falls(chosen)
         or of.is_not_clear_and_denied(chosen)

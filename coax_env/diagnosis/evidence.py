@@ -34,6 +34,7 @@ import numpy as np
 from coax_env.diagnosis.fits import (
     converged,
     fitted,
+    is_much_coloured,
     noise_fitted,
     only,
     quadratic_at,
@@ -51,6 +52,8 @@ from coax_env.diagnosis.problem import (
 )
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, is_large, loss, threshold
+from coax_env.estimation.parted_engine import PartedEngine
+from coax_env.estimation.prediction import mean_log_ratio, pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import is_white, whiteness
 from coax_env.model.effects import CATALOGUE
@@ -460,7 +463,34 @@ def _better(
         again = converged(problem, replace(fit, noise=rest.noise))
         if again.objective < fit.objective - problem.settings.tie:
             return again
-    if evidence.nats >= enough:
-        return None
-    problem.report(f"dropped {weakest}: worth {evidence.nats:.1f} nats in the end")
-    return rest.noted(f"- {weakest}", max(evidence.nats, 0.0))
+    gone = [e for e, removal in removals.items() if removal.evidence.nats < enough]
+    for effect in sorted(gone, key=lambda e: removals[e].evidence.nats):
+        evidence, rest = removals[effect].evidence, removals[effect].rest
+        if not stays_without_a_name(problem, fit, removals[effect], enough):
+            problem.report(f"dropped {effect}: worth {evidence.nats:.1f} nats in the end")
+            return rest.noted(f"- {effect}", max(evidence.nats, 0.0))
+    return None
+
+
+def stays_without_a_name(problem: Problem, fit: Fit, removal: Removal, enough: float) -> bool:
+    """Whether a cause stays in the model though colour takes its evidence: it is worth enough without,
+    and the fitted runs are flown worse without the cause.
+
+    Where much is coloured, the noise stands for what the model lacks, and takes a cause up that leaves;
+    the next one has less evidence then. On a real helicopter (first CoaX, held out `circles`), noise
+    fitted a little further, a yaw damping of 33 nats had 13 left, a nat too few, and fell; so did a
+    swash offset and a blow-back of 61; 2 % of the error was removed, where 51 had been.
+
+    Args:
+        problem, fit: with the cause. removal: of the cause. enough: nats that it must be worth.
+    """
+    chosen, worth = problem.settings, removal.evidence
+    if not worth.nats < chosen.evidence <= enough <= worth.lost:
+        return False  # with more evidence it would have a name
+    if isinstance(problem.engine, PartedEngine) or not is_much_coloured(problem, fit):
+        return False
+    flown, without_it = (
+        pooled_rms(replay_runs(problem.engine, f.values, f.noise, chosen.horizon))
+        for f in (fit, removal.rest)
+    )
+    return mean_log_ratio(flown, without_it) < 0.0

@@ -54,17 +54,17 @@ MOST_ROTORED = 2
 additions; ours."""
 
 
-def search(problem: Problem, fit: Fit, gone: Collection[str] = ()) -> tuple[Fit, Quadratic]:
+def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
     """Add, drop and swap effects from a fitted model until nothing is gained.
 
     Args:
-        problem, fit: what may be free, and where. gone: effects that are not added again.
+        problem, fit: what may be free, and where.
 
     Returns:
         the fit, and the quadratic at it.
     """
     chosen = problem.settings
-    memory = _Memory(banned=set(gone), drops=Counter(dict.fromkeys(gone, 2)))
+    memory = _Memory()
     near = problem  # with the candidates that are linearised
     complete = False  # nothing is left to add
     just_fitted = False

@@ -392,3 +392,13 @@ def pooled_rms(runs: Iterable[RunReplay]) -> dict[str, float]:
                 gathered.setdefault(name, []).append(channel.error)
     joined = {name: np.concatenate(parts) for name, parts in gathered.items()}
     return {name: rms(e) for name, e in joined.items() if np.isfinite(e).any()}
+
+
+def mean_log_ratio(ours: Mapping[str, float], theirs: Mapping[str, float]) -> float:
+    """Mean over channels of the log of one's rms over another's; 0 where they have none in common.
+
+    Args:
+        ours, theirs: as of `pooled_rms`.
+    """
+    logs = [math.log(ours[c] / theirs[c]) for c in ours if theirs.get(c, 0.0) > 0.0 < ours[c]]
+    return float(np.mean(logs)) if logs else 0.0

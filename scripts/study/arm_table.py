@@ -12,33 +12,40 @@ from study.plan import OUTSIDE
 from study.table import cause_text, preamble
 
 Test = Callable[[Row], bool]
+Which = Callable[[Row, float], bool]
 ALL = "all arms"
 EFFECTS = ("one", "two", "three")
 
-FIGURES: dict[str, tuple[str, tuple[str, ...], bool, Test]] = {
+FIGURES: dict[str, tuple[str, tuple[str, ...], Which | None, Test]] = {
     "false_clean": (
-        "a name on a clean flight", ("clean",), False, lambda row: bool(judge.named(row))),
+        "a name on a clean flight", ("clean",), None, lambda row: bool(judge.named(row))),
     "false_clean_sure": (
-        "the same, sure", ("clean",), False, lambda row: bool(judge.surely_named(row))),
-    "exact_one": ("exact, one effect that should show", ("one",), True, judge.is_exact_row),
+        "the same, sure", ("clean",), None, lambda row: bool(judge.surely_named(row))),
+    "exact_one": (
+        "exact, one effect that should show", ("one",), judge.is_shown, judge.is_exact_row),
+    "exact_one_likelier": (
+        "exact, one effect that the likelihood shows", ("one",), judge.is_likelier,
+        judge.is_exact_row),
     "exact_one_strict": (
-        "the same, no ties counted", ("one",), True, lambda row: judge.is_strictly_exact(row)),
-    "exact_one_all": ("exact, one effect", ("one",), False, judge.is_exact_row),
+        "the same, no ties counted", ("one",), judge.is_shown,
+        lambda row: judge.is_strictly_exact(row)),
+    "exact_one_all": ("exact, one effect", ("one",), None, judge.is_exact_row),
     "exact_more": (
-        "exact, two or three effects that should show", ("two", "three"), True, judge.is_exact_row),
+        "exact, two or three effects that should show", ("two", "three"), judge.is_shown,
+        judge.is_exact_row),
     "false_beside": (
-        "anything false beside a true one", EFFECTS, False, lambda row: false_beside(row)),
+        "anything false beside a true one", EFFECTS, None, lambda row: false_beside(row)),
     "false_beside_sure": (
-        "the same, sure", EFFECTS, False,
+        "the same, sure", EFFECTS, None,
         lambda row: bool(judge.false_names(row["hidden"], judge.surely_named(row)))),
     "blamed": (
-        "a name for what is in no list", ("outside",), False, lambda row: bool(judge.named(row))),
-    "blamed_sure": ("the same, sure", ("outside",), False, lambda row: bool(judge.surely_named(row))),
+        "a name for what is in no list", ("outside",), None, lambda row: bool(judge.named(row))),
+    "blamed_sure": ("the same, sure", ("outside",), None, lambda row: bool(judge.surely_named(row))),
     "unexplained": (
-        "in no list: unexplained, right axis, nothing blamed", ("outside",), False,
+        "in no list: unexplained, right axis, nothing blamed", ("outside",), None,
         lambda row: judge.reports_unexplained(row, OUTSIDE[row["hidden"][0]])),
 }  # fmt: skip
-"""Figure -> words, kinds of flights, whether all effects must be expected to show, what is counted."""
+"""Figure -> words, kinds of flights, which of them (None: all), what is counted."""
 
 
 def false_beside(row: Row) -> bool:
@@ -60,10 +67,10 @@ def figures(rows: Sequence[Row]) -> dict[str, dict[str, list[int]]]:
 
 def _of_arm(rows: Sequence[Row]) -> dict[str, list[int]]:
     result = {}
-    for figure, (_, kinds, shown_only, test) in FIGURES.items():
+    for figure, (_, kinds, which, test) in FIGURES.items():
         part = [row for row in rows if row["plan"]["kind"] in kinds]
-        if shown_only:
-            part = [row for row in part if judge.is_shown(row, SETTINGS.evidence)]
+        if which:
+            part = [row for row in part if which(row, SETTINGS.evidence)]
         result[figure] = [sum(map(test, part)), len(part)]
     shown = [r for r in rows if r["hidden"] and judge.is_shown(r, SETTINGS.evidence)]
     inside = [good for row in shown for _, good in judge.intervals(row)]
@@ -103,6 +110,7 @@ NAMES = (
     "false_clean",
     "false_clean_sure",
     "exact_one",
+    "exact_one_likelier",
     "exact_one_strict",
     "exact_one_all",
     "exact_more",

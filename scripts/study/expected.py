@@ -71,7 +71,7 @@ def expected_evidence(
         planned: how it was flown. flight: its log. truth: of the generator, `hidden` and `values`.
         held: names of the runs that are not fitted.
     """
-    values = _by_names(catalogue_values(truth["values"]))
+    values = by_names(catalogue_values(truth["values"]))
     names = {e: CATALOGUE[e].named_as or e for e in truth["hidden"] if e in CATALOGUE}
     listed = list(names.values())
     result: dict[str, float | None] = dict.fromkeys(truth["hidden"])
@@ -93,7 +93,7 @@ def expected_evidence(
     return result | {effect: about.worth(name) for effect, name in names.items()}
 
 
-def _by_names(values: Mapping[str, float]) -> dict[str, float]:
+def by_names(values: Mapping[str, float]) -> dict[str, float]:
     """Values of effects that go by the name of another, as that one's.
 
     A deadband's plate jumps with the last digit of a command, so that two predictions with it are far

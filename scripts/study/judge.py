@@ -89,6 +89,12 @@ def is_shown(row: Row, threshold: float) -> bool:
     return all(e is not None and e >= 2.0 * threshold for e in expected)
 
 
+def is_likelier(row: Row, threshold: float) -> bool:
+    """Whether the truth is likelier by so much with every hidden effect than without it."""
+    found = [row.get("likelier", {}).get(effect) for effect in row["hidden"]]
+    return all(nats is not None and nats >= 2.0 * threshold for nats in found)
+
+
 def reports_unexplained(row: Row, channel: str, method: str = OWN) -> bool:
     """Whether no catalogue effect is named and the hidden one's channel is reported as unexplained.
 

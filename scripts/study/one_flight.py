@@ -31,6 +31,7 @@ from coax_env.model.vehicle_file import load_vehicle
 from study import baselines
 from study.expected import catalogue_values, expected_evidence
 from study.judge import OWN
+from study.likelier import likelier_than_nothing
 from study.plan import PlannedFlight, air_of, craft_of, size_on
 from study.store import code_hash
 
@@ -74,6 +75,7 @@ def _result(planned: PlannedFlight, folder: Path, only_own: bool) -> dict[str, A
         "values": truth["values"],
         "comparable": truth["comparable"],
         "expected": expected_evidence(planned, flight, truth, held),
+        "likelier": likelier_than_nothing(result.problem, result.refitted, truth),
         "methods": methods,
         "gain": findings["gain"],
         "strongest": {"evidence": evidence if math.isfinite(evidence) else None, "effect": effect},

@@ -8,7 +8,6 @@ part.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis import late_readings
@@ -18,7 +17,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
 from coax_env.estimation.helicopter_noise import LEAST_READING_STD
-from coax_env.estimation.prediction import pooled_rms, replay_runs
+from coax_env.estimation.prediction import mean_log_ratio, pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import are_white, whiteness
@@ -179,5 +178,4 @@ def flies_nearer(found: Searched, other: Searched) -> bool:
         pooled_rms(replay_runs(f.problem.engine, f.fit.values, f.fit.noise, horizon))
         for f in (found, other)
     )
-    logs = [np.log(ours[c] / theirs[c]) for c in ours if theirs.get(c, 0.0) > 0.0]
-    return bool(logs) and float(np.mean(logs)) < 0.0
+    return mean_log_ratio(ours, theirs) < 0.0
