@@ -165,7 +165,7 @@ def test_a_limited_rate_is_no_surer_than_a_servo_is_late(monkeypatch, lost, behi
     [
         ("command_delay", True, 79.0, ["servo_delay"]),  # a tenth of what it is worth
         ("command_delay", True, 81.0, []),
-        ("command_delay", False, 79.0, []),  # gyros show what the swash plate does
+        ("command_delay", False, 5.0, []),  # gyros show what the swash plate does
         ("servo_delay", True, 79.0, ["command_delay"]),
         ("servo_play", True, 79.0, []),
     ],

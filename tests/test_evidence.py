@@ -141,8 +141,7 @@ def test_where_much_is_coloured_what_flies_the_runs_nearer_stays_in_the_model(
     """Worth the threshold, of which colour leaves a third; a name it has none (doubts.py)."""
     errors = itertools.cycle([{"p": flown}, {"p": 1.0}])  # with it, without
     monkeypatch.setattr(evidence, "is_much_coloured", lambda problem, fit: coloured)
-    monkeypatch.setattr(evidence, "replay_runs", lambda *given: next(errors))
-    monkeypatch.setattr(evidence, "pooled_rms", lambda runs: runs)
+    monkeypatch.setattr(evidence, "flown_errors", lambda problem, fit: next(errors))
     flights = Flights({"motor_droop": worth * THRESHOLD, "gyro_bias": 5.0 * THRESHOLD})
     fit, found = flights.pruned(monkeypatch, GOOD, unseen={"unlike_gusts": True})
     assert ("motor_droop" in fit.active) == stays and "gyro_bias" in fit.active
@@ -167,20 +166,18 @@ def test_where_much_is_coloured_what_flies_the_runs_nearer_stays_in_the_model(
 def test_what_stays_is_worth_enough_but_for_colour(monkeypatch, lost, enough, parted, stays):
     asked = []
 
-    def replayed(engine: object, values: object, noise: object, horizon: float) -> dict[str, float]:
-        asked.append(values)
-        assert horizon == SETTINGS.horizon
-        return {"p": 1.0 if values == "without" else 0.9, "q": 1.0}
+    def flown(problem: object, fit: Fit) -> dict[str, float]:
+        asked.append(fit.active)
+        return {"p": 0.9 if fit.active else 1.0, "q": 1.0}
 
     monkeypatch.setattr(evidence, "is_much_coloured", lambda problem, fit: True)
-    monkeypatch.setattr(evidence, "replay_runs", replayed)
-    monkeypatch.setattr(evidence, "pooled_rms", lambda runs: runs)
+    monkeypatch.setattr(evidence, "flown_errors", flown)
     engine = PartedEngine.__new__(PartedEngine) if parted else None
     problem = SimpleNamespace(settings=SETTINGS, engine=engine)
-    removal = evidence.Removal(Evidence(lost, 3.0), Fit((), "without", GOOD))  # type: ignore[arg-type]
-    fit = Fit(("wind",), "with", GOOD)  # type: ignore[arg-type]
+    removal = evidence.Removal(Evidence(lost, 3.0), Fit((), {}, GOOD))
+    fit = Fit(("wind",), {}, GOOD)
     assert evidence.stays_without_a_name(problem, fit, removal, enough) == stays  # type: ignore[arg-type]
-    assert asked == (["with", "without"] if stays else [])
+    assert asked == ([("wind",), ()] if stays else [])
 
 
 def test_a_weaker_cause_that_stays_does_not_keep_another_that_falls(monkeypatch):
@@ -309,6 +306,12 @@ def test_what_is_worth_less_than_the_threshold_leaves_the_weakest_first(monkeypa
     assert {e: f.nats for e, f in found.items()} == pytest.approx(
         {"gyro_bias": CLEAR, "ground_effect": 1.1 * THRESHOLD}
     )
+
+
+def test_of_two_that_lack_less_than_a_tie_the_weaker_leaves_first(monkeypatch):
+    worth = {"swash_offset": 0.9 * THRESHOLD, "yaw_damping": 0.8 * THRESHOLD, "gyro_bias": CLEAR}
+    fit, _ = Flights(worth).pruned(monkeypatch, GOOD)
+    assert [move for move, _ in fit.history] == ["- yaw_damping", "- swash_offset"]
 
 
 def test_what_has_no_evidence_leaves_before_the_fit_is_refined(monkeypatch):

@@ -20,6 +20,7 @@ from coax_env.estimation.prediction import (
     ChannelReplay,
     RunReplay,
     gusts_of,
+    mean_log_ratio,
     pooled_rms,
     replay,
     replay_runs,
@@ -234,3 +235,17 @@ def test_a_replay_says_what_it_was_made_with():
     expected = math.hypot(G * 0.02 / 1.02, 0.01)
     assert table["vd"]["rms"] == pytest.approx(expected, rel=0.1)
     assert result.findings["gusts"] == gusts_of(result.noise)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "mean"),
+    [
+        ({"p": 2.0, "q": 1.0}, {"p": 1.0, "q": 1.0}, 0.5 * math.log(2.0)),
+        ({"p": 1.0}, {"p": 4.0, "q": 9.0}, -2.0 * math.log(2.0)),  # q is one's alone
+        ({"p": 0.0, "q": 3.0}, {"p": 1.0, "q": 1.0}, math.log(3.0)),  # of no error no ratio
+        ({"p": 2.0}, {"p": 0.0}, 0.0),
+        ({"p": 2.0}, {"q": 2.0}, 0.0),
+    ],
+)
+def test_errors_of_all_channels_are_compared_by_their_ratios(ours, theirs, mean):
+    assert mean_log_ratio(ours, theirs) == pytest.approx(mean, abs=1e-12)

@@ -76,12 +76,24 @@ def test_readings_much_finer_than_a_rigid_body_are_made_coarser():
 def test_errors_are_compared_by_their_geometric_mean(monkeypatch, ours, better):
     """Half of one error and twice another is no better; channels that the other lacks do not count."""
     theirs = {"h": 1.0, "q": 1.0, "ax": 0.0}
-    stand_in(monkeypatch, "replay_runs", lambda engine, values, noise, horizon: values["rms"])
-    stand_in(monkeypatch, "pooled_rms", lambda rms: rms)
+    stand_in(monkeypatch, "flown_errors", lambda problem, fit: fit.values["rms"])
     problem: Any = SimpleNamespace(settings=SETTINGS, engine=None)
     fits: Any = [Fit((), {"rms": rms}, Noise({})) for rms in (ours, theirs)]  # type: ignore
     found, other = (Searched(problem, f, f, f, None) for f in fits)  # type: ignore[arg-type]
     assert once.flies_nearer(found, other) == better
+
+
+def test_runs_are_flown_over_the_settings_horizon_by_the_fits_numbers_and_noise(monkeypatch):
+    asked = []
+    run = SimpleNamespace(
+        diverged=False, channels={"h": SimpleNamespace(error=np.array([3.0, -4.0]))}
+    )
+    monkeypatch.setattr(fits, "replay_runs", lambda *given: asked.append(given) or [run])
+    settings = replace(SETTINGS, horizon=0.7)
+    problem: Any = SimpleNamespace(settings=settings, engine="engine")
+    fit = Fit((), {"mass": 0.4}, Noise({"force": 1.0}))
+    assert fits.flown_errors(problem, fit) == {"h": pytest.approx(np.sqrt(12.5))}
+    assert asked == [("engine", fit.values, fit.noise, 0.7)]
 
 
 FINE = Noise({}, {"phi": 0.001})

@@ -71,13 +71,13 @@ def alike_by_poses_alone(problem: Problem, effect: str) -> list[str]:
 
 
 def twins_of(problem: Problem, effect: str) -> set[str]:
-    """What is always tried in a cause's place, however far it is.
+    """What is always tried in a cause's place where it is not in the model, however far it is.
 
     By poses alone a command that answers a gust before these show it makes rotors late, too: where the
     swash plate alone was, a late command was 38 nats likelier than that, of 800 (**synthetic**).
     """
     late = PURE_DELAYS if effect in PURE_DELAYS and problem.sees_poses_alone else frozenset()
-    return exclusive_with(effect) | (late - {effect})
+    return exclusive_with(effect) | late
 
 
 def alike_unturned(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> list[str]:

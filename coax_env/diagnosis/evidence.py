@@ -34,6 +34,7 @@ import numpy as np
 from coax_env.diagnosis.fits import (
     converged,
     fitted,
+    flown_errors,
     is_much_coloured,
     noise_fitted,
     only,
@@ -53,7 +54,7 @@ from coax_env.diagnosis.problem import (
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, is_large, loss, threshold
 from coax_env.estimation.parted_engine import PartedEngine
-from coax_env.estimation.prediction import mean_log_ratio, pooled_rms, replay_runs
+from coax_env.estimation.prediction import mean_log_ratio
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.whiteness import is_white, whiteness
 from coax_env.model.effects import CATALOGUE
@@ -489,8 +490,5 @@ def stays_without_a_name(problem: Problem, fit: Fit, removal: Removal, enough: f
         return False  # with more evidence it would have a name
     if isinstance(problem.engine, PartedEngine) or not is_much_coloured(problem, fit):
         return False
-    flown, without_it = (
-        pooled_rms(replay_runs(problem.engine, f.values, f.noise, chosen.horizon))
-        for f in (fit, removal.rest)
-    )
+    flown, without_it = (flown_errors(problem, f) for f in (fit, removal.rest))
     return mean_log_ratio(flown, without_it) < 0.0

@@ -18,6 +18,7 @@ from coax_env.estimation.helicopter_noise import (
 )
 from coax_env.estimation.noise_levels import fit_noise, level_slopes
 from coax_env.estimation.parted_engine import AT, PartedEngine, joint_noise, of_part
+from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
@@ -351,3 +352,9 @@ def noise_may_hide(problem: Problem, fit: Fit) -> bool:
     so made errors of 1 s larger, 39 % removed for 62 %.
     """
     return problem.has_slow_rows and not is_much_coloured(problem, fit)
+
+
+def flown_errors(problem: Problem, fit: Fit) -> dict[str, float]:
+    """RMS by channel of the open-loop errors on the fitted runs, over the settings' horizon."""
+    runs = replay_runs(problem.engine, fit.values, fit.noise, problem.settings.horizon)
+    return pooled_rms(runs)

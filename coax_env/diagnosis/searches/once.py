@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis import late_readings
-from coax_env.diagnosis.fits import fitted, noise_fitted, start, steadied
+from coax_env.diagnosis.fits import fitted, flown_errors, noise_fitted, start, steadied
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import cost
 from coax_env.diagnosis.search import search
 from coax_env.estimation.helicopter_noise import LEAST_READING_STD
-from coax_env.estimation.prediction import mean_log_ratio, pooled_rms, replay_runs
+from coax_env.estimation.prediction import mean_log_ratio
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import Noise
 from coax_env.estimation.whiteness import are_white, whiteness
@@ -173,9 +173,5 @@ def flies_nearer(found: Searched, other: Searched) -> bool:
     Args:
         found, other: each with commands and readings as it takes them to be.
     """
-    horizon = found.problem.settings.horizon
-    ours, theirs = (
-        pooled_rms(replay_runs(f.problem.engine, f.fit.values, f.fit.noise, horizon))
-        for f in (found, other)
-    )
+    ours, theirs = (flown_errors(f.problem, f.fit) for f in (found, other))
     return mean_log_ratio(ours, theirs) < 0.0
