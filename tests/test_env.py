@@ -19,10 +19,11 @@ from coax_env.env import hover
 from coax_env.env.actions import action_map, nominal_for
 from coax_env.env.period import DT
 from coax_env.env.spaces import action_table, observation_table, observed
-from coax_env.env.threads import in_threads
+from coax_env.env.threads import GROUP, MOST_MORE, Balance, in_threads
 from coax_env.env.vector_env import CoaxVectorEnv
 from coax_env.errors import InputError
 from coax_env.kernel.random_streams import stream_key, two_normals, uniform
+from coax_env.kernel.simd_types import SIMD_WIDTH
 from coax_env.model.dynamics import WORK_SIZE, kernel_input, step
 from coax_env.model.sampling import is_new
 from coax_env.model.sensors import SUITES, log_suite
@@ -217,6 +218,43 @@ def test_calls_of_two_threads_share_workers_and_wait_for_their_own():
 
     with ThreadPoolExecutor(4) as callers:
         assert list(callers.map(call, range(4))) == [[]] * 4
+
+
+@pytest.mark.parametrize("count", [600, 4096, 5001])
+@pytest.mark.parametrize("threads", [2, 3, 7])
+@pytest.mark.parametrize("more", [0.0, 0.06, MOST_MORE])
+def test_shares_hold_every_row_once_and_the_callers_is_the_larger(count, threads, more):
+    balance = Balance()
+    balance.more = more
+    edges = balance.edges(count, threads)
+    assert len(edges) == threads + 1 and edges[0] == 0 and edges[-1] == count
+    sizes = np.diff(edges)
+    assert min(sizes) > 0
+    assert edges[1] % GROUP == 0 and abs(edges[1] - (1.0 / threads + more) * count) <= GROUP / 2
+    assert max(sizes[1:]) - min(sizes[1:]) <= 1
+
+
+def test_a_group_is_what_flies_side_by_side():
+    assert GROUP == SIMD_WIDTH
+
+
+@pytest.mark.parametrize("larger", [True, False])
+def test_the_callers_share_grows_where_it_waits_and_falls_back_to_an_equal_one(larger):
+    """The other thread takes 2 ms and the caller none, or the caller does and the other none."""
+    balance = Balance()
+    balance.more = 0.0 if larger else MOST_MORE
+
+    def share(first: int, last: int) -> None:
+        time.sleep(0.002 if (first == 0) != larger else 0.0)
+
+    for _ in range(3):
+        in_threads(share, 800, 2, balance)
+    assert 0.0 <= balance.more <= MOST_MORE
+    assert (balance.more > 0.0) if larger else (balance.more < MOST_MORE)
+    for waited, bound in ((True, MOST_MORE), (False, 0.0)):
+        for _ in range(1000):
+            balance.learn(waited)
+        assert balance.more == bound
 
 
 @pytest.mark.parametrize("count", [3, 16])  # one by one; side by side

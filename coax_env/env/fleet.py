@@ -24,7 +24,7 @@ from coax_env.env.air_check import warn_where_wind_cannot_act
 from coax_env.env.arrays import Helicopters, Makeup, Mission, Outcome, World
 from coax_env.env.period import DELAYS, delay_slots
 from coax_env.env.randomisation import Draws, Randomize, Wind
-from coax_env.env.threads import in_threads
+from coax_env.env.threads import Balance, in_threads
 from coax_env.env.turbulence import N_FILTERS, wind_at_6m
 from coax_env.errors import InputError
 from coax_env.kernel.compilation import looked_up_once
@@ -129,6 +129,7 @@ class Fleet:
         self.makeup = self._what_flies(used)
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         self._threads = max(1, min(threads or most or 1, count // ROWS_PER_THREAD))
+        self._balance = Balance()
         fewest = SIMD_VARIANT_FROM if any(self.makeup) else SIMD_FROM
         self._side_by_side = count >= fewest and _fit_for_simd(used)
 
@@ -323,7 +324,7 @@ class Fleet:
             if anew is not None:
                 self._start(first, last, anew, False, outcome.observations)
 
-        in_threads(rows, n, self._threads)
+        in_threads(rows, n, self._threads, self._balance)
         return outcome
 
     @property
