@@ -8,10 +8,10 @@ delay, a centre of gravity and an accelerometer's bias did on four clean **synth
 to 29 nats, and by poses alone a swash offset for 33. Nor has what the held-out runs should show and
 deny, if it is not clear on the fitted ones. Two of these take a name, too: noise left where it
 shows, little evidence there or by poses alone, other noise, parts of the flights, such a one beside it,
-numbers of which none is known to be another than nothing, but where another effect would do as well (it
-is none then), held-out runs that should show it and do not,
-or that are likelier without it and flown worse with the causes, a share of what all causes explain
-that their forms may be wrong by where the control loop oscillates, a change in flight that a single
+numbers of which none is known to be another than nothing, but where another effect would do as well
+(it is none then), held-out runs that should show it and do not, or that are likelier without it and
+flown worse with the causes, a share of what all causes explain that their forms may be wrong by where
+the control loop oscillates, a change in flight that a single
 shock may have made.
 """
 
