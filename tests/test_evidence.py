@@ -153,12 +153,7 @@ def test_where_much_is_coloured_what_flies_the_runs_nearer_stays_in_the_model(
     ("lost", "enough", "parted", "stays"),
     [
         (30.0, THRESHOLD, False, True),
-        (
-            60.0,
-            30.0,
-            False,
-            False,
-        ),  # 20 nats are a name's, but for the form of what is strong beside it
+        (60.0, 30.0, False, False),  # 20 nats are a name's, but for another's form
         (20.0, 30.0, False, False),
         (30.0, THRESHOLD, True, False),  # two flights at once: nothing is flown
     ],

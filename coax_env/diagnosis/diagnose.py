@@ -271,7 +271,7 @@ def diagnose(
         whiteness=white,
         evidence_history=list(fit.history),
         strongest=fit.strongest,
-        problem=first.problem,
+        problem=first.problem.with_records(first.problem.engine.records),  # no pass is kept
         refitted=refitted,
         remarks=(
             *flight.notes,

@@ -458,18 +458,19 @@ def _better(
     """
     if not removals:
         return None
-    weakest = min(removals, key=lambda e: removals[e].evidence.nats)
-    evidence, rest = removals[weakest].evidence, removals[weakest].rest
-    if evidence.lost < -problem.settings.tie:
-        again = converged(problem, replace(fit, noise=rest.noise))
+    weakest_first = sorted(removals.items(), key=lambda item: item[1].evidence.nats)
+    _, weakest = weakest_first[0]
+    if weakest.evidence.lost < -problem.settings.tie:
+        again = converged(problem, replace(fit, noise=weakest.rest.noise))
         if again.objective < fit.objective - problem.settings.tie:
             return again
-    gone = [e for e, removal in removals.items() if removal.evidence.nats < enough]
-    for effect in sorted(gone, key=lambda e: removals[e].evidence.nats):
-        evidence, rest = removals[effect].evidence, removals[effect].rest
-        if not stays_without_a_name(problem, fit, removals[effect], enough):
-            problem.report(f"dropped {effect}: worth {evidence.nats:.1f} nats in the end")
-            return rest.noted(f"- {effect}", max(evidence.nats, 0.0))
+    for effect, removal in weakest_first:
+        nats = removal.evidence.nats
+        if nats >= enough:
+            break
+        if not stays_without_a_name(problem, fit, removal, enough):
+            problem.report(f"dropped {effect}: worth {nats:.1f} nats in the end")
+            return removal.rest.noted(f"- {effect}", max(nats, 0.0))
     return None
 
 

@@ -71,8 +71,7 @@ def expected_evidence(
         planned: how it was flown. flight: its log. truth: of the generator, `hidden` and `values`.
         held: names of the runs that are not fitted.
     """
-    values = by_names(catalogue_values(truth["values"]))
-    names = {e: CATALOGUE[e].named_as or e for e in truth["hidden"] if e in CATALOGUE}
+    names, values = as_listed(truth)
     listed = list(names.values())
     result: dict[str, float | None] = dict.fromkeys(truth["hidden"])
     if not listed:
@@ -93,7 +92,17 @@ def expected_evidence(
     return result | {effect: about.worth(name) for effect, name in names.items()}
 
 
-def by_names(values: Mapping[str, float]) -> dict[str, float]:
+def as_listed(truth: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, float]]:
+    """Hidden effects that the catalogue has, and the names by which they go there; their values there.
+
+    Args:
+        truth: of the generator, `hidden` and `values`.
+    """
+    names = {e: CATALOGUE[e].named_as or e for e in truth["hidden"] if e in CATALOGUE}
+    return names, _by_names(catalogue_values(truth["values"]))
+
+
+def _by_names(values: Mapping[str, float]) -> dict[str, float]:
     """Values of effects that go by the name of another, as that one's.
 
     A deadband's plate jumps with the last digit of a command, so that two predictions with it are far

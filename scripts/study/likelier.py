@@ -24,8 +24,7 @@ from coax_env.diagnosis.fits import (
     without,
 )
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.model.effects import CATALOGUE
-from study.expected import by_names, catalogue_values
+from study.expected import as_listed
 
 TURNS = 3
 """Of numbers and noise by turns, from true sizes in noise that was fitted without them; ours."""
@@ -41,8 +40,7 @@ def likelier_than_nothing(
         truth: of the generator, `hidden` and `values`.
     """
     assert problem is not None and nothing is not None, "not a diagnosis of its own"
-    values = by_names(catalogue_values(truth["values"]))
-    names = {e: CATALOGUE[e].named_as or e for e in truth["hidden"] if e in CATALOGUE}
+    names, values = as_listed(truth)
     there = [name for name in names.values() if name in problem.candidates]
     result: dict[str, float | None] = dict.fromkeys(truth["hidden"])
     if not there:
