@@ -401,7 +401,7 @@ def named(monkeypatch: pytest.MonkeyPatch, tables: Tables, *active: str) -> tupl
     nothing = SimpleNamespace()
     monkeypatch.setattr(evidence, "with_command_gains", gained)
     monkeypatch.setattr(evidence, "has_command_gains", lambda problem: problem.gains)
-    monkeypatch.setattr(evidence, "_is_white", lambda problem, fit: problem.white)
+    monkeypatch.setattr(evidence, "is_all_white", lambda problem, fit: problem.white)
     monkeypatch.setattr(evidence, "_feels_gusts", lambda problem: problem.feels)
     monkeypatch.setattr(evidence, "_unlike_gusts", lambda problem, fit: False)
     monkeypatch.setattr(evidence, "converged", lambda problem, fit: fit)

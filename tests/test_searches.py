@@ -124,7 +124,7 @@ def test_readings_are_believed_less_where_that_flies_better(monkeypatch, white, 
     stand_in(monkeypatch, "with_swings", lambda problem, fit: None)
     stand_in(monkeypatch, "is_coloured", lambda found, channels: False)
     stand_in(monkeypatch, "in_shocks", lambda problem, fit: False)
-    stand_in(monkeypatch, "is_white", lambda passes, channels: white)
+    stand_in(monkeypatch, "is_all_white", lambda problem, fit: white)
     stand_in(monkeypatch, "flies_nearer", lambda *found: answers.pop(0))
     engine = SimpleNamespace(filter=lambda values, noise: [])
     problem = SimpleNamespace(
@@ -149,7 +149,7 @@ def test_readings_that_are_coarse_enough_are_held_as_they_were_fitted(monkeypatc
     stand_in(monkeypatch, "searched_once", one)
     stand_in(monkeypatch, "in_shocks", lambda problem, fit: False)
     stand_in(monkeypatch, "with_swings", lambda problem, fit: None)
-    stand_in(monkeypatch, "is_white", lambda passes, channels: False)
+    stand_in(monkeypatch, "is_all_white", lambda problem, fit: False)
     stand_in(monkeypatch, "flies_nearer", lambda *found: False)
     problem: Any = SimpleNamespace(
         engine=SimpleNamespace(filter=lambda values, noise: []), report=lambda text: None,
@@ -391,7 +391,7 @@ def test_what_changed_once_is_no_error_that_lasts(monkeypatch, onsets, white, wo
     fit = Fit((), {}, FINE)
     state = SimpleNamespace(problem=problem, fit=fit, onsets=onsets)
     stand_in(monkeypatch, "with_onsets", lambda *given: state)
-    stand_in(monkeypatch, "is_white", lambda passes, channels: white)
+    stand_in(monkeypatch, "is_all_white", lambda problem, fit: white)
     first = Searched(problem, fit, fit, fit, None)  # type: ignore[arg-type]
     stand_in(monkeypatch, "most_by_change", lambda *found: worth)
     changed = readings._white_since(first, {}, 100.0)
@@ -413,7 +413,7 @@ def test_gusts_with_a_frequency_are_searched_beside_from_their_own_levels(monkey
         SimpleNamespace(report=lambda text: None, engine=engine, model=model, smoothed=False)
         for _ in range(2)
     )
-    stand_in(monkeypatch, "is_white", lambda passes, channels: white)
+    stand_in(monkeypatch, "is_all_white", lambda problem, fit: white)
     stand_in(monkeypatch, "searched_once", one)
     believes_its_sensors(monkeypatch)
     stand_in(monkeypatch, "low_passes", lambda problem, fit, noise: {})
@@ -446,7 +446,7 @@ def test_a_swing_that_what_was_found_had_hidden_is_searched_beside_where_that_is
     stand_in(monkeypatch, "with_other_swings", lambda p, fit: (other, {"force_xy": 0.9}))
     stand_in(monkeypatch, "searched_once", of)
     stand_in(monkeypatch, "cost", lambda problem, fit, quadratic: worth[problem.name])
-    stand_in(monkeypatch, "is_white", lambda passes, channels: True)
+    stand_in(monkeypatch, "is_all_white", lambda problem, fit: True)
     noise = Noise({"force_xy": 0.2})
     found = unrest._in_swings(of(fading, noise), noise)
     assert found is not None and found.problem is (other if used else swinging)
@@ -481,7 +481,7 @@ def test_swings_are_asked_before_shocks_and_stand_where_none_are_left_or_they_ar
     believes_its_sensors(monkeypatch)
     stand_in(monkeypatch, "in_shocks", lambda problem, fit: problem.name == "fading" or left)
     stand_in(monkeypatch, "_in_swings", lambda best, noise: of("swings", found["swinging"]))
-    stand_in(monkeypatch, "_all_white", lambda problem, fit: white)
+    stand_in(monkeypatch, "is_all_white", lambda problem, fit: white)
     stand_in(monkeypatch, "_are_swings", lambda swung, shaken: likelier)
     stand_in(monkeypatch, "_changed", lambda best, clock: None)
     stand_in(monkeypatch, "_searched_in_shocks", lambda best, noise: of("shocks", found["shaken"]))
@@ -540,7 +540,7 @@ def test_jitter_is_asked_first_where_rotor_speeds_show_it_and_gusts_beside_it(
 ):
     asked: list[str] = []
     engine, model = SimpleNamespace(filter=lambda values, noise: []), SimpleNamespace(channels=())
-    stand_in(monkeypatch, "is_white", lambda passes, channels: True)
+    stand_in(monkeypatch, "is_all_white", lambda problem, fit: True)
     plain, jittery, swinging = (
         SimpleNamespace(
             name=name, report=lambda text: None, engine=engine, model=model, smoothed=False
@@ -895,7 +895,7 @@ def test_strengths_of_gusts_are_fitted_beside_what_stood_them(
 
     stand_in(monkeypatch, "with_shocks", shaken)
     stand_in(monkeypatch, "searched_once", search)
-    stand_in(monkeypatch, "is_white", lambda passes, channels: white)
+    stand_in(monkeypatch, "is_all_white", lambda problem, fit: white)
     first: Any = SimpleNamespace(
         problem=problem_of("steady"), fit=Fit(("wind",), {}, FINE), refitted=Fit((), {}, FINE)
     )

@@ -35,6 +35,7 @@ from coax_env.diagnosis.fits import (
     converged,
     fitted,
     flown_errors,
+    is_all_white,
     is_much_coloured,
     noise_fitted,
     only,
@@ -56,7 +57,7 @@ from coax_env.diagnosis.scores import inflation, is_large, loss, threshold
 from coax_env.estimation.parted_engine import PartedEngine
 from coax_env.estimation.prediction import mean_log_ratio
 from coax_env.estimation.quadratic import Quadratic
-from coax_env.estimation.whiteness import is_white, whiteness
+from coax_env.estimation.whiteness import whiteness
 from coax_env.model.effects import CATALOGUE
 from coax_env.model.layout import ACCELEROMETERS
 
@@ -295,7 +296,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
     while True:
         wider, trial = with_command_gains(problem, fit, coloured=True)
         # colour, and gusts that no reading feels in time, spoil them for a model, not to ask with
-        stated = has_command_gains(wider) and _feels_gusts(problem) and _is_white(problem, fit)
+        stated = has_command_gains(wider) and _feels_gusts(problem) and is_all_white(problem, fit)
         joint, alone = (wider, trial), (problem, fit)
         (first, start), (second, again) = (joint, alone) if stated else (alone, joint)
         pruned, quadratic, evidence = prune(first, start)
@@ -410,11 +411,6 @@ def _unlike_gusts(problem: Problem, fit: Fit) -> bool:
 def _feels_gusts(problem: Problem) -> bool:
     """Whether gyros or accelerometers are aboard, and read before a command answers what they feel."""
     return not problem.has_slow_rows and not problem.sees_poses_alone
-
-
-def _is_white(problem: Problem, fit: Fit) -> bool:
-    """Whether the readings' innovations are."""
-    return is_white(problem.engine.filter(fit.values, fit.noise), problem.model.channels)
 
 
 def as_named(problem: Problem, fit: Fit, other: Fit) -> Fit:

@@ -22,7 +22,7 @@ from coax_env.estimation.prediction import pooled_rms, replay_runs
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
-from coax_env.estimation.whiteness import colour, whiteness
+from coax_env.estimation.whiteness import colour, is_white, whiteness
 from coax_env.model.effect_registry import GUST_MEMORY
 
 BRIEF = 0.1
@@ -342,6 +342,11 @@ def is_much_coloured(problem: Problem, fit: Fit) -> bool:
     """Whether more than MUCH of the innovations is foretold by their own past."""
     passes = problem.engine.filter(fit.values, fit.noise)
     return colour(whiteness(passes, problem.model.channels).values()) > MUCH
+
+
+def is_all_white(problem: Problem, fit: Fit) -> bool:
+    """Whether no channel's innovations are coloured."""
+    return is_white(problem.engine.filter(fit.values, fit.noise), problem.model.channels)
 
 
 def noise_may_hide(problem: Problem, fit: Fit) -> bool:

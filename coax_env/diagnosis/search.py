@@ -47,7 +47,7 @@ from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 from coax_env.model.layout import ROTOR_SPEEDS
 
-WEAK = 3.0
+UNDECIDED = 3.0
 """Thresholds below which the best score does not decide yet: noise may hide a better cause; ours."""
 MOST_ROTORED = 2
 """Sets of effects beside which one search tries rotors that follow late: each takes as long as some
@@ -212,7 +212,7 @@ def _forward(
     if memory.failures >= problem.settings.most_failures:
         return None
     moved = None
-    if strong and strong[0].nats < WEAK * threshold(problem, quadratic, fit.active):
+    if strong and strong[0].nats < UNDECIDED * threshold(problem, quadratic, fit.active):
         moved = _with_noise_anew(problem, fit, quadratic, candidates, memory)
     if moved is None:
         moved = add(problem, fit, passes, quadratic, strong)

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from coax_env.diagnosis import late_imu
 from coax_env.diagnosis.clock_errors import with_clock_errors
+from coax_env.diagnosis.fits import is_all_white
 from coax_env.diagnosis.late_readings import moved_as_in
 from coax_env.diagnosis.onsets.search import most_by_change, with_onsets
 from coax_env.diagnosis.problem import Problem
@@ -23,7 +24,6 @@ from coax_env.diagnosis.sensor_low_pass import GROUPS, LIKE, hidden_behind, low_
 from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.low_pass import LowPass, before_low_pass
 from coax_env.estimation.state_space import Noise, Record
-from coax_env.estimation.whiteness import is_white
 from coax_env.model.layout import INERTIAL
 from coax_env.plain_words import and_list
 
@@ -171,8 +171,7 @@ def _white_since(found: Searched, clock: Mapping[str, Lap], gained: float) -> Se
     if most_by_change(found.problem, found.fit, found.quadratic) < NEAR * gained:
         return None
     state = with_onsets(found.problem, found.fit, found.quadratic, found.refitted, clock)
-    passes = state.problem.engine.filter(state.fit.values, state.fit.noise)
-    if not state.onsets or not is_white(passes, state.problem.model.channels):
+    if not state.onsets or not is_all_white(state.problem, state.fit):
         return None
     return replace(found, changing=state)
 

@@ -24,10 +24,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from coax_env.diagnosis.doubts import has_limit, sizes
-from coax_env.diagnosis.fits import is_much_coloured
+from coax_env.diagnosis.fits import is_all_white, is_much_coloured
 from coax_env.diagnosis.joint_gusts import in_joint_gusts
 from coax_env.diagnosis.onsets.search import with_onsets
-from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.run_air import with_own_air
 from coax_env.diagnosis.searches.once import Searched, flies_nearer, likelier, searched_once
 from coax_env.diagnosis.searches.rotors import jittery_if_asked
@@ -37,7 +36,6 @@ from coax_env.estimation.changing_model import Lap
 from coax_env.estimation.gust_strength import prior_cost
 from coax_env.estimation.helicopter_noise import LEAST_READING_STD
 from coax_env.estimation.state_space import Noise
-from coax_env.estimation.whiteness import is_white
 
 COARSENESS = (1.0, 3.0)
 """Times LEAST_READING_STD that readings are believed to at most, one search after the other; ours."""
@@ -69,7 +67,7 @@ def in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bo
     while best is not asked:
         asked = best
         swung = None if shaken else _in_swings(best, noise)
-        if swung is not None and _all_white(swung.problem, swung.fit):
+        if swung is not None and is_all_white(swung.problem, swung.fit):
             return swung
         best, noise = jittery_if_asked(best, noise)
     best = _with_joint_gusts(best, noise)
@@ -77,7 +75,7 @@ def in_unrest(best: Searched, noise: Noise, clock: Mapping[str, Lap], erring: bo
         return best
     problem = best.problem
     coarser = _coarser(best.fit.noise)
-    if not coarser or _all_white(problem, best.fit):
+    if not coarser or is_all_white(problem, best.fit):
         return best
     reading = best.fit.noise.reading
     as_fitted = {c: reading[c] for c in LEAST_READING_STD if c in reading}  # they are held, too
@@ -125,15 +123,10 @@ def _in_swings(found: Searched, noise: Noise) -> Searched | None:
     return other
 
 
-def _all_white(problem: Problem, fit: Fit) -> bool:
-    """Whether nothing is coloured."""
-    return is_white(problem.engine.filter(fit.values, fit.noise), problem.model.channels)
-
-
 def _leave_nothing(swung: Searched) -> bool:
     """Whether gusts that swing leave nothing coloured, and no shocks."""
     problem, fit = swung.problem, swung.fit
-    return _all_white(problem, fit) and not in_shocks(problem, fit)
+    return is_all_white(problem, fit) and not in_shocks(problem, fit)
 
 
 def _are_swings(swung: Searched, shaken: Searched) -> bool:
@@ -182,7 +175,7 @@ def _searched_in_shocks(first: Searched, noise: Noise) -> Searched:
     """
     problem = first.problem
     beside, with_causes = with_shocks(problem, first.fit)
-    if not _all_white(beside, with_causes):
+    if not is_all_white(beside, with_causes):
         return first
     problem.report("gusts come in single shocks: searching again with a strength for each")
     shaken, _ = with_shocks(problem, first.refitted)
