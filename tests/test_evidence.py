@@ -75,6 +75,7 @@ class Flights:
         noise: Noise,
         row: float = 0.01,
         unseen: Mapping[str, bool] = MappingProxyType({}),
+        beyond: float = 0.0,
     ) -> tuple[Fit, dict[str, evidence.Evidence]]:
         def loss(problem, quadratic, active, effect, inflation):
             return self.worth[effect] / inflation
@@ -87,6 +88,7 @@ class Flights:
             "quadratic_at": lambda problem, fit: (fit, None),
             "inflation": lambda problem, quadratic, active, effect: 1.0,
             "threshold": lambda problem, quadratic, active: THRESHOLD,
+            "beyond_even_spread": lambda problem, fit, rest: beyond,
         }  # fmt: skip
         for name, stand_in in stand_ins.items():
             monkeypatch.setattr(evidence, name, stand_in)
@@ -124,6 +126,34 @@ def test_a_weak_or_late_answer_to_what_the_filter_does_not_see_must_be_worth_mor
     assert set(fit.active) == set(found) == stay
     assert found["gyro_bias"].nats == pytest.approx(2.9 * THRESHOLD)
     assert found["rate_damping"].nats == pytest.approx(3.1 * THRESHOLD / (3.0 if unseen else 1.0))
+
+
+SPREAD = SETTINGS.beyond_even_spread
+
+
+@pytest.mark.parametrize(
+    ("seen", "beyond", "times"),
+    [
+        ({}, SPREAD, 1.0),
+        ({}, SPREAD - 0.1, 3.0),
+        ({"unlike_gusts": True}, SPREAD, 1.0),
+        ({"low_passes": {"p": LowPass(0.01)}}, 10.0 * SPREAD, 3.0),  # every answer is late there
+        ({"between_commands": 0.1}, 10.0 * SPREAD, 3.0),
+    ],
+)
+def test_what_gains_its_nats_where_it_shows_is_worth_them(monkeypatch, seen, beyond, times):
+    """Its number is as unsure as before: what answers unseen gusts may have moved it."""
+    flights = Flights({"motor_droop": 1.1 * THRESHOLD, "rate_damping": 3.1 * THRESHOLD})
+    fit, found = flights.pruned(monkeypatch, GOOD, 0.04, seen, beyond)
+    assert ("motor_droop" in fit.active) == (times == 1.0)
+    assert found["rate_damping"].nats == pytest.approx(3.1 * THRESHOLD / times)
+    assert found["rate_damping"].inflation == pytest.approx(3.0)
+
+
+def test_a_late_command_may_be_a_late_swash_plate_beside_such_answers(monkeypatch):
+    flights = Flights({"command_delay": 2.9 * THRESHOLD, "servo_delay": 2.9 * THRESHOLD})
+    fit, _ = flights.pruned(monkeypatch, GOOD, 0.04, beyond=10.0 * SPREAD)
+    assert fit.active == ("servo_delay",)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, norm
 
-from coax_env.diagnosis import moves, replication, unlisted
+from coax_env.diagnosis import moves, replication, trust, unlisted
 from coax_env.diagnosis.doubts import (
     Against,
     doubts,
@@ -27,6 +27,7 @@ from coax_env.diagnosis.doubts import (
     weak,
     without_name,
 )
+from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.hold_out import fair_part
 from coax_env.diagnosis.moves import Proposal, accepted
 from coax_env.diagnosis.problem import Fit, Problem
@@ -43,6 +44,7 @@ from coax_env.diagnosis.trust import (
     taken_back,
 )
 from coax_env.diagnosis.unseen import Unseen
+from coax_env.diagnosis.where_shown import SizeWhereMost
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
@@ -342,6 +344,35 @@ def test_what_shows_where_another_stands_at_its_limit_is_doubted(size, channels,
     found = list(doubts("servo_delay", against, SETTINGS))
     assert bool(found) == doubted and all("gyro bias" in text for text in found)
     assert not any("beside it" in text for text in doubts("gyro_bias", against, SETTINGS))
+
+
+@pytest.mark.parametrize(("size", "doubted"), [(1.6, True), (0.2, True), (1.1, False)])
+def test_what_has_another_size_where_it_shows_most_is_doubted(size, doubted):
+    """A limited rate was a servo's lag of 76 nats, sure, 1.6 times as long after large steps."""
+    there = SizeWhereMost(0.016, size, 0.05)
+    found = list(doubts("servo_lag", {"servo_lag": known_of(where_most=there)}, SETTINGS))
+    assert bool(found) == doubted
+    assert not found or f"in 1.6 % of the time, it has {size:.1f} times its size" in found[0]
+
+
+def test_a_causes_size_is_asked_beside_the_fit_without_it(monkeypatch):
+    asked = []
+
+    def size_where_most(problem, fit, rest, inflation):
+        asked.append((rest, inflation))
+        return SizeWhereMost(0.1, 2.0, 0.01)
+
+    monkeypatch.setattr(trust, "size_where_most", size_where_most)
+    problem, rng = problem_of(8), np.random.default_rng(1)
+    fit, _, worth = fitted_to(problem, *drawn(rng, [1.0] * 8, [1.0] * 8), EFFECTS[:2])
+    rest = replace(fit, active=EFFECTS[1:2])
+    evidence = {
+        EFFECTS[0]: Evidence(worth[EFFECTS[0]], 4.0, rest=rest),
+        EFFECTS[1]: Evidence(worth[EFFECTS[1]], 1.0),  # not weighed: nothing is asked
+    }
+    assert trust.where_most(problem, fit, evidence[EFFECTS[0]]) == SizeWhereMost(0.1, 2.0, 0.01)
+    assert trust.where_most(problem, fit, evidence[EFFECTS[1]]) is None
+    assert asked == [(rest, 4.0)]
 
 
 def test_what_shows_where_something_unexplained_acts_is_doubted():

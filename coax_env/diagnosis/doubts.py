@@ -23,6 +23,7 @@ from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.replication import Replication
 from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.unseen import Unseen
+from coax_env.diagnosis.where_shown import SizeWhereMost
 from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
 from coax_env.plain_words import and_list, channel_name, plain
 
@@ -75,6 +76,7 @@ class Against:
         taken_back_by: a cause that takes back at rest what it does; empty: none.
         by_speeds_alone: whether it is a motor's lag that measured rotor speeds alone show.
         followed: whether the states of an onboard filter that were read follow it.
+        where_most: its size where the flights show most of it; None where that is not known.
     """
 
     channels: tuple[str, ...]
@@ -104,6 +106,7 @@ class Against:
     taken_back_by: str
     by_speeds_alone: bool
     followed: bool
+    where_most: SizeWhereMost | None = None
 
     @property
     def at_limit(self) -> bool:
@@ -266,6 +269,12 @@ def doubts(effect: str, against: Mapping[str, Against], chosen: Settings) -> Ite
         yield f"on the held-out runs it is worth {there} nats, where {expected} were to be expected"
         if of.flies_worse:
             yield "with the causes the model flies the held-out runs worse than as given"
+    if of.where_most and of.where_most.is_another:
+        percent, size = 100.0 * of.where_most.share, of.where_most.size
+        yield (
+            f"where the flights show half of it, in {percent:.2g} % of the time, it has {size:.1f}"
+            " times its size: something of another form looks so"
+        )
     if of.within_form:
         share = 100.0 * math.sqrt(chosen.oscillating_form)
         yield (

@@ -22,7 +22,8 @@ coming of gusts that are not as the filter has them (with a frequency, say); and
 sensor's low-pass, taken back by its likeliest form, is itself a late answer. What looks like a weak or
 late answer must be worth several times as much there (`Settings.unseen_inflation`). So must a weak one
 by poses alone, where colour takes no more than that from it already: a command that answers a gust
-before poses show it makes an answer weak or slow, and none late by a constant time.
+before poses show it makes an answer weak or slow, and none late by a constant time. Unless it gains its
+nats where the flights show it and not all the time, as such answers do (where_shown.py).
 """
 
 import math
@@ -54,6 +55,7 @@ from coax_env.diagnosis.problem import (
 )
 from coax_env.diagnosis.refinement import refined
 from coax_env.diagnosis.scores import inflation, is_large, loss, threshold
+from coax_env.diagnosis.where_shown import beyond_even_spread
 from coax_env.estimation.parted_engine import PartedEngine
 from coax_env.estimation.prediction import mean_log_ratio
 from coax_env.estimation.quadratic import Quadratic
@@ -73,17 +75,19 @@ clean **synthetic** flight; ours."""
 class Evidence:
     """What a cause is worth. lost: nats without it. inflation: variance inflation in its direction.
     against: channels that should show it and whose readings are likelier without it, beyond chance, and
-    by how many nats. rest: the fit without it."""
+    by how many nats. rest: the fit without it. times: how many of the inflation are by commands that
+    answer what the filter does not see, though it is worth its nats where it shows."""
 
     lost: float
     inflation: float
     against: Mapping[str, float] = field(default_factory=dict)
     rest: Fit | None = None
+    times: float = 1.0
 
     @property
     def nats(self) -> float:
         """What colour, and commands for what the filter does not see, leave of what is lost."""
-        return self.lost / self.inflation
+        return self.lost / self.inflation * self.times
 
 
 @dataclass(frozen=True)
@@ -114,14 +118,21 @@ def weigh(
     def one(effect: str) -> Removal:
         held = tuple(problem.file_values(effect))
         factor = inflation_of(problem, fit, quadratic, effect)
+        times = factor / inflation(problem, quadratic, fit.active, effect)
+        tells = times > 1.0 and problem.tells_by_spread(effect)
         rest = noise_fitted(problem, without(problem, fit, quadratic, effect))
         rest = fitted(problem, rest, steps=1, held=held)
         lost = rest.objective - fit.objective
         foretold = loss(problem, quadratic, fit.active, effect, 1.0)
         clear = chosen.clear * factor
-        if enough * factor < lost < clear or lost > AMISS * foretold:
+        least = enough * (factor / times if tells else factor)
+        if least < lost < clear or lost > AMISS * foretold:
             rest = converged(problem, rest, held)
-        return Removal(Evidence(float(rest.objective - fit.objective), factor), rest)
+        lost = float(rest.objective - fit.objective)
+        tells = tells and lost / factor * times >= chosen.evidence
+        if tells and beyond_even_spread(problem, fit, rest) >= chosen.beyond_even_spread:
+            return Removal(Evidence(lost, factor, times=times), rest)
+        return Removal(Evidence(lost, factor), rest)
 
     return problem.for_each(one, which)
 
@@ -313,7 +324,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
             asked, other = fitted(second, rest), {}
         if asked.active == pruned.active:
             lesser = {
-                e: replace(x, lost=least.lost, inflation=least.inflation)
+                e: replace(x, lost=least.lost, inflation=least.inflation, times=least.times)
                 for e, x in evidence.items()
                 for least in [min(x, other.get(e, x), key=lambda w: w.nats)]
             }

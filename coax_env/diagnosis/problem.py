@@ -300,6 +300,17 @@ class Problem:
         seldom = self.reads_seldom or self.knows_commands_seldom
         return seldom or self.unlike_gusts or self.smoothed
 
+    def tells_by_spread(self, effect: str) -> bool:
+        """Whether answers to what no reading has shown, which are there all the time, are told from an
+        effect by when it is worth its nats (where_shown.py).
+
+        What is left of a sensor's low-pass, and commands that are not known between some, make every
+        answer late, a large one more. A late command is a late swash plate and late rotors: one of the
+        two may show where it should, and such answers be the other. By telemetry a servo's delay was a
+        late command so, of 20 nats (**synthetic**).
+        """
+        return effect != COMMAND_DELAY and not self.smoothed and not self.knows_commands_seldom
+
     @property
     def unseen_times(self) -> float:
         """Times that what looks like a weak or late answer must be worth more where it is not seen."""

@@ -32,6 +32,9 @@ class Settings:
     """The same by poses alone that come seldom, where neither is seen in time. Measured by a camera
     (`study_diagnosis.py --arms camera`, seeds 790 and 791): on four clean flights the strongest was
     worth 47 to 58 nats before, a play or a motor lag; three plays of 45 to 62 had had a name."""
+    beyond_even_spread: float = 10.0
+    """nats beyond an even spread over time that such a cause must gain where the flights show most of
+    it, to be worth what it seems (where_shown.py). 32 that nobody hid gained 2 at most; ours."""
     tie: float = 6.0
     """nats within which alternatives are confounded: odds of 400 to 1, ours."""
     form_share: float = 0.1

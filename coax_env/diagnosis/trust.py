@@ -34,6 +34,7 @@ from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.shocks import in_shocks
 from coax_env.diagnosis.unlisted import acted_on
 from coax_env.diagnosis.unseen import Unseen
+from coax_env.diagnosis.where_shown import SizeWhereMost, size_where_most
 from coax_env.estimation.helicopter import UNUSUAL_FROM
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.vibration import Line
@@ -147,7 +148,9 @@ def trusts(
             flies_worse=worse,
             unseen=unseen.get(effect),
             within_form=worth[effect] < of_form,
-            alternatives=(*found[effect], *untold(problem, fit, quadratic, effect)),
+            alternatives=tuple(
+                dict.fromkeys((*found[effect], *untold(problem, fit, quadratic, effect)))
+            ),
             nats=worth[effect],
             of_moment=onsets[effect].beside if effect in onsets else math.inf,
             shaken=shaken,
@@ -160,6 +163,7 @@ def trusts(
             taken_back_by=undone.get(effect, ""),
             by_speeds_alone=effect == LAG and unconfirmed,
             followed=problem.of_onboard_filter and effect in CIRCULAR,
+            where_most=where_most(problem, fit, evidence[effect]),
         )
     nameless = without_name(against, problem.settings)
     return {
@@ -170,6 +174,17 @@ def trusts(
         )
         for effect, of in against.items()
     }  # fmt: skip
+
+
+def where_most(problem: Problem, fit: Fit, weighed: Evidence) -> SizeWhereMost | None:
+    """A cause's size where the flights show most of it, if it was weighed.
+
+    Args:
+        problem, fit: with the cause. weighed: what it is worth, with the fit without it.
+    """
+    if weighed.rest is None:
+        return None
+    return size_where_most(problem, fit, weighed.rest, weighed.inflation)
 
 
 def taken_back(fit: Fit) -> dict[str, str]:

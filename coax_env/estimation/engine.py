@@ -78,6 +78,15 @@ class NoiseScore:
 
 
 @dataclass(frozen=True)
+class ByReading:
+    """A run by its readings. innovations: (n, m) whitened; nats: (n, m) log-likelihood, but for a
+    constant. Both are NaN where there is no reading; nats are 0 where the filter diverged."""
+
+    innovations: np.ndarray
+    nats: np.ndarray
+
+
+@dataclass(frozen=True)
 class _Known:
     """What is known at a point."""
 
@@ -168,27 +177,38 @@ class Engine(RunPasses):
                 return known.score.log_likelihood
         return float(sum(p.log_likelihood for p in self.filter(values, noise, which=which)))
 
-    def likelihood_by_channel(self, values: Mapping[str, float], noise: Noise) -> np.ndarray:
-        """Log-likelihood of each channel's readings, (m,) [nats], but for a constant.
+    def by_reading(self, values: Mapping[str, float], noise: Noise) -> list[ByReading]:
+        """Innovation and log-likelihood of each reading, per run.
 
         A row's readings are taken one by one in the order of the channels: each is judged by what was
-        known before it. Without those of a run whose filter diverged.
+        known before it.
 
         Args:
             values: of the parameters, by name. noise: levels of process and reading noise.
         """
         p = self.model.vector(values, noise)
 
-        def one(i: int) -> np.ndarray:
+        def one(i: int) -> ByReading:
             with self.borrowed_buffers() as buffers:
                 run, _ = self.filter_run(i, *self.of_run(i, values, noise, p), buffers)
                 nats = -0.5 * run.innovations**2
                 if not np.isfinite(run.log_likelihood):
-                    return np.zeros(nats.shape[1])
+                    return ByReading(run.innovations, np.zeros(nats.shape))
                 nats[np.isfinite(nats)] += np.log(run.per_sigma)
-                return np.asarray(np.nansum(nats, axis=0))
+                return ByReading(run.innovations, nats)
 
-        return np.asarray(np.sum(self.each(one), axis=0))
+        return self.each(one)
+
+    def likelihood_by_channel(self, values: Mapping[str, float], noise: Noise) -> np.ndarray:
+        """Log-likelihood of each channel's readings, (m,) [nats], but for a constant.
+
+        Without those of a run whose filter diverged.
+
+        Args:
+            values: of the parameters, by name. noise: levels of process and reading noise.
+        """
+        of_runs = [np.nansum(run.nats, axis=0) for run in self.by_reading(values, noise)]
+        return np.asarray(np.sum(of_runs, axis=0))
 
     def of_run(
         self, i: int, values: Mapping[str, float], noise: Noise, p: np.ndarray
