@@ -483,6 +483,8 @@ def test_an_excluded_effect_is_not_named(tmp_path):
     named = diagnose(flight, hold_out=[], exclude=FEW).findings
     assert [c["effect"] for c in named["causes"]] == ["gyro_bias"]
     assert named["verdict"] == "explained"
+    most = named["causes"][0]["where_most"]  # a bias is there all the time, of one size
+    assert 0.3 < most["share"] <= 0.6 and abs(most["size"] - 1.0) < 4.0 * most["std"] < 1.0
     forbidden = diagnose(flight, hold_out=[], exclude=[*FEW, "gyro_bias"]).findings
     assert "gyro_bias" not in say_what_was_found(forbidden)
     for cause in forbidden["causes"]:

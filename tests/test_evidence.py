@@ -76,11 +76,12 @@ class Flights:
         row: float = 0.01,
         unseen: Mapping[str, bool] = MappingProxyType({}),
         beyond: float = 0.0,
+        stand_ins: Mapping[str, Any] = MappingProxyType({}),
     ) -> tuple[Fit, dict[str, evidence.Evidence]]:
         def loss(problem, quadratic, active, effect, inflation):
             return self.worth[effect] / inflation
 
-        stand_ins = {
+        every = {
             "converged": self.converged, "without": self.without, "loss": loss,
             "refined": lambda problem, fit: self.refined.append(fit.active) or fit,
             "fitted": lambda problem, fit, steps, held: self.converged(problem, fit),
@@ -90,7 +91,7 @@ class Flights:
             "threshold": lambda problem, quadratic, active: THRESHOLD,
             "beyond_even_spread": lambda problem, fit, rest: beyond,
         }  # fmt: skip
-        for name, stand_in in stand_ins.items():
+        for name, stand_in in {**every, **stand_ins}.items():
             monkeypatch.setattr(evidence, name, stand_in)
         model = SimpleNamespace(moments={}, bare_values={}, channels=("p",))
         own: dict[str, tuple[()]] = dict.fromkeys(self.worth, ())
@@ -148,6 +149,37 @@ def test_what_gains_its_nats_where_it_shows_is_worth_them(monkeypatch, seen, bey
     assert ("motor_droop" in fit.active) == (times == 1.0)
     assert found["rate_damping"].nats == pytest.approx(3.1 * THRESHOLD / times)
     assert found["rate_damping"].inflation == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(("one", "other"), [(3.0, 1.0), (1.0, 3.0)])
+def test_the_lesser_worth_of_two_is_stated(one, other):
+    """42 nats, of which commands that answer unseen gusts leave all or a third."""
+    rest = Fit((), {}, GOOD)
+    own = Evidence(42.0, 3.0, {"p": 1.0}, rest, times=one)
+    found = own.lesser(Evidence(42.0, 3.0, times=other))
+    assert found.nats == pytest.approx(14.0)
+    assert (found.against, found.rest) == ({"p": 1.0}, rest)
+
+
+def test_what_may_be_worth_enough_is_refitted_to_its_end_and_else_is_not_asked(monkeypatch):
+    """Once converged 1.5 thresholds are left of 2; 0.9 are too few, wherever they are gained."""
+    flights = Flights({"motor_droop": 1.5 * THRESHOLD, "rate_damping": 0.9 * THRESHOLD})
+    asked = []
+
+    def beyond(problem: Problem, fit: Fit, rest: Fit) -> float:
+        asked.append(set(fit.active) - set(rest.active))
+        return SPREAD
+
+    def unconverged(problem: Problem, fit: Fit, steps: int, held: Any) -> Fit:
+        found = flights.converged(problem, fit)
+        return replace(found, objective=found.objective + 0.5 * THRESHOLD)
+
+    fit, found = flights.pruned(
+        monkeypatch, GOOD, 0.04, stand_ins={"beyond_even_spread": beyond, "fitted": unconverged}
+    )
+    assert fit.active == ("motor_droop",)
+    assert found["motor_droop"].nats == pytest.approx(1.5 * THRESHOLD)
+    assert {"motor_droop"} in asked and {"rate_damping"} not in asked
 
 
 def test_a_late_command_may_be_a_late_swash_plate_beside_such_answers(monkeypatch):

@@ -98,6 +98,7 @@ def finding(effect, twins=(), **values):
         ],
         "since": None,
         "unseen": None if twins else {"nats": 41.2, "expected": 40.0, "std": 9.0},
+        "where_most": None if twins else {"share": 0.062, "size": 0.98, "std": 0.04},
     }
 
 
@@ -744,6 +745,17 @@ def test_what_a_cause_is_worth_on_the_held_out_runs_is_said(unseen, said):
     cause = finding("cg_offset", x=0.05, y=0.0) | {"unseen": unseen}
     sections = causes.cause_sections({"causes": [cause]}, LAMA, LAMA)
     assert said in "".join(str(block) for section in sections for block in section.blocks)
+
+
+def test_a_cause_s_size_where_half_of_it_shows_is_said():
+    cause = finding("cg_offset", x=0.05, y=0.0)
+
+    def said(cause):
+        sections = causes.cause_sections({"causes": [cause]}, LAMA, LAMA)
+        return "".join(str(block) for section in sections for block in section.blocks)
+
+    assert "0.98 of its size, in 6.2" in said(cause) and "not asked" not in said(cause)
+    assert "of its size" not in said(cause | {"where_most": None})
 
 
 def test_a_cause_s_interval_knows_its_correlation():

@@ -372,6 +372,9 @@ def test_a_causes_size_is_asked_beside_the_fit_without_it(monkeypatch):
     }
     assert trust.where_most(problem, fit, evidence[EFFECTS[0]]) == SizeWhereMost(0.1, 2.0, 0.01)
     assert trust.where_most(problem, fit, evidence[EFFECTS[1]]) is None
+    known = trust.Trust(True, 1.0, None, {}, (), (), where_most=SizeWhereMost(0.1, 2.0, 0.01))
+    assert known.entries()["where_most"] == {"share": 0.1, "size": 2.0, "std": 0.01}
+    assert replace(known, where_most=None).entries()["where_most"] is None
     assert asked == [(rest, 4.0)]
 
 

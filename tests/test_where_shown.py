@@ -35,10 +35,12 @@ LOUD_ROWS = slice(200, 250)  # one block of each run
 class Runs:
     """An engine over runs whose readings are `y` (n,); a model foretells size times `column` (n,).
 
-    `offset`: nats that the noise without the cause gives each row.
+    `offset`: nats that the noise without the cause gives each row, or each of a run's.
     """
 
-    def __init__(self, columns: list[np.ndarray], y: list[np.ndarray], offset: float = 0.0) -> None:
+    def __init__(
+        self, columns: list[np.ndarray], y: list[np.ndarray], offset: float | np.ndarray = 0.0
+    ) -> None:
         self.columns, self.y, self.offset = columns, y, offset
         self.records = [SimpleNamespace(t=5.0 + ROW * np.arange(c.size)) for c in columns]
 
@@ -47,6 +49,7 @@ class Runs:
         for column, y in zip(self.columns, self.y, strict=True):
             e = y - values["size"] * column
             more = self.offset if noise is OTHER else 0.0
+            e = np.where(np.isnan(more), np.nan, e)
             missing = np.full(e.shape, np.nan)  # a channel that is not read
             pair = (np.stack((e, missing), 1), np.stack((more - 0.5 * e * e, missing), 1))
             found.append(ByReading(*pair))
@@ -61,7 +64,7 @@ def column() -> np.ndarray:
 
 
 def flown(
-    seed: int, quiet: float = 1.0, loud: float = 1.0, offset: float = 0.0
+    seed: int, quiet: float = 1.0, loud: float = 1.0, offset: float | np.ndarray = 0.0
 ) -> tuple[Any, Fit, Fit, float]:
     """Of one size in quiet rows and one in loud ones: the problem, the fit, that without, and the nats
     of the cause."""
@@ -137,11 +140,25 @@ def test_what_acts_gains_its_nats_where_it_shows_and_answers_do_not():
 
 
 def test_noise_of_its_own_without_a_cause_is_spread_evenly():
-    """What the noise levels give every row alike is in no block's favour."""
+    """What the noise levels give every row alike is in no block's favour; what they give loud rows
+    is not gained by the cause."""
     problem, fit, rest, _ = flown(3)
     level = beyond_even_spread(problem, fit, rest)
     problem, fit, rest, _ = flown(3, offset=0.02)
     assert beyond_even_spread(problem, fit, rest) == pytest.approx(level, abs=1e-9)
+    problem, fit, rest, _ = flown(3, offset=np.where(column() == LOUD, 0.02, 0.0))
+    assert beyond_even_spread(problem, fit, rest) < level - 0.5 * RUNS * 50 * 0.02
+    problem, fit, rest, _ = flown(3, offset=np.nan)  # a filter that diverges in that noise
+    assert beyond_even_spread(problem, fit, rest) == -np.inf
+
+
+def test_a_prior_that_holds_all_of_a_cause_back_makes_no_size_another():
+    """It is as much too small everywhere."""
+    problem, fit, rest, _ = flown(5)
+    one = size_where_most(problem, fit, rest, 1.0)
+    held = size_where_most(problem, fit.at({"size": 0.8 * fit.values["size"]}), rest, 1.0)
+    assert one and held
+    assert held.size - 1.0 == pytest.approx((one.size - 1.0) / 0.8, abs=1e-9)
 
 
 def test_nothing_is_said_of_two_machines_of_what_is_not_shown_and_of_one_block():

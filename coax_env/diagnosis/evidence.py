@@ -89,6 +89,11 @@ class Evidence:
         """What colour, and commands for what the filter does not see, leave of what is lost."""
         return self.lost / self.inflation * self.times
 
+    def lesser(self, other: "Evidence") -> "Evidence":
+        """This, worth no more than another."""
+        least = min(self, other, key=lambda of: of.nats)
+        return replace(self, lost=least.lost, inflation=least.inflation, times=least.times)
+
 
 @dataclass(frozen=True)
 class Removal:
@@ -323,11 +328,7 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
         else:
             asked, other = fitted(second, rest), {}
         if asked.active == pruned.active:
-            lesser = {
-                e: replace(x, lost=least.lost, inflation=least.inflation, times=least.times)
-                for e, x in evidence.items()
-                for least in [min(x, other.get(e, x), key=lambda w: w.nats)]
-            }
+            lesser = {e: own.lesser(other.get(e, own)) for e, own in evidence.items()}
             if not _feels_gusts(problem):
                 pruned = beside_unseen_answers(problem, pruned, quadratic, evidence, asked)
             elif stated:

@@ -65,6 +65,7 @@ class Trust:
         channels: in which it shows most, strongest first.
         named: whether it is stated as a cause; what is not is told among the unexplained.
         unseen: what it is worth on the held-out runs; None where none were asked.
+        where_most: its size where the flights show half of it; None where that is not known.
     """
 
     noise: bool
@@ -75,6 +76,7 @@ class Trust:
     channels: tuple[str, ...]
     named: bool = True
     unseen: Unseen | None = None
+    where_most: SizeWhereMost | None = None
 
     @property
     def word(self) -> str:
@@ -89,6 +91,7 @@ class Trust:
             "doubts": list(self.doubts),
             "since": None,
             "unseen": self.unseen and self.unseen.entry(),
+            "where_most": self.where_most and self.where_most.entry(),
         }
 
 
@@ -170,7 +173,7 @@ def trusts(
         effect: Trust(
             not of.falls_at, of.parts.runs, of.parts.kept, known[effect],
             tuple(doubts(effect, against, problem.settings)), of.channels, effect not in nameless,
-            of.unseen,
+            of.unseen, of.where_most,
         )
         for effect, of in against.items()
     }  # fmt: skip

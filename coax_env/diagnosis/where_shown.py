@@ -20,7 +20,7 @@ plate whose rate is limited was a servo's lag of 76 nats, sure, and 1.6 times as
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -48,6 +48,10 @@ class SizeWhereMost:
     share: float
     size: float
     std: float
+
+    def entry(self) -> dict[str, float]:
+        """findings.json's `where_most`."""
+        return asdict(self)
 
     @property
     def is_another(self) -> bool:

@@ -90,12 +90,15 @@ TRUST = {
 """How far a cause's name may be believed -> the heading of such causes, and what that means."""
 AT_ONCE = 0.95
 """Probability from which on a cause is said to have come at once; ours."""
-_ROBUST_HEADER = ["cause", "name is", "under other noise", "left-out runs", "halves", "held-out runs"]
+_ROBUST_HEADER = [
+    "cause", "name is", "under other noise", "left-out runs", "halves", "held-out runs",
+    "where half of it shows",
+]  # fmt: skip
 
 
 def _robust_row(cause: Mapping[str, Any]) -> list[str]:
     """What a cause's name withstood, in a table."""
-    robust, unseen = cause["robust"], cause.get("unseen")
+    robust, unseen, most = cause["robust"], cause.get("unseen"), cause.get("where_most")
     return [
         capital(plain(cause["effect"])),
         cause["trust"],
@@ -105,6 +108,9 @@ def _robust_row(cause: Mapping[str, Any]) -> list[str]:
         if robust["kept"] is None
         else f"returns in {whole_percent(100.0 * robust['kept'])}",
         f"worth {number(unseen['nats'])} nats" if unseen else "not asked",
+        f"{most['size']:.2f} of its size, in {number(100.0 * most['share'])} % of the time"
+        if most
+        else "not asked",
     ]
 
 
