@@ -26,6 +26,7 @@ from coax_env.diagnosis import evidence
 from coax_env.diagnosis.evidence import Evidence, prune, weighed
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.diagnosis.where_shown import SizeWhereMost
 from coax_env.estimation.low_pass import LowPass
 from coax_env.estimation.parted_engine import PartedEngine
 from coax_env.estimation.state_space import Noise
@@ -45,6 +46,7 @@ def noise_as_it_is(request, monkeypatch):
         monkeypatch.setattr(evidence, "dropped_in_brief_gusts", lambda *given: None)
         monkeypatch.setattr(evidence, "is_large", lambda problem, effect, values: True)
         monkeypatch.setattr(evidence, "is_much_coloured", lambda problem, fit: False)
+        monkeypatch.setattr(evidence, "size_where_most", lambda *given: None)
 
 
 class Flights:
@@ -151,13 +153,38 @@ def test_what_gains_its_nats_where_it_shows_is_worth_them(monkeypatch, seen, bey
     assert found["rate_damping"].inflation == pytest.approx(3.0)
 
 
-@pytest.mark.parametrize(("one", "other"), [(3.0, 1.0), (1.0, 3.0)])
+@pytest.mark.parametrize(
+    ("size", "worth", "falls"),
+    [
+        (0.55, 4.0, True),
+        (0.75, 4.0, False),  # another size, and it acts
+        (1.6, 4.0, False),
+        (0.55, 11.0, False),  # clear: something acts, in another form
+    ],
+)
+def test_what_does_not_act_where_it_should_show_falls(monkeypatch, size, worth, falls):
+    """The weakest of such first, and beside the fit without it."""
+    asked = []
+
+    def there(problem: Problem, fit: Fit, rest: Fit, inflation: float) -> SizeWhereMost | None:
+        (gone,) = set(fit.active) - set(rest.active)
+        asked.append(gone)
+        return SizeWhereMost(0.01, size, 0.02) if gone != "gyro_bias" else None
+
+    monkeypatch.setattr(evidence, "size_where_most", there)
+    flights = Flights({"motor_droop": worth * THRESHOLD, "gyro_bias": 2.0 * THRESHOLD})
+    fit, _ = flights.pruned(monkeypatch, GOOD)
+    assert fit.active == (("gyro_bias",) if falls else ("motor_droop", "gyro_bias"))
+    assert asked[:1] == ["gyro_bias"] and ("motor_droop" in asked) == (worth < 10.0)
+
+
+@pytest.mark.parametrize(("one", "other"), [(True, False), (False, True)])
 def test_the_lesser_worth_of_two_is_stated(one, other):
     """42 nats, of which commands that answer unseen gusts leave all or a third."""
     rest = Fit((), {}, GOOD)
-    own = Evidence(42.0, 3.0, {"p": 1.0}, rest, times=one)
-    found = own.lesser(Evidence(42.0, 3.0, times=other))
-    assert found.nats == pytest.approx(14.0)
+    own, of_other = (Evidence(42.0, 6.0, {"p": 1.0}, rest, 3.0, shown) for shown in (one, other))
+    found = own.lesser(replace(of_other, against={}, rest=None))
+    assert found.nats == pytest.approx(7.0) and found.colour == pytest.approx(2.0)
     assert (found.against, found.rest) == ({"p": 1.0}, rest)
 
 

@@ -367,7 +367,7 @@ def test_a_causes_size_is_asked_beside_the_fit_without_it(monkeypatch):
     fit, _, worth = fitted_to(problem, *drawn(rng, [1.0] * 8, [1.0] * 8), EFFECTS[:2])
     rest = replace(fit, active=EFFECTS[1:2])
     evidence = {
-        EFFECTS[0]: Evidence(worth[EFFECTS[0]], 4.0, rest=rest),
+        EFFECTS[0]: Evidence(worth[EFFECTS[0]], 12.0, rest=rest, times=3.0),  # of colour 4
         EFFECTS[1]: Evidence(worth[EFFECTS[1]], 1.0),  # not weighed: nothing is asked
     }
     assert trust.where_most(problem, fit, evidence[EFFECTS[0]]) == SizeWhereMost(0.1, 2.0, 0.01)

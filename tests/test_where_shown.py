@@ -121,6 +121,14 @@ def test_a_size_is_another_beyond_chance_and_form(size, std, another):
     assert SizeWhereMost(0.1, size, std).is_another == another
 
 
+@pytest.mark.parametrize(
+    ("size", "std", "denied"),
+    [(0.69, 0.01, True), (0.71, 0.01, False), (0.55, 0.2, False), (1.5, 0.01, False)],
+)
+def test_what_is_much_smaller_where_it_should_show_is_denied(size, std, denied):
+    assert SizeWhereMost(0.1, size, std).is_denied == denied
+
+
 def test_what_acts_gains_its_nats_where_it_shows_and_answers_do_not():
     """Three quarters of its nats in a few blocks, less the share of so much time; what is alike in all
     rows gains less than that share, whatever it is worth in all."""

@@ -187,7 +187,7 @@ def where_most(problem: Problem, fit: Fit, weighed: Evidence) -> SizeWhereMost |
     """
     if weighed.rest is None:
         return None
-    return size_where_most(problem, fit, weighed.rest, weighed.inflation)
+    return size_where_most(problem, fit, weighed.rest, weighed.colour)
 
 
 def taken_back(fit: Fit) -> dict[str, str]:

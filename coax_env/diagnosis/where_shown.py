@@ -36,6 +36,9 @@ BY_CHANCE = 4.0
 FORM = 0.25
 """Parts of its size that another form may differ there: 17 true causes of 18 arms differed by 0.10 at
 most, but for servos that had another fault beside; ours."""
+LEAST = 0.7
+"""Parts of its size below which it does not act where it should show: true ones had 0.75 at least, lags
+and delays that nobody hid 0.44 at most; ours."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,11 @@ class SizeWhereMost:
     def entry(self) -> dict[str, float]:
         """findings.json's `where_most`."""
         return asdict(self)
+
+    @property
+    def is_denied(self) -> bool:
+        """Whether it is so much smaller there that what is there all the time stands for it."""
+        return self.is_another and self.size < LEAST
 
     @property
     def is_another(self) -> bool:
