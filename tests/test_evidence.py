@@ -178,6 +178,23 @@ def test_what_does_not_act_where_it_should_show_falls(monkeypatch, size, worth, 
     assert asked[:1] == ["gyro_bias"] and ("motor_droop" in asked) == (worth < 10.0)
 
 
+@pytest.mark.parametrize(
+    ("coloured", "flown", "falls"),
+    [(True, 0.9, False), (True, 1.1, True), (False, 0.9, True)],
+)
+def test_where_much_is_coloured_what_is_denied_falls_if_the_runs_are_flown_no_worse(
+    monkeypatch, coloured, flown, falls
+):
+    """A gyro that turned 1.2 times as much as the heading was denied on a real helicopter."""
+    there = SizeWhereMost(0.01, 0.5, 0.02)
+    monkeypatch.setattr(evidence, "size_where_most", lambda *given: there)
+    monkeypatch.setattr(evidence, "is_much_coloured", lambda problem, fit: coloured)
+    errors = itertools.cycle([{"p": flown}, {"p": 1.0}])  # with it, without
+    monkeypatch.setattr(evidence, "flown_errors", lambda problem, fit: next(errors))
+    fit, _ = Flights({"gyro_scale": 4.0 * THRESHOLD}).pruned(monkeypatch, GOOD)
+    assert fit.active == (() if falls else ("gyro_scale",))
+
+
 @pytest.mark.parametrize(("one", "other"), [(True, False), (False, True)])
 def test_the_lesser_worth_of_two_is_stated(one, other):
     """42 nats, of which commands that answer unseen gusts leave all or a third."""
