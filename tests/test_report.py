@@ -754,8 +754,8 @@ def test_a_cause_s_size_where_half_of_it_shows_is_said():
         sections = causes.cause_sections({"causes": [cause]}, LAMA, LAMA)
         return "".join(str(block) for section in sections for block in section.blocks)
 
-    assert "0.98 of its size, in 6.2" in said(cause) and "not asked" not in said(cause)
-    assert "of its size" not in said(cause | {"where_most": None})
+    assert "0.98 of all" in said(cause) and "not asked" not in said(cause)
+    assert "of all" not in said(cause | {"where_most": None})
 
 
 def test_a_cause_s_interval_knows_its_correlation():

@@ -92,7 +92,7 @@ AT_ONCE = 0.95
 """Probability from which on a cause is said to have come at once; ours."""
 _ROBUST_HEADER = [
     "cause", "name is", "under other noise", "left-out runs", "halves", "held-out runs",
-    "where half of it shows",
+    "size where it shows",
 ]  # fmt: skip
 
 
@@ -108,9 +108,7 @@ def _robust_row(cause: Mapping[str, Any]) -> list[str]:
         if robust["kept"] is None
         else f"returns in {whole_percent(100.0 * robust['kept'])}",
         f"worth {number(unseen['nats'])} nats" if unseen else "not asked",
-        f"{most['size']:.2f} of its size, in {number(100.0 * most['share'])} % of the time"
-        if most
-        else "not asked",
+        f"{most['size']:.2f} of all" if most else "not asked",
     ]
 
 
