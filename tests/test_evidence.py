@@ -178,6 +178,15 @@ def test_what_does_not_act_where_it_should_show_falls(monkeypatch, size, worth, 
     assert asked[:1] == ["gyro_bias"] and ("motor_droop" in asked) == (worth < 10.0)
 
 
+def test_where_a_cause_shows_most_it_is_as_unsure_as_colour_makes_it(monkeypatch):
+    """Not as answers to unseen gusts do: these are what is asked about."""
+    asked = []
+    monkeypatch.setattr(evidence, "size_where_most", lambda *given: asked.append(given[-1]))
+    flights = Flights({"motor_droop": 4.0 * THRESHOLD})
+    _, found = flights.pruned(monkeypatch, GOOD, 0.04)
+    assert found["motor_droop"].inflation == pytest.approx(3.0) and set(asked) == {1.0}
+
+
 @pytest.mark.parametrize(
     ("coloured", "flown", "falls"),
     [(True, 0.9, False), (True, 1.1, True), (False, 0.9, True)],
