@@ -130,21 +130,24 @@ def weigh(
     def one(effect: str) -> Removal:
         held = tuple(problem.file_values(effect))
         factor = inflation_of(problem, fit, quadratic, effect)
-        times = factor / inflation(problem, quadratic, fit.active, effect)
-        tells = times > 1.0 and problem.tells_by_spread(effect)
+        colour = inflation(problem, quadratic, fit.active, effect)
+        tells = factor > colour and problem.tells_by_spread(effect)
         rest = noise_fitted(problem, without(problem, fit, quadratic, effect))
         rest = fitted(problem, rest, steps=1, held=held)
         lost = rest.objective - fit.objective
         foretold = loss(problem, quadratic, fit.active, effect, 1.0)
         clear = chosen.clear * factor
-        least = enough * (factor / times if tells else factor)
+        least = enough * (colour if tells else factor)
         if least < lost < clear or lost > AMISS * foretold:
             rest = converged(problem, rest, held)
         lost = float(rest.objective - fit.objective)
-        tells = tells and lost / factor * times >= chosen.evidence
-        gained = beyond_even_spread(problem, fit, rest) if tells else 0.0
-        where_shown = gained >= chosen.beyond_even_spread
-        return Removal(Evidence(lost, factor, times=times, where_shown=where_shown), rest)
+        where_shown = (
+            tells
+            and lost / colour >= chosen.evidence
+            and beyond_even_spread(problem, fit, rest) >= chosen.beyond_even_spread
+        )
+        worth = Evidence(lost, factor, times=factor / colour, where_shown=where_shown)
+        return Removal(worth, rest)
 
     return problem.for_each(one, which)
 

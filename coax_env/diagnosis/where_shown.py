@@ -37,7 +37,7 @@ FORM = 0.25
 """Parts of its size that another form may differ there: 17 true causes of 18 arms differed by 0.10 at
 most, but for servos that had another fault beside; ours."""
 LEAST = 0.7
-"""Parts of its size below which it does not act where it should show: true ones had 0.75 at least, lags
+"""Parts of its size below which it does not act where it should show: true ones had 0.73 at least, lags
 and delays that nobody hid 0.44 at most; ours."""
 
 
