@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coax_env.diagnosis import confounding, remarks
+from coax_env.diagnosis import confounding, evidence, remarks
 from coax_env.diagnosis.confounding import (
     alike_unturned,
     beside_undecided,
@@ -20,6 +20,7 @@ from coax_env.diagnosis.confounding import (
 )
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.problem import Fit, Problem
+from coax_env.diagnosis.where_shown import SizeWhereMost
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
@@ -190,6 +191,38 @@ def test_by_poses_alone_a_late_command_and_a_late_servo_stand_for_each_other(
     assert sorted(found) == alike
 
 
+@pytest.mark.parametrize(
+    ("size", "lost", "known", "left"),
+    [
+        (0.5, 60.0, True, ["command_delay"]),
+        (0.9, 60.0, True, ["command_delay", "motor_droop"]),
+        (0.5, 300.0, True, ["command_delay", "motor_droop"]),  # clear: something acts
+        (0.5, 60.0, False, ["command_delay", "motor_droop"]),
+    ],
+)
+def test_what_does_not_act_where_it_should_show_is_no_alternative(
+    monkeypatch, size, lost, known, left
+):
+    """Against the fit with neither; of each other effect's own size there, as colour has it."""
+    problem, fit, quadratic = fitted_with(0.0)
+    problem = replace(problem, engine=SimpleNamespace(threads=1))
+    rest = replace(fit, active=(), objective=lost)
+    others = {e: replace(fit, active=(e,), objective=0.0) for e in ("command_delay", "motor_droop")}
+
+    def there(problem: Problem, fit: Fit, without: Fit, colour: float) -> SizeWhereMost:
+        assert without is rest and colour == 1.5
+        return SizeWhereMost(0.01, size if fit.active == ("motor_droop",) else 1.0, 0.02)
+
+    monkeypatch.setattr(evidence, "size_where_most", there)
+    monkeypatch.setattr(evidence, "is_much_coloured", lambda problem, fit: False)
+    monkeypatch.setattr(confounding, "inflation", lambda *given: 1.5)
+    monkeypatch.setattr(confounding, "channels_of", lambda *given: [])
+    monkeypatch.setattr(confounding, "_of_one", lambda *given: others)
+    worth = {"axial_damping": Evidence(lost, 1.5, rest=rest if known else None)}
+    found = confounding.alternatives(problem, fit, quadratic, worth, {})
+    assert sorted(found["axial_damping"]) == left
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_likelier_alternative_stays_where_it_stands_once_weighed(monkeypatch, kept):
     problem, fit, quadratic = fitted_with(0.0)
@@ -213,18 +246,20 @@ def test_a_likelier_alternative_stays_where_it_stands_once_weighed(monkeypatch, 
 
 
 @pytest.mark.parametrize(
-    ("hides", "adds", "stands", "named"),
+    ("hides", "denied", "adds", "stands", "named"),
     [
-        (True, "sonar_delay", True, ("wind", "sonar_delay")),
-        (True, "sonar_delay", False, ("wind",)),  # it does not stand, nor what stood before
-        (True, None, True, ("wind",)),
-        (False, "sonar_delay", True, ("wind",)),
+        (True, False, "sonar_delay", True, ("wind", "sonar_delay")),
+        (True, False, "sonar_delay", False, ("wind",)),  # it does not stand, nor what stood before
+        (True, False, None, True, ("wind",)),
+        (False, False, "sonar_delay", True, ("wind",)),
+        (False, True, "sonar_delay", True, ("wind", "sonar_delay")),
     ],
 )
 def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
-    monkeypatch, hides, adds, stands, named
+    monkeypatch, hides, denied, adds, stands, named
 ):
-    """Where noise may hide it; what fell is not looked for again, nor put in another's place."""
+    """Where noise may hide it, or what fell was denied; what fell is not looked for again, nor what was
+    denied put in another's place."""
     problem, fit, quadratic = fitted_with(0.0)
     own = {e: (FreeParameter(f"{e}.time", 0.0, 1.0),) for e in ("wind", "motor_lag", "sonar_delay")}
     problem = replace(problem, own=own)
@@ -232,11 +267,13 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
     asked: list[tuple[str, ...]] = []
 
     def weighed(problem: Problem, fit: Fit) -> tuple[Any, ...]:
+        assert ("motor_lag" in problem.candidates) == (not asked or not denied)
         asked.append(fit.active)
         kept = [e for e in fit.active if e != "motor_lag"]
         if "sonar_delay" in kept and not stands:
             kept = ["sonar_delay"]
-        return problem, replace(fit, active=tuple(kept)), quadratic, {}
+        gone = frozenset({"motor_lag"} if denied else set())
+        return problem, replace(fit, active=tuple(kept), denied=gone), quadratic, {}
 
     def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
         assert fit.active == ("wind",) and set(problem.candidates) == {"wind", "sonar_delay"}
@@ -253,7 +290,7 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
     monkeypatch.setattr(confounding, "likelier", lambda *given: None)
     engine = SimpleNamespace(filter=lambda values, noise: [])
     assert settled(replace(problem, engine=engine), fit).fit.active == named
-    assert len(asked) == (2 if hides and adds else 1)
+    assert len(asked) == (2 if (hides or denied) and adds else 1)
 
 
 def test_nothing_is_averaged_over_without_a_cause_nor_what_no_model_has_beside_it():

@@ -175,6 +175,7 @@ def test_what_does_not_act_where_it_should_show_falls(monkeypatch, size, worth, 
     flights = Flights({"motor_droop": worth * THRESHOLD, "gyro_bias": 2.0 * THRESHOLD})
     fit, _ = flights.pruned(monkeypatch, GOOD)
     assert fit.active == (("gyro_bias",) if falls else ("motor_droop", "gyro_bias"))
+    assert fit.denied == ({"motor_droop"} if falls else set())
     assert asked[:1] == ["gyro_bias"] and ("motor_droop" in asked) == (worth < 10.0)
 
 
@@ -684,8 +685,9 @@ def test_what_is_named_in_the_end_has_its_own_number():
     values = {"servo_lag.time": 0.05, "servo_rate.limit": 10.0, "wind.north": 2.0, "play": 0.02}
     fit = Fit(("servo_lag", "play", "wind"), values, Noise({}))
     there = {"servo_rate.limit": 1.3, "play": 0.03}
-    found = evidence.as_named(problem, fit, Fit(("servo_rate", "play"), there, Noise({})))
-    assert found.active == ("servo_rate", "play")
+    other = Fit(("servo_rate", "play"), there, Noise({}), denied=frozenset({"wind"}))
+    found = evidence.as_named(problem, fit, other)
+    assert found.active == ("servo_rate", "play") and found.denied == {"wind"}
     assert found.values == {
         "servo_lag.time": 0.0, "servo_rate.limit": 1.3, "wind.north": 0.0, "play": 0.02
     }  # fmt: skip

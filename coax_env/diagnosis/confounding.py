@@ -1,6 +1,6 @@
 """Which effects would do as well in a cause's place: its confounded alternatives, by refits."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -11,16 +11,18 @@ from coax_env.design.discrimination import Alternative, logged_rates
 from coax_env.design.next_maneuver import Design, design
 from coax_env.diagnosis.evidence import (
     Evidence,
+    Removal,
     as_far_apart,
     as_named,
     inflation_of,
+    is_denied_where_it_shows,
     less_sure,
     weighed,
 )
 from coax_env.diagnosis.fits import converged, fitted, noise_fitted, noise_may_hide
 from coax_env.diagnosis.from_afar import FAR, in_place_of
 from coax_env.diagnosis.problem import LATE_SERVO, PURE_DELAYS, Fit, Problem, exclusive_with
-from coax_env.diagnosis.scores import cost, is_large, score, swap
+from coax_env.diagnosis.scores import cost, inflation, is_large, score, swap
 from coax_env.diagnosis.search import search
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
@@ -169,7 +171,13 @@ def alternatives(
         shown_by = channels_of(problem, fit, quadratic, effect)
         judged = [white[c].inflation for c in shown_by if c in white]  # not of a few readings
         factor = max([evidence[effect].inflation, *judged])
-        return _of_one(problem, fit, quadratic, effect, factor, evidence[effect].lost)
+        others = _of_one(problem, fit, quadratic, effect, factor, evidence[effect].lost)
+        rest = evidence[effect].rest
+        return {
+            name: other
+            for name, other in others.items()
+            if rest is None or not _is_denied(problem, other, quadratic, name, rest)
+        }
 
     return problem.for_each(of_one, fit.active if of is None else of)
 
@@ -181,29 +189,32 @@ def settled(problem: Problem, fit: Fit) -> Settled:
         problem, fit: after the search.
     """
 
-    def at(fit: Fit) -> Settled:
-        own, there, quadratic, evidence = weighed(problem, fit)
+    def at(fit: Fit, denied: Collection[str] = ()) -> Settled:
+        asked = problem.of_candidates(set(problem.candidates) - set(denied))
+        own, there, quadratic, evidence = weighed(asked, fit)
         passes = own.engine.filter(there.values, there.noise)
         white = whiteness(passes, CHANNELS)
         found = alternatives(own, there, quadratic, evidence, white)
         return Settled(own, there, quadratic, evidence, passes, found)
 
     first = at(fit)
+    denied = first.fit.denied
     again = searched_again(problem, fit, first.fit)
     if again is not None:
-        second = at(again)
+        second = at(again, denied)
         if set(first.fit.active) < set(second.fit.active):
             fit, first = again, second
     other = likelier(first.problem, first.fit, first.quadratic, first.evidence, first.found)
     if other is None:
         return first
-    second = at(as_named(problem, fit, other))
+    second = at(as_named(problem, fit, other), denied)
     # what is not there in the end explained nothing: another optimum did
     return second if set(second.fit.active) == set(other.active) else first
 
 
 def searched_again(problem: Problem, fit: Fit, left: Fit) -> Fit | None:
-    """What a search adds once causes fell that stood for it, where noise may hide it.
+    """What a search adds once causes fell that stood for it, where noise may hide it; or once one fell
+    that was denied, whose nats are something else's.
 
     Beside late rotors, which fell, nothing showed of a sonar that is late and worth 58 nats
     (`study_diagnosis.py --arms telemetry --seed 846`, one 380).
@@ -212,7 +223,7 @@ def searched_again(problem: Problem, fit: Fit, left: Fit) -> Fit | None:
         problem, fit: after the search. left: with the causes that stand.
     """
     fallen = set(fit.active) - set(left.active)
-    if not fallen or not noise_may_hide(problem, fit):
+    if not left.denied and not (fallen and noise_may_hide(problem, fit)):
         return None
     rest = as_named(problem, fit, left)
     rest = fitted(problem, noise_fitted(problem, fitted(problem, rest)))
@@ -389,6 +400,18 @@ def _of_one(
         if mixed or trial.objective - fit.objective < most:
             found[twin] = trial
     return found
+
+
+def _is_denied(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str, rest: Fit) -> bool:
+    """Whether an alternative does not act where it should show, as no cause may.
+
+    Args:
+        problem, fit: with it in a cause's place. quadratic: linearised with the cause.
+        effect: the alternative. rest: with neither.
+    """
+    colour = inflation(problem, quadratic, fit.active, effect)
+    removal = Removal(Evidence(rest.objective - fit.objective, colour), rest)
+    return is_denied_where_it_shows(problem, fit, removal)
 
 
 def _near(

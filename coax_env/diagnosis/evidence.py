@@ -345,7 +345,8 @@ def weighed(problem: Problem, fit: Fit) -> tuple[Problem, Fit, Quadratic, dict[s
                 own = problem.base_names(pruned.active)
                 pruned = as_far_apart(problem, pruned, quadratic, evidence, asked, own)
             return first, pruned, quadratic, lesser
-        fit = only(problem, fit, asked.active)
+        denied = pruned.denied | asked.denied
+        fit = replace(only(problem, fit, asked.active), denied=denied)
 
 
 def beside_unseen_answers(
@@ -443,7 +444,8 @@ def as_named(problem: Problem, fit: Fit, other: Fit) -> Fit:
     """
     rest = only(problem, fit, other.active)
     new = [f.name for e in other.active if e not in fit.active for f in problem.own[e]]
-    return replace(rest.at({name: other.values[name] for name in new}), active=other.active)
+    there = rest.at({name: other.values[name] for name in new})
+    return replace(there, active=other.active, denied=other.denied)
 
 
 def inflation_of(problem: Problem, fit: Fit, quadratic: Quadratic, effect: str) -> float:
@@ -493,7 +495,8 @@ def _better(
     for effect, removal in weakest_first:
         if is_denied_where_it_shows(problem, fit, removal):
             problem.report(f"dropped {effect}: where most of it should show it does not act")
-            return removal.rest.noted(f"- {effect}", removal.evidence.nats)
+            rest = removal.rest.noted(f"- {effect}", removal.evidence.nats)
+            return replace(rest, denied=rest.denied | {effect})
     return None
 
 

@@ -397,6 +397,7 @@ class Fit:
         history: (move, nats) of the search, in order.
         strongest: evidence [nats] and name of the candidate that came nearest to being added, or was;
             the threshold is calibrated on it (scripts/study_diagnosis.py --calibrate).
+        denied: effects that left though they were worth a name: where they should show they do not act.
     """
 
     active: tuple[str, ...]
@@ -407,6 +408,7 @@ class Fit:
     std_ratio: Mapping[str, float] = field(default_factory=dict)
     history: tuple[tuple[str, float], ...] = ()
     strongest: tuple[float, str] = (-math.inf, "")
+    denied: frozenset[str] = frozenset()
 
     def at(self, values: Mapping[str, float]) -> "Fit":
         """With some values changed."""
