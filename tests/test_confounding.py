@@ -10,6 +10,7 @@ import pytest
 
 from coax_env.diagnosis import confounding, evidence, remarks
 from coax_env.diagnosis.confounding import (
+    Settled,
     alike_unturned,
     beside_undecided,
     likelier,
@@ -22,6 +23,7 @@ from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.where_shown import SizeWhereMost
 from coax_env.estimation.helicopter import HeliModel
+from coax_env.estimation.prediction import RunReplay
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.model.vehicle_file import load_vehicle
@@ -253,6 +255,7 @@ def test_a_likelier_alternative_stays_where_it_stands_once_weighed(monkeypatch, 
         (True, False, None, True, ("wind",)),
         (False, False, "sonar_delay", True, ("wind",)),
         (False, True, "sonar_delay", True, ("wind", "sonar_delay")),
+        (False, True, "worse", True, ("wind",)),  # with it runs are flown worse
     ],
 )
 def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
@@ -261,8 +264,8 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
     """Where noise may hide it, or what fell was denied; what fell is not looked for again, nor what was
     denied put in another's place."""
     problem, fit, quadratic = fitted_with(0.0)
-    own = {e: (FreeParameter(f"{e}.time", 0.0, 1.0),) for e in ("wind", "motor_lag", "sonar_delay")}
-    problem = replace(problem, own=own)
+    every = ("wind", "motor_lag", "sonar_delay", "worse")
+    problem = replace(problem, own={e: (FreeParameter(f"{e}.time", 0.0, 1.0),) for e in every})
     fit = replace(fit, active=("wind", "motor_lag"))
     asked: list[tuple[str, ...]] = []
 
@@ -276,7 +279,7 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
         return problem, replace(fit, active=tuple(kept), denied=gone), quadratic, {}
 
     def search(problem: Problem, fit: Fit) -> tuple[Fit, Quadratic]:
-        assert fit.active == ("wind",) and set(problem.candidates) == {"wind", "sonar_delay"}
+        assert fit.active == ("wind",) and set(problem.candidates) == {*every} - {"motor_lag"}
         return replace(fit, active=(*fit.active, adds) if adds else fit.active), quadratic
 
     monkeypatch.setattr(confounding, "noise_may_hide", lambda problem, fit: hides)
@@ -288,9 +291,43 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
     monkeypatch.setattr(confounding, "whiteness", lambda passes, channels: {})
     monkeypatch.setattr(confounding, "alternatives", lambda *given: {})
     monkeypatch.setattr(confounding, "likelier", lambda *given: None)
+    monkeypatch.setattr(
+        confounding, "_flies_a_run_worse", lambda found, other: "worse" in found.fit.active
+    )
     engine = SimpleNamespace(filter=lambda values, noise: [])
     assert settled(replace(problem, engine=engine), fit).fit.active == named
     assert len(asked) == (2 if (hides or denied) and adds else 1)
+
+
+@pytest.mark.parametrize(
+    ("coloured", "heights", "worse"),
+    [
+        (True, (0.4, 1.1), True),  # in the mean nearer
+        (True, (0.4, 0.9), False),
+        (True, (0.4, math.nan), True),  # it diverges
+        (False, (0.4, 1.1), False),
+    ],
+)
+def test_where_much_is_coloured_every_run_must_be_flown_no_worse(
+    monkeypatch, coloured, heights, worse
+):
+    problem, fit, quadratic = fitted_with(0.0)
+    problem = replace(problem, engine=SimpleNamespace(threads=1))
+    more = replace(fit, active=(*fit.active, "rotor_drag"))
+    found, other = (
+        Settled(problem, of.at({"is": len(of.active)}), quadratic, {}, [], {}) for of in (more, fit)
+    )
+
+    def flown(engine: Any, values: Any, noise: Noise, horizon: float) -> list[RunReplay]:
+        errors = heights if values["is"] == len(more.active) else (1.0, 1.0)
+        return [
+            RunReplay("", {"h": SimpleNamespace(error=np.full(9, e))}, math.isnan(e), {})  # type: ignore[dict-item]
+            for e in errors
+        ]
+
+    monkeypatch.setattr(confounding, "is_much_coloured", lambda problem, fit: coloured)
+    monkeypatch.setattr(confounding, "replay_runs", flown)
+    assert confounding._flies_a_run_worse(found, other) == worse
 
 
 def test_nothing_is_averaged_over_without_a_cause_nor_what_no_model_has_beside_it():
