@@ -268,6 +268,7 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
     problem = replace(problem, own={e: (FreeParameter(f"{e}.time", 0.0, 1.0),) for e in every})
     fit = replace(fit, active=("wind", "motor_lag"))
     asked: list[tuple[str, ...]] = []
+    looked: list[set[str]] = []
 
     def weighed(problem: Problem, fit: Fit) -> tuple[Any, ...]:
         assert ("motor_lag" in problem.candidates) == (not asked or not denied)
@@ -289,7 +290,9 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
     monkeypatch.setattr(confounding, "fitted", lambda problem, fit: fit)
     monkeypatch.setattr(confounding, "noise_fitted", lambda problem, fit: fit)
     monkeypatch.setattr(confounding, "whiteness", lambda passes, channels: {})
-    monkeypatch.setattr(confounding, "alternatives", lambda *given: {})
+    monkeypatch.setattr(
+        confounding, "alternatives", lambda problem, *_: looked.append({*problem.candidates}) or {}
+    )
     monkeypatch.setattr(confounding, "likelier", lambda *given: None)
     monkeypatch.setattr(
         confounding, "_flies_a_run_worse", lambda found, other: "worse" in found.fit.active
@@ -297,6 +300,7 @@ def test_what_stood_for_a_cause_may_fall_and_the_cause_be_found(
     engine = SimpleNamespace(filter=lambda values, noise: [])
     assert settled(replace(problem, engine=engine), fit).fit.active == named
     assert len(asked) == (2 if (hides or denied) and adds else 1)
+    assert all(("motor_lag" in own) != denied for own in looked)
 
 
 @pytest.mark.parametrize(

@@ -199,6 +199,7 @@ def settled(problem: Problem, fit: Fit) -> Settled:
     def at(fit: Fit, denied: Collection[str] = ()) -> Settled:
         asked = problem.of_candidates(set(problem.candidates) - set(denied))
         own, there, quadratic, evidence = weighed(asked, fit)
+        own = own.of_candidates(set(own.candidates) - there.denied)
         passes = own.engine.filter(there.values, there.noise)
         white = whiteness(passes, CHANNELS)
         found = alternatives(own, there, quadratic, evidence, white)
