@@ -5,7 +5,6 @@ Each against a closed form first; then hidden in flights by other code in anothe
 
 import math
 from collections.abc import Callable, Collection
-from dataclasses import replace
 
 import injector
 import numpy as np
@@ -13,8 +12,7 @@ import pytest
 from causes import check_causes, truth_of
 
 import coax_env
-from coax_env.diagnosis.diagnose import diagnose, namable, stated
-from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.diagnosis.diagnose import diagnose, namable
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
 from coax_env.model import dynamics
 from coax_env.model import inputs as U
@@ -275,29 +273,6 @@ def test_the_voltage_is_read_held_and_written(tmp_path):
 def test_sag_is_named_by_time_or_by_voltage_never_by_both(battery, named, not_named):
     candidates = namable((), LAMA, logged(battery))
     assert named in candidates and not_named not in candidates
-
-
-def test_the_nominal_voltage_is_the_flights_and_nothing_else_is_fitted():
-    flight = logged(np.linspace(12.4, 11.84, 400))
-    assert stated(flight) == {"battery_voltage.nominal": 12.1}
-    assert stated(logged(None)) == {}
-    (run,) = flight.runs
-    rng = np.random.default_rng(2)
-    speeds = run.command * (1.0 + 0.07 * (run.battery[:, None] - 11.5))
-    seen = {
-        name: 30.0 / math.pi * speeds[:, k] + 5.0 * rng.standard_normal(400)
-        for k, name in enumerate(("rpm_upper", "rpm_lower"))
-    }
-    measured = replace(flight, runs=(replace(run, measured=seen),))
-    assert stated(measured)["battery_voltage.nominal"] == pytest.approx(11.5, abs=0.03)
-    model = HeliModel(LAMA, stated(flight))
-    assert [f.name for f in model.effect_parameters("battery_voltage")] == [
-        "battery_voltage.per_volt"
-    ]
-    u = model.inputs(record_of(flight.runs[0]), model.vector(model.bare_values))
-    np.testing.assert_allclose(u[:, U.BATTERY], np.linspace(0.3, -0.26, 400), atol=1e-12)
-    own = LAMA.with_effect("battery_voltage", per_volt=0.05, nominal=10.0)
-    assert HeliModel(own, stated(flight)).bare_values["battery_voltage.nominal"] == 10.0
 
 
 # --- hidden by other code, and found -----------------------------------------------------------------

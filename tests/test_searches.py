@@ -752,6 +752,34 @@ def test_a_cause_that_jitter_was_found_beside_is_not_forgotten(
     assert found.fit.active == (active,) and begun == [had] * searches
 
 
+@pytest.mark.parametrize(("costs", "stands"), [((9.0, 5.0), True), ((5.0, 9.0), False)])
+def test_causes_of_another_problem_are_where_a_second_search_begins(monkeypatch, costs, stands):
+    """With their numbers there, but for what the problem does not name; the likelier end stands."""
+    begun: list[Fit] = []
+
+    def search(problem: Any, fit: Fit) -> tuple[Fit, None]:
+        begun.append(fit)
+        return fit, None
+
+    stand_in(monkeypatch, "search", search)
+    stand_in(monkeypatch, "cost", lambda problem, fit, quadratic: costs["motor_lag" in fit.active])
+    stand_in(monkeypatch, "fitted", lambda problem, fit: fit)
+    stand_in(monkeypatch, "noise_fitted", lambda problem, fit: fit)
+    own = {"motor_lag": [SimpleNamespace(name="motor_lag.upper")], "wind": []}
+    said: list[str] = []
+    problem: Any = SimpleNamespace(candidates=tuple(own), own=own, report=said.append)
+    wind = Fit(("wind",), {"motor_lag.upper": 0.0, "mass": 1.0}, FINE)
+    nothing = replace(wind, active=())
+    best = Searched(problem, nothing, nothing, wind, None)  # type: ignore[arg-type]
+    values = {"motor_lag.upper": 0.1, "battery_voltage.per_volt": 0.3, "mass": 2.0}
+    other = replace(best, fit=Fit(("motor_lag", "battery_voltage"), values, replace(FINE)))
+    found = once.from_causes_of(best, other)
+    assert [fit.active for fit in begun] == [("motor_lag",)]
+    assert begun[0].values == {"motor_lag.upper": 0.1, "mass": 1.0} and begun[0].noise is FINE
+    assert (found.fit.active == ("motor_lag",)) == stands
+    assert said == [f"from the causes found so: {4.0 if stands else 0.0:.1f} nats"]
+
+
 @pytest.mark.parametrize("coloured", [True, False])
 def test_air_of_each_runs_own_stands_where_little_is_coloured_in_it(monkeypatch, coloured):
     """What is coloured without it says nothing: such air colours innovations itself."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
-from coax_env.diagnosis.diagnose import stated
+from coax_env.diagnosis.battery import stated
 from coax_env.errors import InputError
 from coax_env.estimation import vibration
 from coax_env.estimation.engine import Engine
@@ -146,5 +146,6 @@ def one_flight(
 
 def nominal_voltage(flights: tuple[OneFlight, OneFlight]) -> dict[str, float]:
     """What effects take as stated, of both flights together: one machine has one."""
-    first = flights[0].flight
-    return stated(replace(first, runs=tuple(run for f in flights for run in f.flight.runs)))
+    first = flights[0]
+    both = replace(first.flight, runs=tuple(run for f in flights for run in f.flight.runs))
+    return stated(both, first.vehicle)

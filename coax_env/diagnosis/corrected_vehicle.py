@@ -49,7 +49,7 @@ def corrected_vehicle(
         factor = inflations.get(f.name.partition(".")[0], 1.0)
         return stated_std(fit, f, float(spread[free.index(f)]), factor, dt)
 
-    source = f"diagnosed from {flight.path.name if flight.path else 'flight'}"
+    source = diagnosed_from(flight)
     vehicle = fitted_vehicle(
         problem.model.vehicle,
         of_vehicle,
@@ -73,6 +73,11 @@ def corrected_vehicle(
             for kind, (amplitude, std) in large(lines).items()
         }
     )
+
+
+def diagnosed_from(flight: Flight) -> str:
+    """The source of what a flight says. flight: any."""
+    return f"diagnosed from {flight.path.name if flight.path else 'flight'}"
 
 
 def with_held_out(

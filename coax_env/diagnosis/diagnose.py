@@ -32,9 +32,10 @@ from coax_env.diagnosis import (
     slow_commands,
     unlisted,
 )
+from coax_env.diagnosis.battery import PER_VOLT, VOLTAGE, felt_voltage, stated, voltage_varies
 from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
-from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
+from coax_env.diagnosis.corrected_vehicle import corrected_vehicle, diagnosed_from
 from coax_env.diagnosis.evidence import less_sure
 from coax_env.diagnosis.gain import TOO_SHORT, flies_worse, gain_of
 from coax_env.diagnosis.hold_out import check_hold_out, split
@@ -51,6 +52,7 @@ from coax_env.diagnosis.remarks import (
     one_step_against_a_second,
     remarks,
 )
+from coax_env.diagnosis.searches.once import from_causes_of, given_with
 from coax_env.diagnosis.searches.searched import searched
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.shock_evidence import in_own_strengths
@@ -71,7 +73,7 @@ from coax_env.estimation.whiteness import Whiteness, whiteness
 from coax_env.logs.fast_rows import decimated
 from coax_env.logs.flight import Flight, read_flight
 from coax_env.model import effects
-from coax_env.model.layout import CHANNELS, ROTOR_SPEEDS, RPM_PER_RAD_S
+from coax_env.model.layout import CHANNELS
 from coax_env.model.vehicle import Vehicle
 from coax_env.model.vehicle_file import load_vehicle
 from coax_env.progress import Progress, reporter, shows_progress
@@ -174,7 +176,7 @@ def diagnose(
     circular = onboard_filter.of_onboard_filter(calm.runs)
     flight, calm = decimated(flight), decimated(calm)
     new_lines = lines if "vibration" not in vehicle.effects else ()
-    model = HeliModel(vehicle, stated(flight))
+    model = HeliModel(vehicle, stated(flight, vehicle))
     noise = starting_noise(calm, calm_vehicle)
     candidates = namable(exclude, vehicle, flight)
     report = reporter(progress)
@@ -185,6 +187,15 @@ def diagnose(
         of_sensors.append(onboard_filter.remark())
         records = onboard_filter.read_seldom(records, CHANNELS)
     used, held = split(model, records, noise, hold_out, candidates, settings)
+    fitted_on = flight.select(r.whole for r in used)
+    model = given = HeliModel(vehicle, stated(fitted_on, vehicle))
+    felt = felt_voltage(fitted_on, vehicle) if VOLTAGE in candidates else None
+    if felt is not None and felt.is_shown(settings.evidence):
+        report("speeds follow the battery's voltage, by the felt thrust")
+        model = HeliModel(felt.known(vehicle, diagnosed_from(flight)))
+        candidates = tuple(e for e in candidates if e != VOLTAGE)
+    else:
+        felt = None
 
     between = slow_commands.between_known(used)
     if between > settings.unknown_commands:
@@ -194,11 +205,18 @@ def diagnose(
     problem = replace(problem, of_onboard_filter=circular, between_commands=between)
     clock = clock_of(flight.runs)
     first = slow_commands.likelier_on_the_way(searched(problem, noise, clock))
+    if felt is not None:
+        report("searching as though they did not, for causes to begin with")
+        first = from_causes_of(first, searched(problem.with_model(given), noise, clock))
     of_sensors += log_faults.remarks(problem, first)
     held = log_faults.undone(held, problem, first)
     problem, bare, refitted = first.problem, first.bare, first.refitted
+    if felt is not None:
+        bare, refitted = given_with(first, {PER_VOLT: 0.0}, noise)
     passes_before = problem.engine.filter(bare.values, bare.noise)
-    state = first.changing or with_onsets(problem, first.fit, first.quadratic, refitted, clock)
+    state = first.changing or with_onsets(
+        problem, first.fit, first.quadratic, first.refitted, clock
+    )
     problem, fit, quadratic, terms = unlisted.explain(state.problem, state.fit, state.quadratic)
     report("weighing the causes against their confounded alternatives")
     problem, fit, quadratic, evidence, passes_after, found = confounding.settled(
@@ -231,7 +249,7 @@ def diagnose(
     trust = trusts(
         problem, fit, quadratic, evidence, found, white["after"], onsets, unseen, worse, bool(swinging)
     )
-    causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets)
+    causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets, felt)
     described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)
     unnamed = findings.without_a_name(evidence, trust, white["after"])
@@ -311,59 +329,12 @@ def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple
             known = ", ".join(effects.CATALOGUE)
             raise InputError(f"no effect {name!r} to exclude; the catalogue has {known}")
     absent = set(exclude) | set(vehicle.effects) | _without_sensor(flight)
-    absent.add("battery_sag" if _voltage_varies(flight) else "battery_voltage")
+    absent.add("battery_sag" if voltage_varies(flight) else "battery_voltage")
     return tuple(
         e
         for e, entry in effects.CATALOGUE.items()
         if e not in absent and not entry.line and not entry.named_as
     )
-
-
-VARYING = 0.1
-"""Volts from the lowest to the highest battery voltage, more than a reading's noise; ours."""
-
-
-FARTHEST = 0.5
-"""Share of the mean voltage that a nominal one may be away from it; ours."""
-
-
-def _voltage_varies(flight: Flight) -> bool:
-    """Whether the flight's battery is logged and its voltage shows more than noise."""
-    logged = [run.battery for run in flight.runs if run.battery is not None]
-    return bool(logged) and float(np.ptp(np.concatenate(logged))) > VARYING
-
-
-def stated(flight: Flight) -> dict[str, float]:
-    """Values that effects take from a flight as stated: the battery's nominal voltage.
-
-    Where a rotor's speed is measured, the voltage at which it is what was commanded, by a line through
-    speed over command against voltage; else the mean, to 0.1 V: thrust coefficients take up the rest.
-    """
-    logged = [run.battery for run in flight.runs if run.battery is not None]
-    if not logged:
-        return {}
-    mean = float(np.mean(np.concatenate(logged)))
-    nominal = round(mean, 1)
-    volts, ratio = _followed(flight)
-    if len(volts) and _voltage_varies(flight):
-        slope, at_mean = np.polyfit(volts - mean, ratio, 1)
-        if slope > 0.0 and abs(1.0 - at_mean) < FARTHEST * mean * slope:
-            nominal = mean + float((1.0 - at_mean) / slope)
-    return {"battery_voltage.nominal": nominal}
-
-
-def _followed(flight: Flight) -> tuple[np.ndarray, np.ndarray]:
-    """Battery voltages [V], and measured over commanded rotor speeds at them, (n,) each."""
-    volts, ratio = [np.empty(0)], [np.empty(0)]
-    for run in flight.runs:
-        for k, channel in enumerate(ROTOR_SPEEDS):
-            if run.battery is None or channel not in run.measured:
-                continue
-            command = run.command[:, k] * RPM_PER_RAD_S
-            read = np.isfinite(run.measured[channel]) & (command > 0.0)
-            volts.append(run.battery[read])
-            ratio.append(run.measured[channel][read] / command[read])
-    return np.concatenate(volts), np.concatenate(ratio)
 
 
 def _without_sensor(flight: Flight) -> frozenset[str]:

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from coax_env.diagnosis.battery import PER_VOLT, VOLTAGE, FeltVoltage, Line
 from coax_env.diagnosis.confounding import Alternatives, untold
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
-from coax_env.diagnosis.trust import Trust, of_line
+from coax_env.diagnosis.trust import Trust, of_line, of_voltage
+from coax_env.estimation import vibration
 from coax_env.estimation.changing_model import BEFORE
 from coax_env.estimation.fitted_vehicle import with_timing
 from coax_env.estimation.helicopter_noise import level_unit
@@ -18,7 +20,7 @@ from coax_env.estimation.parted_engine import AT, of_part
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
-from coax_env.estimation.vibration import Line, large
+from coax_env.estimation.vibration import large
 from coax_env.estimation.whiteness import Whiteness
 from coax_env.model import effects
 from coax_env.model.layout import CHANNELS
@@ -37,8 +39,9 @@ def causes(
     evidence: Mapping[str, Evidence],
     found: Alternatives,
     trust: Mapping[str, Trust],
-    lines: Sequence[Line],
+    lines: Sequence[vibration.Line],
     onsets: Mapping[str, Onset] | None = None,
+    felt: FeltVoltage | None = None,
 ) -> list[dict[str, Any]]:
     """The causes: those that are sure before those that are doubtful, each strongest first.
 
@@ -53,6 +56,7 @@ def causes(
         trust: what speaks for and against each name; one without a name is not among the causes.
         lines: of a vibration that the vehicle file does not have.
         onsets: of causes that began or changed.
+        felt: how speeds follow the battery's voltage, where that is known before the search.
     """
     onsets = onsets or {}
     free = problem.free_names(fit.active)
@@ -92,6 +96,8 @@ def causes(
             entries[-1]["before"] = {n: number(f, factor) for n, f in earlier.items() if f}
     if sizes := large(lines):
         entries.append(_vibration(lines, sizes))
+    if felt is not None and felt.line is not None:
+        entries.append(_voltage(felt, felt.line))
     return _in_order(mixtures_as_one(entries))
 
 
@@ -153,7 +159,9 @@ def stated_std(
     return with_timing(parameter, spread, dt)
 
 
-def _vibration(lines: Sequence[Line], sizes: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+def _vibration(
+    lines: Sequence[vibration.Line], sizes: Mapping[str, tuple[float, float]]
+) -> dict[str, Any]:
     """The cause that is found by its lines and not by a signature; sizes: `large` of these."""
     units = {p.name: p.unit for p in effects.CATALOGUE["vibration"].parameters}
     own = [line for line in lines if line.kind in sizes]
@@ -172,6 +180,22 @@ def _vibration(lines: Sequence[Line], sizes: Mapping[str, tuple[float, float]]) 
         "confusable_with": [],
         "channels": list(dict.fromkeys(c for line in own for c in line.channels)),
         **of_line(max(own, key=lambda line: line.evidence)).entries(),
+    }
+
+
+def _voltage(felt: FeltVoltage, line: Line) -> dict[str, Any]:
+    """The cause that is found by the felt thrust and not by a signature. line: of `felt`."""
+    unit = effects.CATALOGUE[VOLTAGE].parameters[0].unit
+    spread = math.hypot(line.std, FORM * line.per_volt)
+    number = {"value": line.per_volt, "std": spread, "unit": unit, "determined": True}
+    trust = of_voltage(felt)
+    return {
+        "effect": VOLTAGE,
+        "parameters": {PER_VOLT: number},
+        "evidence": felt.evidence,
+        "confusable_with": [],
+        "channels": list(trust.channels),
+        **trust.entries(),
     }
 
 

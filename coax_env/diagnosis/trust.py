@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from coax_env.diagnosis.battery import PER_VOLT, FeltVoltage
 from coax_env.diagnosis.confounding import (
     KNOWN,
     Alternatives,
@@ -21,7 +22,7 @@ from coax_env.diagnosis.confounding import (
     channels_of_numbers,
     untold,
 )
-from coax_env.diagnosis.doubts import LOUD, Against, doubts, on_parts, sizes, without_name
+from coax_env.diagnosis.doubts import LOUD, Against, doubts, on_parts, sizes, weak, without_name
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.late_rotor_speeds import LAG, by_speeds_alone
 from coax_env.diagnosis.noise_variation import not_holding
@@ -50,6 +51,12 @@ TAKEN_BACK = 0.1
 """Share of an accelerometer's bias that a tilt beside it must leave at rest, or they are one thing with
 two names: by chance a pair in a hundred does. Gyros alone that were turned by 1.1 degrees were both,
 sure, for 640 and 595 nats (**synthetic**; an inertial sensor's axes are square to 1 or 2 %); ours."""
+
+
+BETWEEN_RUNS = (
+    "the voltage differs from run to run, and in none by enough to show it: another load on these runs"
+    " would look the same"
+)
 
 
 @dataclass(frozen=True)
@@ -271,6 +278,38 @@ def of_line(line: Line, chosen: Settings = SETTINGS) -> Trust:
     against = tuple(on_parts(of_parts, len(runs), chosen))
     known = {f"vibration.{line.kind}": True}
     return Trust(True, of_parts.runs, of_parts.kept, known, against, line.channels)
+
+
+def of_voltage(felt: FeltVoltage, chosen: Settings = SETTINGS) -> Trust:
+    """What is known of speeds that follow the battery's voltage, as the felt thrust shows it.
+
+    Args:
+        felt: with a line. chosen: what decides.
+    """
+    assert felt.line is not None
+    whole, runs = felt.line, tuple(felt.points)
+
+    def returns(part: FeltVoltage) -> bool | None:
+        line = part.line
+        share = min((whole.std / line.std) ** 2, 1.0) if line else 0.0
+        asked = Asked(share, 1.0, whole.evidence, chosen)
+        return asked.margin(part.evidence) >= 0.0 if asked.can_tell else None
+
+    without = [bool(returns(felt.of(n for n in runs if n != out))) for out in runs]
+    halves = halves_of([range(len(runs))], chosen.splits)
+    told = [
+        t for t in (returns(felt.of(runs[i] for i in half)) for half in halves) if t is not None
+    ]
+    of_parts = Replication(
+        sum(without) / len(runs),
+        sum(told) / len(told) if told else None,
+        tuple(name for name, there in zip(runs, without, strict=True) if not there),
+    )
+    against = [*on_parts(of_parts, len(runs), chosen), *weak(whole.evidence, False, chosen)]
+    if felt.within_runs.evidence < chosen.evidence:
+        against.append(BETWEEN_RUNS)
+    known = {PER_VOLT: True}
+    return Trust(True, of_parts.runs, of_parts.kept, known, tuple(against), ("az", "h"))
 
 
 def determined(

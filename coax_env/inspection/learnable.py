@@ -10,7 +10,8 @@ from itertools import combinations
 
 import numpy as np
 
-from coax_env.diagnosis.diagnose import namable, stated
+from coax_env.diagnosis.battery import stated
+from coax_env.diagnosis.diagnose import namable
 from coax_env.diagnosis.fits import start
 from coax_env.diagnosis.problem import Problem
 from coax_env.estimation import vibration
@@ -78,7 +79,7 @@ class Learnable:
 def learnable(flight: Flight, vehicle: Vehicle) -> Learnable:
     """What these flights would determine of effects and own numbers."""
     _, calm, calm_vehicle = vibration.calmed(flight, vehicle)
-    model = HeliModel(calm_vehicle, stated(flight))
+    model = HeliModel(calm_vehicle, stated(flight, calm_vehicle))
     records = [record_of(run) for run in calm.runs]
     problem = Problem.of(model, records, namable((), vehicle, flight))
     fit = start(problem, starting_noise(calm, model.vehicle))

@@ -271,7 +271,7 @@ def battery_voltage(x, f, p, e):
     """Rotor speed per command times 1 + k (V - nominal), with the battery's logged voltage V.
 
     Off: the usual 3 cells of 3.7 V. Where no rotor speed is measured the nominal voltage is one column
-    with the thrust coefficients: it is stated, not fitted (diagnose.stated). No more than speed
+    with the thrust coefficients: it is stated, not fitted (battery.stated). No more than speed
     proportional to voltage is to be expected: k = 1/nominal.
     """
     f[F.SPEED_SCALE] *= 1.0 + p[e] * f[F.BATTERY]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coax_env.diagnosis.diagnose import stated
+from coax_env.diagnosis.battery import stated
 from coax_env.diagnosis.fits import linearise, noise_fitted, start, without_drifts
 from coax_env.diagnosis.onsets.changing import beginning
 from coax_env.diagnosis.problem import Fit, Problem
@@ -56,7 +56,7 @@ def _steady(folder: Path, names: list[str]) -> tuple[Problem, Fit, dict[str, Lap
     vehicle = load_vehicle(flight.vehicle).in_air(flight.air)
     flight = flown_parts(flight, vehicle)
     _, calm, calm_vehicle = vibration.calmed(flight, vehicle)
-    model = HeliModel(vehicle, stated(flight))
+    model = HeliModel(vehicle, stated(flight, vehicle))
     problem = Problem.of(model, [record_of(run) for run in calm.runs], names)
     fit = without_drifts(start(problem, starting_noise(calm, calm_vehicle)))
     return problem, fit, clock_of(flight.runs)

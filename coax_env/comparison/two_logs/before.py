@@ -7,7 +7,8 @@ import numpy as np
 
 from coax_env.comparison.two_logs.coordinates import ROTOR_SPEED, Coordinate, coordinates
 from coax_env.comparison.two_logs.logs import Logs
-from coax_env.diagnosis.diagnose import namable, stated
+from coax_env.diagnosis.battery import stated
+from coax_env.diagnosis.diagnose import namable
 from coax_env.diagnosis.fits import fitted, noise_fitted, start
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
@@ -50,7 +51,7 @@ def fitted_model(
         settings: of the search.
         progress: called with a line of text.
     """
-    model = HeliModel(vehicle, stated(flight))
+    model = HeliModel(vehicle, stated(flight, vehicle))
     records = [record_of(run) for run in flight.runs]
     candidates = namable((), vehicle, flight)
     problem = Problem.of(model, records, candidates, settings, progress)

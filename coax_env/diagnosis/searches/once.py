@@ -5,13 +5,20 @@ if that is likelier: what was found beside a delay that is off by a part of a ro
 part.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis import late_readings
-from coax_env.diagnosis.fits import fitted, flown_errors, noise_fitted, start, steadied
+from coax_env.diagnosis.fits import (
+    fitted,
+    flown_errors,
+    in_noise_from,
+    noise_fitted,
+    start,
+    steadied,
+)
 from coax_env.diagnosis.onsets.changing import Changing
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.scores import cost
@@ -24,6 +31,8 @@ from coax_env.estimation.whiteness import are_white, whiteness
 
 MOST_MOVES = 3
 """Times that late readings are moved, each by the delay found with the rows before; ours."""
+TURNS = 2
+"""Of values and noise, before a search begins with causes of another problem; ours."""
 READ_WITHIN = 0.02
 """Of a row, to which the delay of the commands that readings see is looked for; ours."""
 
@@ -74,6 +83,36 @@ def as_given(problem: Problem, noise: Noise, coarse: bool = False) -> tuple[Fit,
     problem.report("estimating gusts and noise of the model as given")
     bare = start(problem, noise, held=LEAST_READING_STD if coarse else ())
     problem.report("fitting the model's own parameters")
+    return bare, steadied(problem, noise_fitted(problem, fitted(problem, bare)))
+
+
+def from_causes_of(best: Searched, other: Searched) -> Searched:
+    """What was found, or what a search in its problem ends with from the causes of another one, where
+    that is likelier: of many causes the way there decides.
+
+    Args:
+        best: from no cause. other: of another problem.
+    """
+    names = [e for e in other.fit.active if e in best.problem.candidates]
+    own = {f.name: other.fit.values[f.name] for e in names for f in best.problem.own[e]}
+    begun = replace(best.refitted.at(own), active=tuple(names))
+    for _ in range(TURNS):
+        begun = fitted(best.problem, noise_fitted(best.problem, begun))
+    found = likelier(best, begun)
+    best.problem.report(f"from the causes found so: {best.cost - found.cost:.1f} nats")
+    return found
+
+
+def given_with(found: Searched, values: Mapping[str, float], noise: Noise) -> tuple[Fit, Fit]:
+    """As `as_given`, with some values as they were, in the readings and air that were found.
+
+    Args:
+        found: of a search. values: by name. noise: process levels to start from.
+    """
+    problem = found.problem
+    begun = found.bare.noise.with_levels(noise.process)
+    held = LEAST_READING_STD if found.coarse else ()
+    bare = in_noise_from(problem, found.bare.at(values), begun, held)
     return bare, steadied(problem, noise_fitted(problem, fitted(problem, bare)))
 
 
