@@ -15,7 +15,7 @@ every run.
 """
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -41,6 +41,22 @@ class Replication:
     runs: float
     kept: float | None
     rests_on: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, names: Sequence[str], without: Sequence[bool | None], halved: Iterable[bool | None]
+    ) -> "Replication":
+        """Of what returned; None: a part could not tell.
+
+        Args:
+            names: of the runs. without: each of them. halved: on each half.
+        """
+        told = [returned for returned in halved if returned is not None]
+        return cls(
+            sum(map(bool, without)) / len(names),
+            sum(told) / len(told) if told else None,
+            tuple(name for name, returned in zip(names, without, strict=True) if not returned),
+        )
 
 
 def replications(
@@ -72,11 +88,8 @@ def _of_one(
     without: Sequence[Mapping[str, bool | None]],
     halved: Sequence[Mapping[str, bool | None]],
 ) -> Replication:
-    told = [returned for part in halved if (returned := part[effect]) is not None]
-    return Replication(
-        sum(bool(part[effect]) for part in without) / len(names),
-        sum(told) / len(told) if told else None,
-        tuple(name for name, part in zip(names, without, strict=True) if not part[effect]),
+    return Replication.of(
+        names, [part[effect] for part in without], [part[effect] for part in halved]
     )
 
 

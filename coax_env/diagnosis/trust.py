@@ -270,11 +270,7 @@ def of_line(line: Line, chosen: Settings = SETTINGS) -> Trust:
         asked = Asked(len(part) / len(every), 1.0, line.evidence, chosen)
         return asked.can_tell and asked.margin(line.evidence_of(part)) >= 0.0
 
-    of_parts = Replication(
-        sum(map(returns, rest)) / len(runs),
-        sum(map(returns, halves)) / len(halves) if halves else None,
-        tuple(name for name, part in zip(runs, rest, strict=True) if not returns(part)),
-    )
+    of_parts = Replication.of(runs, list(map(returns, rest)), map(returns, halves))
     against = tuple(on_parts(of_parts, len(runs), chosen))
     known = {f"vibration.{line.kind}": True}
     return Trust(True, of_parts.runs, of_parts.kept, known, against, line.channels)
@@ -295,16 +291,10 @@ def of_voltage(felt: FeltVoltage, chosen: Settings = SETTINGS) -> Trust:
         asked = Asked(share, 1.0, whole.evidence, chosen)
         return asked.margin(part.evidence) >= 0.0 if asked.can_tell else None
 
-    without = [bool(returns(felt.of(n for n in runs if n != out))) for out in runs]
+    without = [returns(felt.of(n for n in runs if n != out)) for out in runs]
     halves = halves_of([range(len(runs))], chosen.splits)
-    told = [
-        t for t in (returns(felt.of(runs[i] for i in half)) for half in halves) if t is not None
-    ]
-    of_parts = Replication(
-        sum(without) / len(runs),
-        sum(told) / len(told) if told else None,
-        tuple(name for name, there in zip(runs, without, strict=True) if not there),
-    )
+    halved = [returns(felt.of(runs[i] for i in half)) for half in halves]
+    of_parts = Replication.of(runs, without, halved)
     against = [*on_parts(of_parts, len(runs), chosen), *weak(whole.evidence, False, chosen)]
     if felt.within_runs.evidence < chosen.evidence:
         against.append(BETWEEN_RUNS)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from scipy.optimize import minimize_scalar
 
 from coax_env.diagnosis import late_readings
+from coax_env.diagnosis.evidence import as_named
 from coax_env.diagnosis.fits import (
     fitted,
     flown_errors,
@@ -83,7 +84,11 @@ def as_given(problem: Problem, noise: Noise, coarse: bool = False) -> tuple[Fit,
     problem.report("estimating gusts and noise of the model as given")
     bare = start(problem, noise, held=LEAST_READING_STD if coarse else ())
     problem.report("fitting the model's own parameters")
-    return bare, steadied(problem, noise_fitted(problem, fitted(problem, bare)))
+    return bare, _refitted(problem, bare)
+
+
+def _refitted(problem: Problem, bare: Fit) -> Fit:
+    return steadied(problem, noise_fitted(problem, fitted(problem, bare)))
 
 
 def from_causes_of(best: Searched, other: Searched) -> Searched:
@@ -93,9 +98,8 @@ def from_causes_of(best: Searched, other: Searched) -> Searched:
     Args:
         best: from no cause. other: of another problem.
     """
-    names = [e for e in other.fit.active if e in best.problem.candidates]
-    own = {f.name: other.fit.values[f.name] for e in names for f in best.problem.own[e]}
-    begun = replace(best.refitted.at(own), active=tuple(names))
+    names = tuple(e for e in other.fit.active if e in best.problem.candidates)
+    begun = as_named(best.problem, best.refitted, replace(other.fit, active=names))
     for _ in range(TURNS):
         begun = fitted(best.problem, noise_fitted(best.problem, begun))
     found = likelier(best, begun)
@@ -113,7 +117,7 @@ def given_with(found: Searched, values: Mapping[str, float], noise: Noise) -> tu
     begun = found.bare.noise.with_levels(noise.process)
     held = LEAST_READING_STD if found.coarse else ()
     bare = in_noise_from(problem, found.bare.at(values), begun, held)
-    return bare, steadied(problem, noise_fitted(problem, fitted(problem, bare)))
+    return bare, _refitted(problem, bare)
 
 
 def searched_from(
