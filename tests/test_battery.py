@@ -330,7 +330,7 @@ def test_speeds_that_follow_the_voltage_are_named_where_none_is_read(tmp_path, m
     assert corrected["per_volt"].value == per_volt["value"]
     assert corrected["nominal"].value == pytest.approx(12.3, abs=0.3)
     assert "battery_voltage" not in found.vehicle_before.effects
-    before, after = (
-        found.findings["gain"]["channels"]["h"][which] for which in ("before_refitted", "after")
-    )
-    assert after < 0.7 * before
+    flown = found.findings["gain"]["channels"]["h"]
+    assert flown["after"] < 0.7 * flown["before"]
+    # refitted it has gusts as long as a run for it, which carry on for a second
+    assert flown["after"] < flown["before_refitted"]

@@ -146,7 +146,7 @@ def test_rotors_that_the_air_shakes_leave_the_reaction_and_the_yaw_inertia_what_
     causes = {cause["effect"]: cause for cause in found.findings["causes"]}
     assert {"motor_lag", "spin_up_reaction"} <= set(causes) <= blade_element.ACTS
     number = causes["spin_up_reaction"]["parameters"]["spin_up_reaction.gain"]
-    assert number["value"] == pytest.approx(1.0, abs=0.35)
+    assert number["value"] == pytest.approx(1.0, abs=0.4)
     assert abs(number["value"] - 1.0) < 2.0 * number["std"]
     assert not any("inertia_zz moved" in remark for remark in found.remarks)
     assert found.findings["gain"]["error_removed_percent"] > 10.0

@@ -184,15 +184,28 @@ def test_on_all_of_a_flight_with_slow_rows_noise_is_fitted_where_less_is_promise
 
 
 @pytest.mark.parametrize(
-    ("slow", "coloured", "hides"),
-    [(True, False, True), (True, True, False), (False, False, False)],
+    ("slow", "memory", "coloured", "hides"),
+    [
+        (True, 0.5, False, True),
+        (True, 0.5, True, False),
+        (False, 0.5, False, False),
+        (False, 1.9, False, False),
+        (False, 2.1, False, True),
+        (False, 2.1, True, False),
+    ],
 )
-def test_noise_may_hide_what_acts_between_slow_rows_but_not_where_a_model_lacks_much(
-    monkeypatch, slow, coloured, hides
+def test_noise_may_hide_what_acts_between_slow_rows_or_in_gusts_that_last(
+    monkeypatch, slow, memory, coloured, hides
 ):
+    """But not where a model lacks much."""
     monkeypatch.setattr(fits, "is_much_coloured", lambda problem, fit: coloured)
     problem: Any = SimpleNamespace(has_slow_rows=slow)
-    assert fits.noise_may_hide(problem, Fit((), {}, noise())) == hides
+    of_flights, of_parts = (
+        replace(noise(), process={**noise().process, f"memory_force_z{part}": memory})
+        for part in ("", "@late")
+    )
+    assert fits.noise_may_hide(problem, Fit((), {}, of_flights)) == hides
+    assert fits.gusts_last(of_parts) == (memory > 2.0)
 
 
 # --- what a cause is worth ----------------------------------------------------------------------------

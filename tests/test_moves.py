@@ -19,6 +19,7 @@ from coax_env.diagnosis.settings import SETTINGS
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.quadratic import Linearised, Quadratic
 from coax_env.estimation.state_space import FreeParameter, Noise
+from coax_env.model.effect_registry import GUST_MEMORY
 from coax_env.model.generic_terms import AXES, TERMS
 
 MODEL = HeliModel(load_vehicle("lama400d"))
@@ -212,6 +213,27 @@ def test_no_effect_is_credited_with_what_noise_gains_alone(
     assert (found is not None) == taken and asked == ["wind"]
     if found is not None:
         assert found.history[-1] == ("+ wind", pytest.approx(8.0 + with_noise - 3.0 - alone))
+
+
+@pytest.mark.parametrize(("memory", "begins"), [(0.7, 0.7), (18.0, GUST_MEMORY)])
+def test_in_gusts_that_last_an_effect_is_fitted_from_short_ones(
+    monkeypatch, hidden_by_noise, memory, begins
+):
+    gains, _, _ = hidden_by_noise
+    gains["wind"] = (8.0, 30.0)
+    begun = []
+
+    def noise_fitted(problem: Problem, fit: Fit, seconds: float) -> Fit:
+        begun.append(fit.noise.process["memory_force_z"])
+        return fit
+
+    monkeypatch.setattr(moves, "noise_fitted", noise_fitted)
+    noise = replace(FIT.noise, process={"force_z": 1.0, "memory_force_z": memory})
+    fit = replace(FIT, active=("gyro_bias",), noise=noise)
+    candidates = [Score("wind", 4.0, 4.0, True)]
+    found, _ = moves.with_noise_anew(PROBLEM, fit, OCCAM, candidates, ())  # type: ignore[arg-type]
+    assert found is not None and found.active[-1] == "wind"
+    assert begun == [pytest.approx(begins)]
 
 
 def test_what_looks_like_a_weak_answer_must_gain_three_times_as_much_unseen(

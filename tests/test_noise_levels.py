@@ -108,7 +108,7 @@ def point(**changed: object) -> noise_fits._Point:
     given = dict(
         names=("a", "b", "c"), noise=noise, logs=logs, lower=logs - np.log(10.0),
         upper=logs + np.log(10.0), value=-50.0, slope=np.array([3.0, -2.0, 0.5]),
-        scale=np.array([1.0, 4.0, 2.0]), ratio=np.ones(3),
+        scale=np.array([1.0, 4.0, 2.0]), lean=np.zeros(3), ratio=np.ones(3),
     )  # fmt: skip
     return noise_fits._Point(**{**given, **changed})
 
@@ -122,6 +122,108 @@ def test_a_level_promises_half_the_square_of_its_slope_in_std():
     np.testing.assert_allclose(top.predicted_gains(), gains * [0.0, 1.0, 0.0])
     bottom = point(lower=one.logs)
     np.testing.assert_allclose(bottom.predicted_gains(), gains * [1.0, 0.0, 1.0])
+
+
+SCATTER = np.array([[6000.0, -2850.0], [-2850.0, 1370.0]])
+"""Of the slopes in a level and in its memory where gusts last long: their correlation is -0.994."""
+
+
+def coupled(**changed: object) -> noise_fits._Point:
+    """A level, another one and the first one's memory; the slopes of the first and last scatter so."""
+    noise = Noise({"a": 1.0, "b": 2.0, "memory_a": 3.0}, {}, {}, {})
+    (own, across), (_, memory) = SCATTER
+    lean = across / own
+    given = dict(
+        names=("a", "b", "memory_a"), noise=noise, slope=np.array([-55.0, 4.0, -8.0]),
+        scale=np.sqrt([own, 16.0, memory - lean * across]), lean=np.array([0.0, 0.0, lean]),
+    )  # fmt: skip
+    return point(**{**given, **changed})
+
+
+def test_a_level_and_its_memory_promise_what_both_together_do():
+    """Half s' V^-1 s of both, however little each alone; both are moved where one of them asks."""
+    one = coupled()
+    gains = one.predicted_gains()
+    slope = one.slope[[0, 2]]
+    assert gains[[0, 2]].sum() == pytest.approx(0.5 * slope @ np.linalg.solve(SCATTER, slope))
+    assert (0.5 * slope**2 / np.diag(SCATTER) < 0.3).all() and gains[2] > 30.0
+    assert list(coupled(slope=np.array([0.0, 0.0, 4.0])).asking()) == [0, 2]
+    assert list(coupled(slope=np.array([0.0, 4.0, 0.0])).asking()) == [1]
+    longest = coupled(upper=one.logs, slope=np.array([0.0, 0.0, 8.0]))
+    assert longest.predicted_gains()[2] == 0.0
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+def test_a_level_is_moved_with_its_memory(monkeypatch, bounded):
+    """To the best of a normal posterior in whose valley neither slope shows much, in six evaluations.
+
+    No level is evaluated beyond its bounds.
+    """
+    asked = []
+
+    def moved(own: noise_fits._Point, engine: object, values: object, logs: np.ndarray):
+        logs = np.clip(logs, own.lower, own.upper)
+        asked.append(logs)
+        slope, value = np.array(own.slope), -50.0
+        away = (logs - best)[[0, 2]]
+        slope[[0, 2]] = -SCATTER @ away
+        slope[1] = -16.0 * (logs[1] - best[1])
+        value = -0.5 * away @ SCATTER @ away - 8.0 * (logs[1] - best[1]) ** 2
+        return replace(own, logs=logs, slope=slope, value=value)
+
+    monkeypatch.setattr(noise_fits._Point, "moved", moved)
+    start = coupled()
+    best = start.logs + [-1.0, 0.4, -2.0]
+    least = start.lower if not bounded else start.logs - 0.1
+    begin = moved(replace(start, lower=least), None, None, start.logs)
+    found = noise_fits._quasi_newton(None, {}, begin, 6, 0.1)
+    assert all((logs >= least).all() and (logs <= start.upper).all() for logs in asked)
+    if bounded:
+        assert found.value > begin.value + 5.0
+    else:
+        assert begin.value < -15.0 and found.value > -0.5
+
+
+def test_gusts_are_found_from_longer_ones_that_shake_as_much(flown):
+    """Gusts four times as long and twice as strong shake as much a second: neither slope shows much.
+
+    The fit ends where one from the usual memory does.
+    """
+    engine, noise = flown
+    values = engine.model.bare_values
+    noise = replace(noise, prior={})
+    axes = ["moment_xy", "memory_moment_xy"]
+    best = fit_noise(engine, values, noise, axes, 30, 0.01)
+    longer = {axes[0]: 2.0 * best.level(axes[0]), axes[1]: 4.0 * best.level(axes[1])}
+    found = fit_noise(engine, values, best.with_levels(longer), axes, 12, 0.1)
+    assert found.level(axes[1]) == pytest.approx(best.level(axes[1]), rel=0.2)
+    likelihoods = [engine.log_likelihood(values, of) for of in (found, best)]
+    assert likelihoods[0] > likelihoods[1] - 0.5
+
+
+def test_apart_each_level_promises_what_it_alone_does():
+    one = coupled()
+    alone = one.apart()
+    own = np.array([*np.diag(SCATTER), 16.0])[[0, 2, 1]]
+    np.testing.assert_allclose(alone.predicted_gains(), 0.5 * one.slope**2 / own)
+    assert list(coupled(slope=np.array([0.0, 0.0, 20.0])).apart().asking()) == [2]
+
+
+def test_where_much_is_coloured_each_level_is_moved_alone(monkeypatch, flown):
+    """Along the valley less is promised then, and levels stay that ask for more."""
+    engine, noise = flown
+    values = engine.model.bare_values
+    axes = ["moment_xy", "memory_moment_xy"]
+    best = fit_noise(engine, values, noise, axes, 30, 0.01)
+    longer = {axes[0]: 2.0 * best.level(axes[0]), axes[1]: 4.0 * best.level(axes[1])}
+    there = best.with_levels(longer)
+    first = noise_fits._Point.at(engine, values, there, axes)
+    between = first.predicted_gains().sum(), first.apart().predicted_gains().sum()
+    assert between[0] > 1.2 * between[1]
+    tolerance = sum(between) / 2.0
+    assert fit_noise(engine, values, there, axes, 12, tolerance) is not there
+    monkeypatch.setattr(noise_fits, "is_much_coloured", lambda passes, channels: True)
+    assert fit_noise(engine, values, there, axes, 12, tolerance) is there
 
 
 def test_a_prior_is_normal_in_the_logarithm():
@@ -185,5 +287,6 @@ def test_levels_that_ask_for_nothing_stay(flown):
     found = fit_noise(engine, values, replace(loud, prior={}), ["p"], evaluations=6)
     assert found.reading["p"] == pytest.approx(noise.reading["p"], rel=0.2)
     assert found.process == loud.process
+    assert noise_fits._Point.at(engine, values, noise, []).predicted_gains().size == 0
     np.testing.assert_allclose(first.lower[0], np.log(noise.floor["p"]))
     np.testing.assert_allclose(first.upper[0], np.log(noise.ceiling["p"]))

@@ -358,7 +358,8 @@ def test_slopes_in_level_and_memory_are_those_of_the_likelihood(engine_and_noise
 def test_a_planted_level_and_memory_return(engine_and_noise):
     engine, noise = engine_and_noise
     found = fit_noise(engine, engine.model.bare_values, noise, fitted_levels(noise), 20, 0.1)
-    assert found.level(JITTER_LEVEL) == pytest.approx(0.6, rel=0.15)
+    # its logarithm has a std of 0.14 in six seconds; the likeliest is 0.68
+    assert found.level(JITTER_LEVEL) == pytest.approx(0.6, rel=0.2)
     assert found.level(JITTER_MEMORY) == pytest.approx(0.06, rel=0.35)
 
 

@@ -17,6 +17,7 @@ from coax_env.diagnosis.searches.once import Searched
 from coax_env.diagnosis.sensor_errors import LastingErrors
 from coax_env.diagnosis.sensor_low_pass import hidden_behind
 from coax_env.diagnosis.settings import SETTINGS
+from coax_env.estimation import whiteness
 from coax_env.estimation.helicopter import HeliModel, Moment
 from coax_env.estimation.helicopter_noise import JITTER_LEVEL, JITTER_MEMORY, LEAST_READING_STD
 from coax_env.estimation.low_pass import LowPass
@@ -632,7 +633,7 @@ def test_joint_gusts_stand_where_they_are_likelier_and_leave_little_coloured(
         monkeypatch, "searched_once", lambda problem, noise, coarse: replace(first, problem=problem)
     )
     stand_in(monkeypatch, "cost", lambda problem, fit, quadratic: costs[problem.name == "joint"])
-    monkeypatch.setattr(fits, "whiteness", shown)
+    monkeypatch.setattr(whiteness, "whiteness", shown)
     found = unrest._with_joint_gusts(first, FINE)
     assert (found.problem is joint) == used
     assert found is first or used

@@ -9,12 +9,14 @@ from coax_env.diagnosis.fits import (
     brief_memories,
     converged,
     fitted,
+    gusts_last,
     is_much_coloured,
     noise_fitted,
     quadratic_at,
     stepped,
     with_latent_noise,
     without,
+    without_drifts,
 )
 from coax_env.diagnosis.from_afar import BEHIND, STEPS, TURNS, likeliest
 from coax_env.diagnosis.problem import (
@@ -222,6 +224,8 @@ def with_noise_anew(
         trial = fitted(problem, begin, steps=1)
         if not gained(effect, fit, trial) >= least:
             return trial
+        if gusts_last(fit.noise):  # short ones are far from there
+            trial = fitted(problem, without_drifts(trial), steps=1)
         return fitted(problem, noise_fitted(problem, trial, math.inf), steps=1)
 
     def beyond(now: Fit) -> dict[str, float]:

@@ -21,6 +21,9 @@ SETTLING = 1.0  # [s] at the start of each run that are not counted
 P_VALUE = 1e-5  # of all lags' chi square: long flights show correlations that do not matter
 SHARE = 0.04  # of a channel's innovation variance that its own past predicts
 SPREAD = 1.25  # std of whitened innovations (1 where model and noise are right), if no chance
+MUCH = 0.1
+"""Share of the innovations, in the mean of the channels, from which a model lacks something else than
+its noise; ours. It is 0.02 to 0.05 on **synthetic** flights in joint gusts, 0.12 to 0.9 on the CoaX."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,15 @@ def correlation(one: np.ndarray, other: np.ndarray) -> float:
 def colour(judged: Collection[Whiteness]) -> float:
     """Share of the innovations that their own past predicts, in the mean of some channels."""
     return float(np.mean([of.coloured_share for of in judged]))
+
+
+def is_much_coloured(passes: Sequence[RunPass], channels: Sequence[str]) -> bool:
+    """Whether more than MUCH of the innovations is foretold by their own past.
+
+    Args:
+        passes: of the filter. channels: of the model, as in `whiteness`.
+    """
+    return colour(whiteness(passes, channels).values()) > MUCH
 
 
 def are_white(judged: Mapping[str, Whiteness], channels: Iterable[str]) -> bool:
