@@ -176,11 +176,15 @@ def test_nothing_is_named_where_poses_were_smoothed(tmp_path):
         ("command_delay", ("phi", "pn"), ["pose_delay"]),
         ("pose_delay", ("phi", "pn"), ["command_delay"]),
         ("command_delay", ("phi", "az"), []),  # an accelerometer feels when a command acts
+        ("swash_phase", ("phi", "pn"), ["frame_yaw"]),
+        ("frame_yaw", ("phi", "pn"), ["swash_phase"]),
+        ("frame_yaw", ("phi", "az"), []),
         ("wind", ("phi", "pn"), []),
     ],
 )
-def test_by_poses_alone_late_commands_and_late_poses_are_one(effect, aboard, alike):
+def test_by_poses_alone_commands_and_poses_are_late_as_one_and_turned_as_one(effect, aboard, alike):
     problem = SimpleNamespace(
-        sees_poses_alone="az" not in aboard, candidates=("command_delay", "pose_delay", "wind")
+        sees_poses_alone="az" not in aboard,
+        candidates=("command_delay", "pose_delay", "wind", "swash_phase", "frame_yaw"),
     )
     assert alike_by_poses_alone(problem, effect) == alike  # type: ignore[arg-type]

@@ -38,6 +38,7 @@ from coax_env.diagnosis.settings import SETTINGS
 from coax_env.diagnosis.trust import (
     beside_large_axes,
     determined,
+    less_sure_beside_large_numbers,
     may_be_none,
     moved_far,
     of_line,
@@ -285,6 +286,33 @@ def test_beside_a_large_axis_the_others_are_as_wide():
 
 
 @pytest.mark.parametrize(
+    ("size", "told", "factor"), [(4.0, 0.0, 4.0), (4.0, 1e6, 1.0), (2.0, 0.0, 1.0)]
+)
+def test_beside_a_large_number_those_of_other_units_may_be_as_large(size, told, factor):
+    """A swash phase's angle is known; its change with rotor speed as the flights tell it, or not.
+
+    told: the data's information on it as a multiple of its prior's.
+    """
+    effect, names = "swash_phase", ("swash_phase.angle", "swash_phase.per_rpm")
+    parameters = tuple(HeliModel(LAMA).effect_parameters(effect))
+    usual = {f.name: f.std for f in parameters}
+    problem = replace(problem_of(1), own={effect: parameters}, base=())
+    assert beside_large_axes(problem, Fit((effect,), dict.fromkeys(names, 1e3), Noise({}))) == problem
+    information = np.diag([1e6 / usual[names[0]] ** 2, told / usual[names[1]] ** 2])
+    values = {names[0]: size * usual[names[0]], names[1]: 0.0}
+    slope = np.zeros((1, 2))  # of the data: it is at their best
+    lin = Linearised(names, information[None], slope, np.zeros((1, 1, 2)), np.zeros((4, 2)))
+    quadratic = Quadratic.of(lin, problem.parameters, values)
+    fit = Fit((effect,), values, Noise({}))
+    weighed = {effect: Evidence(100.0, 1.0)}
+    wider = less_sure_beside_large_numbers(problem, fit, quadratic, weighed)
+    std = quadratic.std(names)
+    assert wider.spread(names[1], std[names[1]], 1.0) == pytest.approx(factor * std[names[1]], rel=1e-3)
+    assert wider.spread(names[0], std[names[0]], 1.0) == pytest.approx(std[names[0]], rel=1e-2)
+    assert wider.values == values
+
+
+@pytest.mark.parametrize(
     ("size", "words"),
     [
         (2.45, ""),
@@ -466,6 +494,22 @@ def test_what_stands_for_something_else_has_no_name(
         not named or limited or coloured or undetermined or falls or beside or kept != 1.0
         or nats < SETTINGS.sure_evidence
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("nats", "beside", "size", "named"),
+    [
+        (110.0, "q", 5.0, False),
+        (230.0, "q", 5.0, True),
+        (110.0, "h", 5.0, True),
+        (110.0, "q", 4.0, True),
+    ],
+)
+def test_a_small_share_of_what_stands_at_its_limit_has_no_name(nats, beside, size, named):
+    """A lag that is held to less than it is leaves a droop in the same rotor's speed: 2.25 % of it."""
+    lag = known_of([beside], sizes={"upper": size}, nats=1e4)
+    against = {"motor_droop": known_of(["q"], nats=nats), "motor_lag": lag}
+    assert ("motor_droop" not in without_name(against, SETTINGS)) == named
 
 
 @pytest.mark.parametrize(("coloured", "falls"), [(0, 0), (1, 0), (0, 1)])

@@ -57,7 +57,7 @@ from coax_env.diagnosis.searches.searched import searched
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.shock_evidence import in_own_strengths
 from coax_env.diagnosis.shocks import engine_of
-from coax_env.diagnosis.trust import beside_large_axes, trusts
+from coax_env.diagnosis.trust import beside_large_axes, less_sure_beside_large_numbers, trusts
 from coax_env.diagnosis.unseen import worth_unseen
 from coax_env.errors import InputError
 from coax_env.estimation import vibration
@@ -230,6 +230,7 @@ def diagnose(
     onsets = moments_of(problem, fit, quadratic, evidence, state.onsets)
     fit = confounding.beside_alternatives(problem, fit, quadratic, evidence, found)
     fit = confounding.beside_undecided(problem, fit, quadratic, evidence)
+    fit = less_sure_beside_large_numbers(problem, fit, quadratic, evidence)
     if circular:
         fit = less_sure(problem, fit, quadratic, evidence, onboard_filter.followed(problem, fit))
     if not onsets:

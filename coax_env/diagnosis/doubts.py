@@ -6,7 +6,8 @@ should show it are likelier without; a motor's lag that measured rotor speeds al
 their readings. What changed in flight, by little evidence, has no name: a hub stiffness, a servo's
 delay, a centre of gravity and an accelerometer's bias did on four clean **synthetic** flights, for 18
 to 29 nats, and by poses alone a swash offset for 33. Nor has what the held-out runs should show and
-deny, if it is not clear on the fitted ones. Two of these take a name, too: noise left where it
+deny, if it is not clear on the fitted ones, nor what is a small share of a cause that stands at its
+limit and shows in the same channels. Two of these take a name, too: noise left where it
 shows, little evidence there or by poses alone, other noise, parts of the flights, such a one beside it,
 numbers of which none is known to be another than nothing, but where another effect would do as well
 (it is none then), held-out runs that should show it and do not, or that are likelier without it and
@@ -187,6 +188,12 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         against: of each active effect. chosen: what decides.
     """
     standing_in = {e: of for e, of in against.items() if of.stands_for_something_else(chosen)}
+    limited = {e: of for e, of in against.items() if of.at_limit}
+
+    def is_rest(effect: str, of: Against) -> bool:
+        """Whether a cause that could not be as large as it is leaves as much in the same channels."""
+        beside = _shows_beside(effect, of, limited)
+        return any(of.nats < chosen.limited_form * limited[e].nats for e in beside)
 
     def voices(effect: str, of: Against) -> int:
         unseen = bool(of.coloured) or of.poses_alone or of.smoothed
@@ -208,6 +215,7 @@ def without_name(against: Mapping[str, Against], chosen: Settings) -> set[str]:
         or of.is_weak_and_falls(chosen)
         or of.is_not_clear_and_denied(chosen)
         or of.by_speeds_alone
+        or is_rest(effect, of)
         or voices(effect, of) >= SPEAKING_AGAINST
     }
 
