@@ -1041,7 +1041,8 @@ def _fly_run(
     )  # fmt: skip
     first = int(np.searchsorted(times, -1e-12))
     logged = readings[first:]
-    if not np.isfinite(logged).all() or abs(logged[:, 8:10]).max() > 0.8:
+    buried = np.median(logged[:, 13]) > 0.0  # most of the time below the ground
+    if not np.isfinite(logged).all() or abs(logged[:, 8:10]).max() > 0.8 or buried:
         raise RuntimeError(f"the pilot lost the helicopter in {name}: {hidden}")
     columns = {"t": times[first:-1]}
     columns["rpm_upper_cmd"], columns["rpm_lower_cmd"] = RPM * commands[first:, :2].T
