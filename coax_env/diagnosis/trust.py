@@ -336,10 +336,10 @@ def beside_large_axes(problem: Problem, fit: Fit) -> Problem:
     """
     own = dict(problem.own)
     for effect in fit.active:
-        others, largest = _beside_a_large_one(problem, fit, effect)
+        numbers, largest = _of_a_large_one(problem, fit, effect)
         if len(_units(effect)) == 1:
             own[effect] = tuple(
-                replace(f, std=largest * f.std) if f.name in others else f for f in own[effect]
+                replace(f, std=largest * f.std) if f.name in numbers else f for f in own[effect]
             )
     return replace(problem, own=own)
 
@@ -359,9 +359,9 @@ def less_sure_beside_large_numbers(
     """
     precision, free = quadratic.precision.copy(), problem.free_names(fit.active)
     for effect in fit.active:
-        others, largest = _beside_a_large_one(problem, fit, effect)
+        numbers, largest = _of_a_large_one(problem, fit, effect)
         if len(_units(effect)) > 1:
-            precision[quadratic.index(others)] /= largest**2
+            precision[quadratic.index(numbers)] /= largest**2
     if (precision == quadratic.precision).all():
         return fit
     wider = replace(quadratic, precision=precision)
@@ -374,8 +374,8 @@ def less_sure_beside_large_numbers(
     return less_sure(problem, fit, quadratic, evidence, apart)
 
 
-def _beside_a_large_one(problem: Problem, fit: Fit, effect: str) -> tuple[list[str], float]:
-    """Numbers that act beside an effect's largest, and its size [prior std]; none where it is usual."""
+def _of_a_large_one(problem: Problem, fit: Fit, effect: str) -> tuple[list[str], float]:
+    """An effect's numbers that act, and the largest's size [prior std]; none where that is usual."""
     acting = set(problem.acting_names(effect))
     sizes_of = {
         f.name: abs(fit.values[f.name] - f.value) / f.std
