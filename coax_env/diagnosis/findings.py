@@ -162,37 +162,39 @@ def stated_std(
 def _vibration(
     lines: Sequence[vibration.Line], sizes: Mapping[str, tuple[float, float]]
 ) -> dict[str, Any]:
-    """The cause that is found by its lines and not by a signature; sizes: `large` of these."""
-    units = {p.name: p.unit for p in effects.CATALOGUE["vibration"].parameters}
+    """The cause that is found by its lines; sizes: `large` of these."""
     own = [line for line in lines if line.kind in sizes]
+    trust = of_line(max(own, key=lambda line: line.evidence))
     return {
-        "effect": "vibration",
-        "parameters": {
-            f"vibration.{kind}": {
-                "value": amplitude,
-                "std": std,
-                "unit": units[kind],
-                "determined": True,
-            }
-            for kind, (amplitude, std) in sizes.items()
-        },
-        "evidence": sum(line.evidence for line in own),
-        "confusable_with": [],
+        **_by_no_signature("vibration", sizes, sum(line.evidence for line in own), trust),
         "channels": list(dict.fromkeys(c for line in own for c in line.channels)),
-        **of_line(max(own, key=lambda line: line.evidence)).entries(),
     }
 
 
 def _voltage(felt: FeltVoltage, line: Line) -> dict[str, Any]:
-    """The cause that is found by the felt thrust and not by a signature. line: of `felt`."""
-    unit = effects.CATALOGUE[VOLTAGE].parameters[0].unit
+    """The cause that is found by the felt thrust; line: of `felt`."""
     spread = math.hypot(line.std, FORM * line.per_volt)
-    number = {"value": line.per_volt, "std": spread, "unit": unit, "determined": True}
-    trust = of_voltage(felt)
+    sizes = {PER_VOLT.removeprefix(f"{VOLTAGE}."): (line.per_volt, spread)}
+    return _by_no_signature(VOLTAGE, sizes, felt.evidence, of_voltage(felt))
+
+
+def _by_no_signature(
+    effect: str, sizes: Mapping[str, tuple[float, float]], evidence: float, trust: Trust
+) -> dict[str, Any]:
+    """The entry of a cause that is found otherwise than the others; sizes: value and std by number."""
+    units = {p.name: p.unit for p in effects.CATALOGUE[effect].parameters}
     return {
-        "effect": VOLTAGE,
-        "parameters": {PER_VOLT: number},
-        "evidence": felt.evidence,
+        "effect": effect,
+        "parameters": {
+            f"{effect}.{name}": {
+                "value": value,
+                "std": std,
+                "unit": units[name],
+                "determined": True,
+            }
+            for name, (value, std) in sizes.items()
+        },
+        "evidence": evidence,
         "confusable_with": [],
         "channels": list(trust.channels),
         **trust.entries(),

@@ -28,7 +28,7 @@ from coax_env.model.effect_registry import GUST_MEMORY
 
 LASTING = 4.0 * GUST_MEMORY
 """s, of gusts that may stand for what is always there. A mass of 0.17 kg of 0.8 was taken for gusts of
-1 N for 18 s, and worth 12 nats beside them; fitted with short ones it is 62 (`study_diagnosis.py --arms
+1 N for 18 s, and worth 12 nats beside them; fitted with short ones it is 82 (`study_diagnosis.py --arms
 sizes_large --seed 859`, one 503, **synthetic**); ours."""
 
 BRIEF = 0.1
