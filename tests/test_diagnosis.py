@@ -489,6 +489,8 @@ def test_an_excluded_effect_is_not_named(tmp_path):
     assert "gyro_bias" not in say_what_was_found(forbidden)
     for cause in forbidden["causes"]:
         assert "gyro_bias" not in cause["confusable_with"]
+    every = diagnose(flight, hold_out=[], exclude=list(effects.CATALOGUE)).findings
+    assert (every["causes"], every["verdict"]) == ([], "unexplained")
 
 
 @pytest.mark.slow

@@ -57,10 +57,12 @@ def scored(state: Changing) -> tuple[Changing, list[Scored]]:
         state: a fit, wherever its quadratic was taken.
 
     Returns:
-        the state with its objective and the quadratic at it, and the effects.
+        the state with its objective and the quadratic at it, and the effects; as it is where none may.
     """
     problem, fit = state.problem, state.fit
     names = {e: _own(problem, e) for e in may_begin(problem, fit, state.onsets)}
+    if not names:
+        return state, []
     records = problem.engine.records
     rows = rows_of(records)
     everything = problem.parameters
