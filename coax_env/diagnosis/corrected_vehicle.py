@@ -7,6 +7,7 @@ import numpy as np
 
 from coax_env.diagnosis.confounding import of_undecided
 from coax_env.diagnosis.findings import stated_std
+from coax_env.diagnosis.flown_numbers import flying_nearest
 from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import Engine, objective
@@ -22,6 +23,7 @@ from coax_env.model.vehicle import Parameter, Vehicle
 def corrected_vehicle(
     problem: Problem,
     fit: Fit,
+    flown: Fit,
     quadratic: Quadratic,
     held: Sequence[Record],
     inflations: Mapping[str, float],
@@ -32,6 +34,7 @@ def corrected_vehicle(
 
     Args:
         problem, fit: with the causes.
+        flown: with the numbers that are stated of the fitted runs (flown_numbers.py).
         quadratic: linearised at the fit.
         held: runs that were held out; they are used now.
         inflations: variance inflation, by effect.
@@ -39,7 +42,11 @@ def corrected_vehicle(
         flight: what is recorded as the source.
     """
     free = problem.free(fit.active)
-    values, covariance = with_held_out(problem, fit, quadratic, held)
+    found, covariance = with_held_out(problem, fit, quadratic, held)
+    values: Mapping[str, float] = found
+    if flown.values != fit.values:
+        there = _flying_all_nearest(problem, fit.at(found), held, covariance) if held else flown
+        values = there.values
     dt = median_step([*problem.engine.records, *held])
     of_vehicle = problem.free_of_vehicle(fit.active)
     own = [free.index(f) for f in of_vehicle]
@@ -47,7 +54,7 @@ def corrected_vehicle(
 
     def std(f: FreeParameter) -> float:
         factor = inflations.get(f.name.partition(".")[0], 1.0)
-        return stated_std(fit, f, float(spread[free.index(f)]), factor, dt)
+        return stated_std(flown, f, float(spread[free.index(f)]), factor, dt)
 
     source = diagnosed_from(flight)
     vehicle = fitted_vehicle(
@@ -121,6 +128,15 @@ def with_held_out(
         if -both.best(names)[0] < problem.settings.refinement_gain:
             break
     return {name: there.values[name] for name in names}, both.covariance(names)
+
+
+def _flying_all_nearest(
+    problem: Problem, fit: Fit, held: Sequence[Record], covariance: np.ndarray
+) -> Fit:
+    """With the numbers that fly all runs nearest; fit, covariance: of `with_held_out`."""
+    engine = engine_as_fitted(problem, held, fit)
+    everything = Engine(problem.model, (*problem.engine.records, *engine.records))
+    return flying_nearest(replace(problem, engine=everything), fit, covariance)
 
 
 def _beyond_signatures(quadratic: Quadratic, known: np.ndarray) -> np.ndarray:

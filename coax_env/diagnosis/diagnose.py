@@ -4,7 +4,8 @@ Data flow::
 
     flight -> runs to fit, runs held out (hold_out.py)
     runs to fit -> problem and first fit -> search -> onsets -> generic terms -> input innovations
-        -> evidence -> confounded alternatives -> findings
+        -> evidence -> confounded alternatives -> numbers that fly nearest, where much is coloured
+        -> findings
     held-out runs -> replay with the vehicle as given, refitted, corrected -> gain with its interval
     all runs -> refit of the same structure -> corrected vehicle file
 
@@ -37,6 +38,7 @@ from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle, diagnosed_from
 from coax_env.diagnosis.evidence import less_sure
+from coax_env.diagnosis.flown_numbers import REMARK, flying_nearest, numbers_apart
 from coax_env.diagnosis.gain import TOO_SHORT, flies_worse, gain_of
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.input_innovations import engine_as_fitted
@@ -129,7 +131,8 @@ class Diagnosis:
 
 SHARES = {
     "choosing": 0.09, "estimating": 0.13, "fitting": 0.2, "searching": 0.25,
-    "asking whether something": 0.45, "weighing": 0.63, "flying": 0.88, "asking left-out": 0.91,
+    "asking whether something": 0.45, "weighing": 0.63, "asking which": 0.86, "flying": 0.88,
+    "asking left-out": 0.91,
     "asking whether the fitted": 0.95, "refitting": 0.98,
 }  # fmt: skip
 """How a step's line begins -> share of the time that has passed: means of the bundled flight, one with
@@ -236,32 +239,41 @@ def diagnose(
     if not onsets:
         fit = slow_commands.beside_straight_lines(problem, fit, quadratic, evidence)
     found |= beside_onsets(problem, fit, evidence, white["after"], onsets)
+    report("asking which numbers fly nearest")
+    flown = flying_nearest(problem, fit)
+    flown = less_sure(problem, flown, quadratic, evidence, numbers_apart(fit, flown))
     sensors = {c: sensor_std(flight, c) for c in flight.channels}
     own = None
     if held:
         problem.report("flying the held-out runs")
         own = engine_as_fitted(problem, held, fit)
-    replays, gain = _gain(problem, (bare, refitted, fit), held, own, sensors, ceiling)
+    own_numbers = flying_nearest(first.problem, refitted) if held else refitted
+    replays, gain = _gain(problem, (bare, own_numbers, flown), held, own, sensors, ceiling)
     report("asking left-out runs, halves and other noise whether the names hold")
     # what began in flight may have done so after them
     unseen = worth_unseen(problem, fit, quadratic, evidence, None if onsets else own)
     worse = flies_worse(gain, begun=bool(onsets))
     swinging = oscillations(flight.runs)
     trust = trusts(
-        problem, fit, quadratic, evidence, found, white["after"], onsets, unseen, worse, bool(swinging)
+        problem, fit, quadratic, evidence, found, white["after"], onsets, unseen, worse,
+        bool(swinging), flown,
+    )  # fmt: skip
+    causes = findings.causes(
+        problem, flown, quadratic, evidence, found, trust, new_lines, onsets, felt
     )
-    causes = findings.causes(problem, fit, quadratic, evidence, found, trust, new_lines, onsets, felt)
-    described = unlisted.entries(problem, fit, quadratic, passes_after, terms)
+    described = unlisted.entries(problem, flown, quadratic, passes_after, terms)
     speaking_for = unlisted.described_channels(described)
     unnamed = findings.without_a_name(evidence, trust, white["after"])
     unexplained = described + unnamed + findings.unexplained(white["after"], speaking_for)
     report("asking whether the fitted model makes such flights")
-    check = model_check(problem.as_logged, fit, passes_after)
+    check = model_check(problem.as_logged, flown, passes_after)
     report("refitting the corrected model on everything")
     inflations = {e: weighed.inflation for e, weighed in evidence.items()}
     inflations |= unlisted.inflations(problem, fit, quadratic, terms)
     held = [with_late(r, problem.late) for r in held]
-    corrected = corrected_vehicle(problem, fit, quadratic, held, inflations, new_lines, flight)
+    corrected = corrected_vehicle(
+        problem, fit, flown, quadratic, held, inflations, new_lines, flight
+    )
     alarms = calibrated(settings.evidence, class_of(flight, vehicle, fit))
     by_evidence = [c["effect"] for c in causes if c["effect"] in found]
     design = confounding.separating_maneuver(problem, fit, quadratic, found, by_evidence, flight)
@@ -298,8 +310,9 @@ def diagnose(
             *double_counting(flight, vehicle),
             *([vibration.remark(lines)] if lines else []),
             *of_sensors,
+            *([REMARK] if flown.values != fit.values else []),
             *([oscillation_remark(swinging)] if swinging else []),
-            *remarks(problem, fit, quadratic, {e: found[e] for e in found if trust[e].named}),
+            *remarks(problem, flown, quadratic, {e: found[e] for e in found if trust[e].named}),
             *([TOO_SHORT] if held and gain is None else []),
             *lost_in_noise(gain),
             *one_step_against_a_second(gain, replays[1], replays[2], settings),

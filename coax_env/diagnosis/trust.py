@@ -113,6 +113,7 @@ def trusts(
     unseen: Mapping[str, Unseen],
     worse: bool,
     oscillates: bool,
+    flown: Fit,
 ) -> dict[str, Trust]:
     """Every active effect judged.
 
@@ -126,6 +127,7 @@ def trusts(
         unseen: worth of each on the held-out runs, where that was asked.
         worse: whether the model with the causes flies these worse.
         oscillates: whether the control loop oscillates through the flight.
+        flown: with the numbers that are stated (flown_numbers.py).
     """
     worth = {effect: weighed.nats for effect, weighed in evidence.items()}
     replicated = replications(problem, fit, quadratic, worth)
@@ -136,8 +138,8 @@ def trusts(
     elsewhere = sum(not of.white for of in white.values()) / max(len(white), 1)
     acting = acted_on(problem)
     of_form = problem.settings.oscillating_form * sum(worth.values()) if oscillates else 0.0
-    far = moved_far(problem, fit, quadratic)
-    undone = taken_back(fit)
+    far = moved_far(problem, flown, quadratic)
+    undone = taken_back(flown)
     unconfirmed = by_speeds_alone(problem, fit)
     known, against = {}, {}
     for effect in fit.active:
@@ -152,7 +154,7 @@ def trusts(
             falls_at=tuple(falling[effect]),
             parts=replicated[effect],
             runs=runs,
-            sizes=sizes(problem, fit, effect),
+            sizes=sizes(problem, flown, effect),
             determined=any(known[effect][name] for name in problem.acting_names(effect)),
             may_be_none=may_be_none(problem, fit, quadratic, effect, evidence[effect].inflation),
             flies_worse=worse,

@@ -41,6 +41,7 @@ from coax_env.progress import Progress
 
 NO_VALUES: Mapping[str, float] = MappingProxyType({})
 HEADING = CHANNELS.index("psi")
+ROLL_AND_PITCH = [CHANNELS.index("phi"), CHANNELS.index("theta")]
 WARM_UP = 1.0  # [s] of filtering before the first start
 EVERY = 0.25  # [s] between starts
 TAIL = 0.15  # [s] before the horizon's end in which a reading counts as at it
@@ -106,6 +107,38 @@ def replay_runs(
             _replay_run(engine, run, dt, own, horizon, floor)
         )
     return [_joined(name, of_run) for name, of_run in parts.items()]
+
+
+def errors_ahead(
+    engine: Engine, values: Mapping[str, float], noise: Noise, horizons: Sequence[float]
+) -> list[np.ndarray]:
+    """Open-loop errors of every record after each of some horizons, as `replay_runs` has them.
+
+    Args:
+        engine: model and records.
+        values: of all parameters, by name.
+        noise: levels of process and reading noise.
+        horizons: seconds flown open loop, from the same starts.
+
+    Returns:
+        (starts, channels) a horizon, NaN where there is no reading, infinite where a flight diverged.
+    """
+    starts = [_starts(r.t, max(horizons)) for r in engine.records]
+    passes = engine.filter(values, noise, start_rows=starts)
+    p = engine.model.vector(values, noise)
+    found: list[list[np.ndarray]] = [[] for _ in horizons]
+    for i, (run, dt) in enumerate(zip(passes, engine.intervals, strict=True)):
+        own, _ = engine.of_run(i, values, noise, p)
+        inputs = engine.model.inputs(replace(run.record, input_innovations=None), own)
+        for errors, horizon in zip(found, horizons, strict=True):
+            targets = _targets(run, horizon)
+            _, measured = _readings_at(run, targets)
+            predicted, _ = _fly(engine, run, inputs, dt, own, targets, gusts=0.0)
+            lost = ~np.isfinite(predicted) | ~np.isfinite(run.log_likelihood)
+            off = predicted - measured
+            off[:, ROLL_AND_PITCH] = _wrapped(off[:, ROLL_AND_PITCH])
+            errors.append(np.where(np.isfinite(measured) & lost, np.inf, off))
+    return [np.concatenate(errors) for errors in found]
 
 
 def _joined(name: str, parts: Sequence[RunReplay]) -> RunReplay:
@@ -179,15 +212,31 @@ def _fly_all(
     Returns:
         both, and whether every flight stayed finite.
     """
-    predicted, decaying = np.full(targets.shape, np.nan), np.full(targets.shape, np.nan)
-    finite = True
-    for gust, out in ((0.0, predicted), (1.0, decaying)):
-        x = run.states[run.start_rows]
-        x[:, engine.model.air] *= gust
-        finite &= compiled_model.fly_open_loop(
-            engine.compiled, dt, inputs, x, p, run.start_rows, targets, out
-        )
-    return predicted, decaying, finite
+    predicted, finite = _fly(engine, run, inputs, dt, p, targets, gusts=0.0)
+    decaying, decayed = _fly(engine, run, inputs, dt, p, targets, gusts=1.0)
+    return predicted, decaying, finite and decayed
+
+
+def _fly(
+    engine: Engine,
+    run: RunPass,
+    inputs: np.ndarray,
+    dt: np.ndarray,
+    p: np.ndarray,
+    targets: np.ndarray,
+    gusts: float,
+) -> tuple[np.ndarray, bool]:
+    """Readings (s, 18) flown to from every start, and whether every flight stayed finite.
+
+    gusts: share of them that is there at the start.
+    """
+    flown = np.full(targets.shape, np.nan)
+    x = run.states[run.start_rows]
+    x[:, engine.model.air] *= gusts
+    finite = compiled_model.fly_open_loop(
+        engine.compiled, dt, inputs, x, p, run.start_rows, targets, flown
+    )
+    return flown, bool(finite)
 
 
 def _readings_at(run: RunPass, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -255,9 +304,12 @@ def _channel(
 
 def _error(name: str, difference: np.ndarray) -> np.ndarray:
     """Prediction less measurement, wrapped for roll and pitch."""
-    if name in ("phi", "theta"):
-        return np.asarray(np.mod(difference + np.pi, 2.0 * np.pi) - np.pi)
-    return difference
+    return _wrapped(difference) if name in ("phi", "theta") else difference
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    """Within half a turn."""
+    return np.asarray(np.mod(angle + np.pi, 2.0 * np.pi) - np.pi)
 
 
 def _spread(
