@@ -23,6 +23,7 @@ from coax_env.estimation.multi_step import (
     LARGE,
     STRETCH,
     _held_down,
+    _rms,
     fit_multi_step,
     some_of,
 )
@@ -71,6 +72,55 @@ def test_it_never_leaves_its_bounds():
     heavy = replace(FREE, lower=1.05 * MASS)
     assert fitted_mass(1.2, LOOSE, heavy) == pytest.approx(1.05, abs=1e-6)
     assert fitted_mass(1.05, LOOSE, heavy) == pytest.approx(1.05, abs=1e-6)
+
+
+def test_it_comes_off_a_bound_that_it_stands_at():
+    light = replace(FREE, lower=0.97 * MASS)
+    assert fitted_mass(0.97, LOOSE, light, engine(noisy(1))) == pytest.approx(1.0, abs=3e-3)
+    heavy = replace(FREE, upper=1.05 * MASS)
+    assert fitted_mass(1.05, LOOSE, heavy, engine(noisy(1))) == pytest.approx(1.0, abs=3e-3)
+
+
+def test_what_is_known_beforehand_holds_it():
+    known = replace(FREE, value=1.02 * MASS, std=1e-5 * MASS)
+    assert fitted_mass(1.03, LOOSE, known) == pytest.approx(1.02, abs=1e-4)
+
+
+MARKER = FreeParameter("marker_offset.x", 0.0, 0.05, reading_only=True)
+
+
+@pytest.mark.parametrize("horizon", [1.0, 2.0])
+@pytest.mark.parametrize("alike", [0.0, 0.99])
+def test_a_second_flown_is_one_reading_of_each_channel(horizon, alike):
+    """Too heavy by 3 %, climb rate and height are wrong in proportion to what is left of it, z: each by
+    its error over what it was at first. The likelihood pulls back as hard as both of them; the balance
+    of (z - 1)^2 and the pseudo-Huber loss of z is at z = 0.508. What only a reading has stays, and what
+    the likelihood says of the mass is what it says beside that.
+    """
+    nothing = dict.fromkeys(("p", "q", "r", "phi", "theta", "psi", "vn", "ve", "az"), np.nan)
+    of = engine(hover(seconds=8.0, **nothing))
+    starts = 1 + round((8.0 - 1.0 - horizon) / 0.25)
+    readings = starts * 2 * np.mean([0.25 / (share * horizon) for share in (0.5, 1.0)])
+    std = 0.03 * MASS * math.sqrt(BELIEVED / readings)  # with the marker where it is
+    both = std / math.sqrt(1.0 - alike**2)
+    across = alike * both * MARKER.std
+    covariance = np.array([[both**2, across], [across, MARKER.std**2]])
+    values = {"mass": 1.03 * MASS, MARKER.name: 0.01}
+    found = fit_multi_step(of, [FREE, MARKER], values, NOISE, covariance, horizon)
+    assert list(found) == ["mass"]
+    assert (found["mass"] / MASS - 1.0) / 0.03 == pytest.approx(0.508, abs=0.01)
+
+
+def test_numbers_that_only_readings_have_are_none_to_fly_by():
+    values = {"mass": MASS, MARKER.name: 0.01}
+    assert fit_multi_step(engine(), [MARKER], values, NOISE, np.array([[1e-4]])) == {}
+
+
+def test_errors_count_by_channel_where_they_are():
+    errors = np.array(
+        [[3.0, np.nan, 0.0, np.inf], [4.0, np.nan, 0.0, 1.0], [np.nan, np.nan, 0.0, 1.0]]
+    )
+    np.testing.assert_allclose(_rms(errors), [math.sqrt(12.5), 1.0, 1.0, 1.0])
 
 
 def test_a_likelihood_that_is_sure_holds_it_and_one_that_is_not_does_not():
@@ -132,13 +182,15 @@ def test_long_flights_are_fitted_on_stretches_of_them():
     """Evenly picked, none longer than STRETCH by half, their clocks kept; short ones stay whole."""
     short = [hover(seconds=8.0)]
     assert some_of(short)[0] is short[0]
-    long = [hover(seconds=400.0, dt=0.1), hover(seconds=90.0, dt=0.1)]
+    just = [hover(seconds=290.0, dt=0.1, start=500.0), hover(seconds=9.0, dt=0.1, start=900.0)]
+    assert [r.t.size for r in some_of(just)] == [r.t.size for r in just]
+    long = [hover(400.0, dt=0.1, start=500.0), hover(seconds=90.0, dt=0.1, start=1000.0)]
     found = some_of(long)
     lengths = [r.t[-1] - r.t[0] for r in found]
-    assert max(lengths) < 1.5 * STRETCH
+    assert STRETCH / 1.5 < min(lengths) < max(lengths) < 1.5 * STRETCH
     assert ENOUGH - STRETCH < sum(lengths) < ENOUGH + STRETCH
     assert {r.whole for r in found} == {r.whole for r in long}
-    assert max(r.t[-1] for r in found) > 390.0
+    assert (found[0].t[0], found[-1].t[-1]) == (long[0].t[0], long[-1].t[-1])
 
 
 # --- the diagnosis ----------------------------------------------------------------------------------
