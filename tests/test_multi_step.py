@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from test_prediction import LAMA, NOISE, hover
 
+from coax_env.diagnosis import flown_numbers
 from coax_env.diagnosis.flown_numbers import flying_nearest, numbers_apart
 from coax_env.diagnosis.problem import Fit
 from coax_env.diagnosis.settings import SETTINGS, Settings
-from coax_env.estimation import multi_step
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.multi_step import (
@@ -209,7 +209,7 @@ class Asked:
 
 def heavy(monkeypatch, coloured: bool) -> tuple[Asked, Fit]:
     """A machine that hovers, a fit 3 % too heavy, and whether much is coloured there."""
-    monkeypatch.setattr(multi_step, "is_much_coloured", lambda passes, channels: coloured)
+    monkeypatch.setattr(flown_numbers, "is_much_coloured", lambda problem, fit: coloured)
     return Asked(engine(noisy(1))), Fit((), {"mass": 1.03 * MASS, "gravity": 9.81}, NOISE)
 
 
@@ -231,5 +231,5 @@ def test_where_little_is_coloured_the_likeliest_numbers_stay(monkeypatch):
 def test_numbers_that_fly_no_nearer_are_not_taken(monkeypatch):
     """What is made least is not the error alone: where that has not become smaller, the fit stays."""
     asked, fit = heavy(monkeypatch, coloured=True)
-    monkeypatch.setattr(multi_step, "fit_multi_step", lambda *given: {"mass": 1.1 * MASS})
+    monkeypatch.setattr(flown_numbers, "fit_multi_step", lambda *given: {"mass": 1.1 * MASS})
     assert flying_nearest(asked, fit, LOOSE) is fit

@@ -8,10 +8,11 @@ likelihood had them from there. The two real CoaXes are such flights, and few **
 
 import numpy as np
 
-from coax_env.diagnosis.fits import quadratic_at
+from coax_env.diagnosis.fits import flown_errors, is_much_coloured, quadratic_at
 from coax_env.diagnosis.problem import Fit, Problem
-from coax_env.estimation import multi_step
+from coax_env.estimation.multi_step import fit_multi_step
 from coax_env.estimation.parted_engine import PartedEngine
+from coax_env.estimation.prediction import mean_log_ratio
 
 REMARK = (
     "much of what is read follows from what was read before, so the noise is not as the filter has it:"
@@ -30,16 +31,18 @@ def flying_nearest(problem: Problem, fit: Fit, covariance: np.ndarray | None = N
         problem, fit: what is free, and where it is likeliest.
         covariance: (k, k) of what is free there; default by the signatures.
     """
-    if isinstance(problem.engine, PartedEngine):
+    if isinstance(problem.engine, PartedEngine) or not is_much_coloured(problem, fit):
         return fit
     free = problem.free(fit.active)
     if covariance is None:
         _, quadratic = quadratic_at(problem, fit, free)
         covariance = quadratic.covariance([f.name for f in free])
-    values = multi_step.flying_nearest(
+    values = fit_multi_step(
         problem.engine, free, fit.values, fit.noise, covariance, problem.settings.horizon
     )
-    return fit.at(values) if values else fit
+    flown = fit.at(values)
+    nearer = mean_log_ratio(flown_errors(problem, flown), flown_errors(problem, fit)) < 0.0
+    return flown if nearer else fit
 
 
 def numbers_apart(fit: Fit, flown: Fit) -> dict[str, float]:

@@ -29,15 +29,8 @@ from scipy.optimize import least_squares
 
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.noise_levels import evenly_picked
-from coax_env.estimation.prediction import (
-    EVERY,
-    errors_ahead,
-    mean_log_ratio,
-    pooled_rms,
-    replay_runs,
-)
+from coax_env.estimation.prediction import EVERY, errors_ahead
 from coax_env.estimation.state_space import FreeParameter, Noise, Record, part
-from coax_env.estimation.whiteness import is_much_coloured
 
 SHARES = (0.5, 1.0)
 """Of the horizon, after which errors are taken; ours."""
@@ -57,30 +50,6 @@ LEAST_GAIN = 1e-3
 ENOUGH = 300.0
 """s of flight that are enough, in stretches of STRETCH, evenly picked; ours."""
 STRETCH = 30.0  # s
-
-
-def flying_nearest(
-    engine: Engine,
-    free: Sequence[FreeParameter],
-    values: Mapping[str, float],
-    noise: Noise,
-    covariance: np.ndarray,
-    horizon: float = 1.0,
-) -> dict[str, float]:
-    """`fit_multi_step` where much is coloured and its values fly nearer; else none, the likeliest stay.
-
-    Args:
-        engine, free, values, noise, covariance, horizon: as there.
-    """
-    if not is_much_coloured(engine.filter(values, noise), engine.model.channels):
-        return {}
-    found = fit_multi_step(engine, free, values, noise, covariance, horizon)
-
-    def flown(values: Mapping[str, float]) -> dict[str, float]:
-        return pooled_rms(replay_runs(engine, values, noise, horizon))
-
-    nearer = mean_log_ratio(flown({**values, **found}), flown(values)) < 0.0
-    return found if nearer else {}
 
 
 def fit_multi_step(

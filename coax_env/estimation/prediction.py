@@ -168,9 +168,11 @@ def _replay_run(
     targets = _targets(run, horizon)
     used = np.flatnonzero(np.isfinite(run.record.z).any(axis=0))
     t, measured = _readings_at(run, targets)
-    predicted, decaying, finite = _fly_all(engine, run, inputs, dt, p, targets)
-    unmoved = _unmoved(engine, run, inputs, dt, p)
-    diverged = not (finite and np.isfinite(run.log_likelihood))
+    predicted, finite = _fly(engine, run, inputs, dt, p, targets, gusts=0.0)
+    decaying, decayed = _fly(engine, run, inputs, dt, p, targets, gusts=1.0)
+    here = np.tile(run.start_rows[:, None], len(CHANNELS))
+    unmoved, _ = _fly(engine, run, inputs, dt, p, here, gusts=1.0)
+    diverged = not (finite and decayed and np.isfinite(run.log_likelihood))
     return RunReplay(
         run.record.name,
         {
@@ -184,37 +186,6 @@ def _replay_run(
         {CHANNELS[i]: _error(CHANNELS[i], unmoved[:, i] - measured[:, i]) for i in used},
         run.log_likelihood,
     )
-
-
-def _unmoved(
-    engine: Engine, run: RunPass, inputs: np.ndarray, dt: np.ndarray, p: np.ndarray
-) -> np.ndarray:
-    """Readings of the filtered state at every start itself, (s, 18)."""
-    rows = run.start_rows
-    readings = np.full((rows.size, len(CHANNELS)), np.nan)
-    here = np.tile(rows[:, None], len(CHANNELS))
-    compiled_model.fly_open_loop(
-        engine.compiled, dt, inputs, run.states[rows], p, rows, here, readings
-    )
-    return readings
-
-
-def _fly_all(
-    engine: Engine,
-    run: RunPass,
-    inputs: np.ndarray,
-    dt: np.ndarray,
-    p: np.ndarray,
-    targets: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Readings (s, 18) flown to from every start, with gusts set to zero and with gusts that decay.
-
-    Returns:
-        both, and whether every flight stayed finite.
-    """
-    predicted, finite = _fly(engine, run, inputs, dt, p, targets, gusts=0.0)
-    decaying, decayed = _fly(engine, run, inputs, dt, p, targets, gusts=1.0)
-    return predicted, decaying, finite and decayed
 
 
 def _fly(
