@@ -12,7 +12,8 @@ import pytest
 from causes import check_causes, truth_of
 
 import coax_env
-from coax_env.diagnosis.diagnose import diagnose, namable
+from coax_env.diagnosis.diagnose import diagnose
+from coax_env.diagnosis.preparation import namable
 from coax_env.logs.flight import Flight, Run, read_flight, write_flight
 from coax_env.model import dynamics
 from coax_env.model import inputs as U

@@ -14,7 +14,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import coax_env
-from coax_env.diagnosis import diagnose as diagnosing
+from coax_env.diagnosis import preparation
 from coax_env.diagnosis.battery import STEEPEST, WIDE, FeltVoltage, felt_voltage, stated
 from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.settings import SETTINGS
@@ -319,7 +319,7 @@ def test_speeds_that_follow_the_voltage_are_named_where_none_is_read(tmp_path, m
         asked.append({run.whole for run in flight.runs})
         return felt_voltage(flight, vehicle)
 
-    monkeypatch.setattr(diagnosing, "felt_voltage", of_fitted)
+    monkeypatch.setattr(preparation, "felt_voltage", of_fitted)
     found = diagnose(read_flight(tmp_path), hold_out=["yaw_3211"])
     (cause,) = found.findings["causes"]
     assert cause["effect"] == "battery_voltage" and BETWEEN_RUNS in cause["doubts"]

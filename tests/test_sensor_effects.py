@@ -7,7 +7,7 @@ from causes import check_causes, say_what_was_found, truth_of
 from injector_sensors import NOISE, POSE, Sensors
 
 from coax_env import diagnose, load_vehicle
-from coax_env.diagnosis.diagnose import namable
+from coax_env.diagnosis.preparation import namable
 from coax_env.logs.flight import Flight, Run
 from coax_env.model import effects
 

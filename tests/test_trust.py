@@ -36,9 +36,7 @@ from coax_env.diagnosis.scores import lost
 from coax_env.diagnosis.sensor_low_pass import may_hide_behind
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.diagnosis.trust import (
-    beside_large_axes,
     determined,
-    less_sure_beside_large_numbers,
     may_be_none,
     moved_far,
     of_line,
@@ -267,49 +265,6 @@ def test_a_number_is_determined_where_the_flights_say_more_than_the_prior(told, 
     quadratic = Quadratic.of(lin, problem.parameters, values)
     assert determined(problem, fit, quadratic, EFFECTS[0], 1.0) == {NAMES[0]: known}
     assert determined(problem, fit, quadratic, EFFECTS[0], 1e4) == {NAMES[0]: False}
-
-
-def test_beside_a_large_axis_the_others_are_as_wide():
-    model = HeliModel(LAMA)
-    own = {e: tuple(model.effect_parameters(e)) for e in ("gyro_bias", "ground_effect")}
-    usual = {f.name: f.std for group in own.values() for f in group}
-    problem = replace(problem_of(1), own=own)
-    values = {f.name: f.value for group in own.values() for f in group}
-    values["gyro_bias.x"] = 4.0 * usual["gyro_bias.x"]
-    wider = beside_large_axes(problem, Fit(tuple(own), values, Noise({})))
-    for f in (*wider.own["gyro_bias"], *wider.own["ground_effect"]):
-        factor = 4.0 if f.name.startswith("gyro_bias") else 1.0
-        assert f.std == pytest.approx(factor * usual[f.name]), f.name
-    values["gyro_bias.x"] = 2.0 * usual["gyro_bias.x"]
-    same = beside_large_axes(problem, Fit(tuple(own), values, Noise({})))
-    assert same.own == problem.own
-
-
-@pytest.mark.parametrize(
-    ("size", "told", "factor"), [(4.0, 0.0, 4.0), (4.0, 1e6, 1.0), (2.0, 0.0, 1.0)]
-)
-def test_beside_a_large_number_those_of_other_units_may_be_as_large(size, told, factor):
-    """A swash phase's angle is known; its change with rotor speed as the flights tell it, or not.
-
-    told: the data's information on it as a multiple of its prior's.
-    """
-    effect, names = "swash_phase", ("swash_phase.angle", "swash_phase.per_rpm")
-    parameters = tuple(HeliModel(LAMA).effect_parameters(effect))
-    usual = {f.name: f.std for f in parameters}
-    problem = replace(problem_of(1), own={effect: parameters}, base=())
-    assert beside_large_axes(problem, Fit((effect,), dict.fromkeys(names, 1e3), Noise({}))) == problem
-    information = np.diag([1e6 / usual[names[0]] ** 2, told / usual[names[1]] ** 2])
-    values = {names[0]: size * usual[names[0]], names[1]: 0.0}
-    slope = np.zeros((1, 2))  # of the data: it is at their best
-    lin = Linearised(names, information[None], slope, np.zeros((1, 1, 2)), np.zeros((4, 2)))
-    quadratic = Quadratic.of(lin, problem.parameters, values)
-    fit = Fit((effect,), values, Noise({}))
-    weighed = {effect: Evidence(100.0, 1.0)}
-    wider = less_sure_beside_large_numbers(problem, fit, quadratic, weighed)
-    std = quadratic.std(names)
-    assert wider.spread(names[1], std[names[1]], 1.0) == pytest.approx(factor * std[names[1]], rel=1e-3)
-    assert wider.spread(names[0], std[names[0]], 1.0) == pytest.approx(std[names[0]], rel=1e-2)
-    assert wider.values == values
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ are never a change, and what they can explain is no evidence for one.
 from collections.abc import Sequence
 
 from coax_env.comparison.two_flights import ROTOR_SPEED, B, OneFlight
-from coax_env.diagnosis.diagnose import namable
+from coax_env.diagnosis.preparation import namable
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.parted_engine import of_part
 from coax_env.estimation.state_space import FreeParameter

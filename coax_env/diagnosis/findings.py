@@ -7,17 +7,16 @@ from typing import Any
 import numpy as np
 
 from coax_env.diagnosis.battery import PER_VOLT, VOLTAGE, FeltVoltage, Line
-from coax_env.diagnosis.confounding import Alternatives, untold
+from coax_env.diagnosis.confounding import untold
 from coax_env.diagnosis.evidence import Evidence
-from coax_env.diagnosis.onsets.changing import Onset
-from coax_env.diagnosis.problem import Fit, Problem, exclusive_with
+from coax_env.diagnosis.problem import Fit, exclusive_with
 from coax_env.diagnosis.trust import Trust, of_line, of_voltage
+from coax_env.diagnosis.weighing import Weighed
 from coax_env.estimation import vibration
 from coax_env.estimation.changing_model import BEFORE
 from coax_env.estimation.fitted_vehicle import with_timing
 from coax_env.estimation.helicopter_noise import level_unit
 from coax_env.estimation.parted_engine import AT, of_part
-from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.run_passes import RunPass
 from coax_env.estimation.state_space import FreeParameter, Noise
 from coax_env.estimation.vibration import large
@@ -33,14 +32,9 @@ battery's sag 0.8 % off, a motor's droop 0.6 %, at 20 and 3 std of the readings 
 
 
 def causes(
-    problem: Problem,
-    fit: Fit,
-    quadratic: Quadratic,
-    evidence: Mapping[str, Evidence],
-    found: Alternatives,
+    weighed: Weighed,
     trust: Mapping[str, Trust],
     lines: Sequence[vibration.Line],
-    onsets: Mapping[str, Onset] | None = None,
     felt: FeltVoltage | None = None,
 ) -> list[dict[str, Any]]:
     """The causes: those that are sure before those that are doubtful, each strongest first.
@@ -49,16 +43,13 @@ def causes(
     where it was there before, those before it too, as `before`.
 
     Args:
-        problem, fit: with the causes.
-        quadratic: linearised at the fit.
-        evidence: of each cause.
-        found: the confounded alternatives of each cause.
+        weighed: the causes.
         trust: what speaks for and against each name; one without a name is not among the causes.
         lines: of a vibration that the vehicle file does not have.
-        onsets: of causes that began or changed.
         felt: how speeds follow the battery's voltage, where that is known before the search.
     """
-    onsets = onsets or {}
+    problem, _, quadratic, evidence, _, found = weighed.settled
+    fit, onsets = weighed.flown, weighed.onsets
     free = problem.free_names(fit.active)
     std = quadratic.std(free)
     dt = problem.row

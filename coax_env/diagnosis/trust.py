@@ -11,23 +11,21 @@ unexplained.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from coax_env.diagnosis.battery import PER_VOLT, FeltVoltage
 from coax_env.diagnosis.confounding import (
     KNOWN,
-    Alternatives,
     channels_of,
     channels_of_numbers,
     untold,
 )
 from coax_env.diagnosis.doubts import LOUD, Against, doubts, on_parts, sizes, weak, without_name
-from coax_env.diagnosis.evidence import Evidence, less_sure
+from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.late_rotor_speeds import LAG, by_speeds_alone
 from coax_env.diagnosis.noise_variation import not_holding
 from coax_env.diagnosis.onboard_filter import CIRCULAR
-from coax_env.diagnosis.onsets.changing import Onset
 from coax_env.diagnosis.problem import LIKE_DRIFT, Fit, Problem
 from coax_env.diagnosis.replication import Asked, Replication, halves_of, of_runs, replications
 from coax_env.diagnosis.sensor_low_pass import may_hide_behind
@@ -35,12 +33,10 @@ from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.diagnosis.shocks import in_shocks
 from coax_env.diagnosis.unlisted import acted_on
 from coax_env.diagnosis.unseen import Unseen
+from coax_env.diagnosis.weighing import Weighed
 from coax_env.diagnosis.where_shown import SizeWhereMost, size_where_most
-from coax_env.estimation.helicopter import UNUSUAL_FROM
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.vibration import Line
-from coax_env.estimation.whiteness import Whiteness
-from coax_env.model import effects
 
 MOVED = 3.0
 """Prior std by which a number of the vehicle has gone too far for what shows in its channels to be
@@ -103,33 +99,19 @@ class Trust:
 
 
 def trusts(
-    problem: Problem,
-    fit: Fit,
-    quadratic: Quadratic,
-    evidence: Mapping[str, Evidence],
-    found: Alternatives,
-    white: Mapping[str, Whiteness],
-    onsets: Mapping[str, Onset],
-    unseen: Mapping[str, Unseen],
-    worse: bool,
-    oscillates: bool,
-    flown: Fit,
+    weighed: Weighed, unseen: Mapping[str, Unseen], worse: bool, oscillates: bool
 ) -> dict[str, Trust]:
     """Every active effect judged.
 
     Args:
-        problem, fit: with the causes.
-        quadratic: linearised at the fit, its runs in it.
-        evidence: of each cause.
-        found: the confounded alternatives of each cause.
-        white: whiteness of the innovations, by channel.
-        onsets: of causes that began or changed.
+        weighed: the causes.
         unseen: worth of each on the held-out runs, where that was asked.
         worse: whether the model with the causes flies these worse.
         oscillates: whether the control loop oscillates through the flight.
-        flown: with the numbers that are stated (flown_numbers.py).
     """
-    worth = {effect: weighed.nats for effect, weighed in evidence.items()}
+    problem, fit, quadratic, evidence, _, found = weighed.settled
+    white, onsets, flown = weighed.white, weighed.onsets, weighed.flown
+    worth = {effect: judged.nats for effect, judged in evidence.items()}
     replicated = replications(problem, fit, quadratic, worth)
     falling = not_holding(problem, fit, quadratic, worth)
     shaken = bool(fit.active) and in_shocks(problem, fit)
@@ -323,71 +305,3 @@ def determined(
         left = 1.0 / math.sqrt(1.0 + of_data * f.std**2)  # std over the prior's
         result[f.name] = left <= problem.settings.undetermined
     return result
-
-
-# --- priors beside a large axis ---------------------------------------------------------------------
-
-
-def beside_large_axes(problem: Problem, fit: Fit) -> Problem:
-    """With the priors of an effect's other axes as wide as the largest that was found.
-
-    Where x is five times its usual size, that y and z are usual is not known.
-
-    Args:
-        problem, fit: after the search.
-    """
-    own = dict(problem.own)
-    for effect in fit.active:
-        numbers, largest = _of_a_large_one(problem, fit, effect)
-        if len(_units(effect)) == 1:
-            own[effect] = tuple(
-                replace(f, std=largest * f.std) if f.name in numbers else f for f in own[effect]
-            )
-    return replace(problem, own=own)
-
-
-def less_sure_beside_large_numbers(
-    problem: Problem, fit: Fit, quadratic: Quadratic, evidence: Mapping[str, Evidence]
-) -> Fit:
-    """The fit whose std of an effect's numbers of other units has in it that they may be as large, too.
-
-    A swash phase of 3.9 usual sizes had a change with rotor speed, which the flight does not determine,
-    of -0.0002 +- 0.00017, where -0.0008 was true (`study_diagnosis.py --arms sizes_large --seed 857`,
-    three 471, **synthetic**). The number itself stays by its usual prior: with a wider one a droop that
-    is not there came back on a real helicopter (first CoaX).
-
-    Args:
-        problem, fit: with the causes. quadratic: linearised at the fit. evidence: of the causes.
-    """
-    precision, free = quadratic.precision.copy(), problem.free_names(fit.active)
-    for effect in fit.active:
-        numbers, largest = _of_a_large_one(problem, fit, effect)
-        if len(_units(effect)) > 1:
-            precision[quadratic.index(numbers)] /= largest**2
-    if (precision == quadratic.precision).all():
-        return fit
-    wider = replace(quadratic, precision=precision)
-    _, move = wider.best(free)
-    std, wide = quadratic.std(free), wider.std(free)
-    apart = {
-        name: math.sqrt(float(move[i]) ** 2 + max(wide[name] ** 2 - std[name] ** 2, 0.0))
-        for name, i in zip(free, quadratic.index(free), strict=True)
-    }
-    return less_sure(problem, fit, quadratic, evidence, apart)
-
-
-def _of_a_large_one(problem: Problem, fit: Fit, effect: str) -> tuple[list[str], float]:
-    """An effect's numbers that act, and the largest's size [prior std]; none where that is usual."""
-    acting = set(problem.acting_names(effect))
-    sizes_of = {
-        f.name: abs(fit.values[f.name] - f.value) / f.std
-        for f in problem.own[effect]
-        if f.name in acting
-    }
-    largest = max(sizes_of.values())
-    return (list(sizes_of), largest) if len(sizes_of) > 1 and largest > UNUSUAL_FROM else ([], 1.0)
-
-
-def _units(effect: str) -> set[str]:
-    """Units of an effect's numbers but for those of its shape."""
-    return {p.unit for p in effects.CATALOGUE[effect].parameters if not p.shape}

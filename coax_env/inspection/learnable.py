@@ -11,8 +11,8 @@ from itertools import combinations
 import numpy as np
 
 from coax_env.diagnosis.battery import stated
-from coax_env.diagnosis.diagnose import namable
 from coax_env.diagnosis.fits import start
+from coax_env.diagnosis.preparation import namable
 from coax_env.diagnosis.problem import Problem
 from coax_env.estimation import vibration
 from coax_env.estimation.helicopter import HeliModel, record_of

@@ -85,6 +85,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "coax_env/diagnosis/unseen.py": ("tests/test_unseen.py", "tests/test_trust.py"),
     "coax_env/diagnosis/shock_evidence.py": ("tests/test_shock_evidence.py",),
     "coax_env/diagnosis/doubts.py": ("tests/test_trust.py",),
+    "coax_env/diagnosis/large_numbers.py": ("tests/test_large_numbers.py",),
     "coax_env/diagnosis/trust.py": ("tests/test_trust.py", "tests/test_diagnosis.py"),
     "coax_env/diagnosis/replication.py": (
         "tests/test_trust.py", "tests/test_noise_variation.py", "tests/test_diagnosis.py",

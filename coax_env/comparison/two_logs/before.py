@@ -8,8 +8,8 @@ import numpy as np
 from coax_env.comparison.two_logs.coordinates import ROTOR_SPEED, Coordinate, coordinates
 from coax_env.comparison.two_logs.logs import Logs
 from coax_env.diagnosis.battery import stated
-from coax_env.diagnosis.diagnose import namable
 from coax_env.diagnosis.fits import fitted, noise_fitted, start
+from coax_env.diagnosis.preparation import namable
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
