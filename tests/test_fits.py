@@ -184,22 +184,24 @@ def test_on_all_of_a_flight_with_slow_rows_noise_is_fitted_where_less_is_promise
 
 
 @pytest.mark.parametrize(
-    ("slow", "memory", "coloured", "hides"),
+    ("slow", "poses", "memory", "coloured", "hides"),
     [
-        (True, 0.5, False, True),
-        (True, 0.5, True, False),
-        (False, 0.5, False, False),
-        (False, 1.9, False, False),
-        (False, 2.1, False, True),
-        (False, 2.1, True, False),
+        (True, False, 0.5, False, True),
+        (True, False, 0.5, True, False),
+        (False, True, 0.5, False, True),
+        (False, True, 0.5, True, False),
+        (False, False, 0.5, False, False),
+        (False, False, 1.9, False, False),
+        (False, False, 2.1, False, True),
+        (False, False, 2.1, True, False),
     ],
 )
-def test_noise_may_hide_what_acts_between_slow_rows_or_in_gusts_that_last(
-    monkeypatch, slow, memory, coloured, hides
+def test_noise_may_hide_what_acts_between_slow_rows_by_poses_alone_or_in_gusts_that_last(
+    monkeypatch, slow, poses, memory, coloured, hides
 ):
     """But not where a model lacks much."""
     monkeypatch.setattr(fits, "is_much_coloured", lambda problem, fit: coloured)
-    problem: Any = SimpleNamespace(has_slow_rows=slow)
+    problem: Any = SimpleNamespace(has_slow_rows=slow, sees_poses_alone=poses)
     of_flights, of_parts = (
         replace(noise(), process={**noise().process, f"memory_force_z{part}": memory})
         for part in ("", "@late")
