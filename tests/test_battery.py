@@ -15,11 +15,13 @@ from scipy.stats import multivariate_normal
 
 import coax_env
 from coax_env.diagnosis import preparation
-from coax_env.diagnosis.battery import STEEPEST, WIDE, FeltVoltage, felt_voltage, stated
 from coax_env.diagnosis.diagnose import diagnose
 from coax_env.diagnosis.settings import SETTINGS
 from coax_env.diagnosis.trust import BETWEEN_RUNS, of_voltage
+from coax_env.estimation.battery import STEEPEST, WIDE, FeltVoltage, felt_voltage, stated
 from coax_env.estimation.helicopter import HeliModel, record_of
+from coax_env.estimation.prediction import pooled_rms
+from coax_env.identification.identify import identify
 from coax_env.logs.flight import Flight, Run, read_flight
 from coax_env.model import dynamics
 from coax_env.model import inputs as U
@@ -306,13 +308,21 @@ def on_batteries(folder: Path, voltages: dict[str, float], nominal: float) -> No
             writer.writerows(rows)
 
 
+FULL, LOW = ("heave_3211", "lon_3211"), ("climb_descend", "yaw_3211")
+
+
+@pytest.fixture(scope="module")
+def on_two_batteries(tmp_path_factory):
+    """In gusts, half of the runs on a battery that is full; the voltage of commands is 12.3 V."""
+    folder = tmp_path_factory.mktemp("batteries")
+    injector.fly(folder, {}, gusts=True, runs=[*FULL, *LOW], seed=6, longest=12.0)
+    on_batteries(folder, dict.fromkeys(FULL, 12.1) | dict.fromkeys(LOW, 10.9), 12.3)
+    return read_flight(folder)
+
+
 @pytest.mark.slow
-def test_speeds_that_follow_the_voltage_are_named_where_none_is_read(tmp_path, monkeypatch):
-    """In gusts, half of the runs on a battery that is full. What is held out has no say in it."""
-    full, low = ["heave_3211", "lon_3211"], ["climb_descend", "yaw_3211"]
-    injector.fly(tmp_path, {}, gusts=True, runs=[*full, *low], seed=6, longest=12.0)
-    voltages = dict.fromkeys(full, 12.1) | dict.fromkeys(low, 10.9)
-    on_batteries(tmp_path, voltages, 12.3)
+def test_speeds_that_follow_the_voltage_are_named_where_none_is_read(on_two_batteries, monkeypatch):
+    """What is held out has no say in it."""
     asked = []
 
     def of_fitted(flight: Flight, vehicle: coax_env.Vehicle) -> FeltVoltage:
@@ -320,12 +330,12 @@ def test_speeds_that_follow_the_voltage_are_named_where_none_is_read(tmp_path, m
         return felt_voltage(flight, vehicle)
 
     monkeypatch.setattr(preparation, "felt_voltage", of_fitted)
-    found = diagnose(read_flight(tmp_path), hold_out=["yaw_3211"])
+    found = diagnose(on_two_batteries, hold_out=["yaw_3211"])
     (cause,) = found.findings["causes"]
     assert cause["effect"] == "battery_voltage" and BETWEEN_RUNS in cause["doubts"]
     per_volt = cause["parameters"]["battery_voltage.per_volt"]
     assert abs(per_volt["value"] - 1.0 / 12.3) < 3.0 * per_volt["std"] < 0.03
-    assert asked == [{*full, *low} - {"yaw_3211"}]
+    assert asked == [{*FULL, *LOW} - {"yaw_3211"}]
     corrected = found.vehicle_after.effects["battery_voltage"]
     assert corrected["per_volt"].value == per_volt["value"]
     assert corrected["nominal"].value == pytest.approx(12.3, abs=0.3)
@@ -334,3 +344,27 @@ def test_speeds_that_follow_the_voltage_are_named_where_none_is_read(tmp_path, m
     assert flown["after"] < 0.7 * flown["before"]
     # refitted it has gusts as long as a run for it, which carry on for a second
     assert flown["after"] < flown["before_refitted"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("also", [(), ("battery_voltage",)])
+def test_identified_numbers_do_not_answer_for_the_voltage(on_two_batteries, also):
+    """By the felt thrust, or fitted with them; without a voltage in the log they do."""
+    found = identify(on_two_batteries, also=also)
+    known = found.after.effects["battery_voltage"]
+    assert abs(known["per_volt"].value - 1.0 / 12.3) < 3.0 * known["per_volt"].std < 0.03
+    assert known["nominal"].value == pytest.approx(12.3, abs=0.1)
+    assert any("low battery" in line for line in found.remarks) == (not also)
+    assert "battery_voltage" not in found.before.effects
+    own = [name for name in found.fitted if name in LAMA.parameters]
+    assert len(own) == len(found.fitted) - len(also)
+    off = [abs(found.after[n].value - LAMA[n].value) / found.after[n].std for n in own]
+    assert max(off) < 3.0
+    before, after = (pooled_rms(r)["h"] for r in (found.replay_before, found.replay_after))
+    assert after < 0.2 * before
+    runs = tuple(replace(run, battery=None) for run in on_two_batteries.runs)
+    blind = identify(replace(on_two_batteries, runs=runs))
+    assert not blind.after.effects
+    as_given, blindly = (pooled_rms(r)["h"] for r in (blind.replay_before, blind.replay_after))
+    assert blindly > 5.0 * after
+    assert before == pytest.approx(as_given, rel=0.05)

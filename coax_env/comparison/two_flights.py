@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
-from coax_env.diagnosis.battery import stated
 from coax_env.errors import InputError
 from coax_env.estimation import vibration
+from coax_env.estimation.battery import stated
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import RISE, ROTORS, HeliModel, record_of

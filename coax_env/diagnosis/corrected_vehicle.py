@@ -11,7 +11,7 @@ from coax_env.diagnosis.flown_numbers import flying_nearest
 from coax_env.diagnosis.input_innovations import engine_as_fitted
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import Engine, objective
-from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step
+from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step, with_stated
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.state_space import FreeParameter, Record
 from coax_env.estimation.vibration import Line, large
@@ -66,13 +66,7 @@ def corrected_vehicle(
         source,
         flight,
     )
-    stated = {
-        f"{e}.{p.name}": Parameter(fit.values[f"{e}.{p.name}"], 0.0, p.unit, source)
-        for e in fit.active
-        for p in CATALOGUE[e].parameters
-        if p.held
-    }
-    vehicle = vehicle.with_parameters(stated)
+    vehicle = with_stated(vehicle, fit.active, fit.values, source)
     units = {p.name: p.unit for p in CATALOGUE["vibration"].parameters}
     return vehicle.with_parameters(
         {

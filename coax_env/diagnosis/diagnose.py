@@ -31,7 +31,6 @@ from coax_env.diagnosis import (
     slow_commands,
     unlisted,
 )
-from coax_env.diagnosis.battery import PER_VOLT
 from coax_env.diagnosis.black_box import black_box
 from coax_env.diagnosis.calibration import calibrated, class_of
 from coax_env.diagnosis.corrected_vehicle import corrected_vehicle
@@ -56,6 +55,7 @@ from coax_env.diagnosis.shocks import engine_of
 from coax_env.diagnosis.trust import trusts
 from coax_env.diagnosis.unseen import worth_unseen
 from coax_env.diagnosis.weighing import weighed_causes
+from coax_env.estimation.battery import PER_VOLT
 from coax_env.estimation.changing_model import Lap, clock_of
 from coax_env.estimation.engine import Engine
 from coax_env.estimation.helicopter_noise import sensor_std

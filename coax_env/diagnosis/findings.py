@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from coax_env.diagnosis.battery import PER_VOLT, VOLTAGE, FeltVoltage, Line
 from coax_env.diagnosis.confounding import untold
 from coax_env.diagnosis.evidence import Evidence
 from coax_env.diagnosis.problem import Fit, exclusive_with
 from coax_env.diagnosis.trust import Trust, of_line, of_voltage
 from coax_env.diagnosis.weighing import Weighed
 from coax_env.estimation import vibration
+from coax_env.estimation.battery import PER_VOLT, VOLTAGE, FeltVoltage, Line
 from coax_env.estimation.changing_model import BEFORE
 from coax_env.estimation.fitted_vehicle import with_timing
 from coax_env.estimation.helicopter_noise import level_unit

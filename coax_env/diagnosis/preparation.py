@@ -8,19 +8,19 @@ import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.diagnosis import onboard_filter, slow_commands
-from coax_env.diagnosis.battery import (
-    VOLTAGE,
-    FeltVoltage,
-    felt_voltage,
-    stated,
-    voltage_varies,
-)
 from coax_env.diagnosis.corrected_vehicle import diagnosed_from
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.problem import WEAK_OR_LATE, Problem
 from coax_env.diagnosis.settings import Settings
 from coax_env.errors import InputError
 from coax_env.estimation import vibration
+from coax_env.estimation.battery import (
+    VOLTAGE,
+    FeltVoltage,
+    felt_voltage,
+    stated,
+    voltage_varies,
+)
 from coax_env.estimation.fitted_vehicle import double_counting
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, record_of

@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from coax_env.diagnosis.battery import PER_VOLT, FeltVoltage
 from coax_env.diagnosis.confounding import (
     KNOWN,
     channels_of,
@@ -35,6 +34,7 @@ from coax_env.diagnosis.unlisted import acted_on
 from coax_env.diagnosis.unseen import Unseen
 from coax_env.diagnosis.weighing import Weighed
 from coax_env.diagnosis.where_shown import SizeWhereMost, size_where_most
+from coax_env.estimation.battery import PER_VOLT, FeltVoltage
 from coax_env.estimation.quadratic import Quadratic
 from coax_env.estimation.vibration import Line
 

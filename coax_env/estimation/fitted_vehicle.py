@@ -1,6 +1,6 @@
 """A vehicle with numbers fitted to a flight: std, correlation, and what they were fitted on."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -42,6 +42,24 @@ def with_timing(parameter: FreeParameter, std: float, dt: float) -> float:
     if any(p.name == own and p.timing for p in known):
         return float(np.hypot(std, dt / np.sqrt(12.0)))
     return float(std)
+
+
+def with_stated(
+    vehicle: Vehicle, fitted: Iterable[str], values: Mapping[str, float], source: str
+) -> Vehicle:
+    """The vehicle with what effects took from the flight as stated: a battery's nominal voltage.
+
+    Args:
+        vehicle: with the effects. fitted: their names.
+        values: of the fit. source: recorded with every value.
+    """
+    stated = {
+        f"{effect}.{p.name}": Parameter(values[f"{effect}.{p.name}"], 0.0, p.unit, source)
+        for effect in fitted
+        for p in effects.CATALOGUE[effect].parameters
+        if p.held
+    }
+    return vehicle.with_parameters(stated)
 
 
 def fitted_vehicle(

@@ -2,8 +2,10 @@
 
 "paper" is the two steps of the paper's section V (two_step/). "ml" is maximum likelihood on the full
 model under priors (maximum_likelihood.py): the same engine as in the diagnosis, with the base
-parameters (and the effects the vehicle already has) free and nothing else. The result is a vehicle
-file that `gymnasium.make("CoaxHeli-v0", vehicle=...)` takes as it is.
+parameters (and the effects the vehicle already has) free and nothing else but how rotor speeds follow
+the battery's voltage, where the felt thrust shows it (estimation/battery.py): else masses and thrust
+coefficients answer for it. The result is a vehicle file that `gymnasium.make("CoaxHeli-v0",
+vehicle=...)` takes as it is.
 """
 
 from collections.abc import Collection
@@ -16,11 +18,13 @@ import numpy as np
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.errors import InputError
 from coax_env.estimation import between_rows, late_commands, vibration
+from coax_env.estimation.battery import PER_VOLT, VOLTAGE, felt_voltage, stated
 from coax_env.estimation.engine import Engine, Estimate
 from coax_env.estimation.fitted_vehicle import (
     double_counting,
     fitted_vehicle,
     median_step,
+    with_stated,
     with_timing,
 )
 from coax_env.estimation.flown import flown_parts
@@ -49,6 +53,9 @@ from coax_env.plain_words import and_list, plain
 from coax_env.progress import Progress, reporter, shows_progress
 
 METHODS = ("ml", "paper")
+
+VOLTAGE_SHOWN = 14.0
+"""nats from which speeds are taken to follow the battery's voltage: those of a name in a diagnosis."""
 
 
 @dataclass(frozen=True)
@@ -176,9 +183,14 @@ def _by_maximum_likelihood(
     known: tuple[str, ...],
     report: Progress,
 ) -> Identification:
-    model = HeliModel(vehicle)
+    given, vehicle = vehicle, _in_voltage(vehicle, flight, also)
+    as_given = {}  # what the model flies with as the vehicle was given
+    if vehicle is not given:
+        known = (*known, _voltage_remark(vehicle))
+        as_given = {PER_VOLT: 0.0}
+    model = HeliModel(vehicle, stated(flight, vehicle))
     engine = Engine(model, [record_of(run) for run in flight.runs])
-    free = free_parameters(model, also)
+    free = [f for f in free_parameters(model, also) if f.name not in as_given]
     if not free:
         raise InputError(
             f"vehicle {vehicle.name!r} has no parameter with a std: nothing to identify"
@@ -220,22 +232,45 @@ def _by_maximum_likelihood(
     apart = beside_commands(engine, found, values, report)
     dt = median_step(engine.records)
     after = _identified_vehicle(vehicle, found, inflation, apart, dt, flight)
+    after = with_stated(after, set(also) - set(vehicle.effects), values, _source(flight))
+    if as_given:
+        first = fit_noise(engine, {**bare, **as_given}, start, fitted_levels(start))
     report("flying the runs open loop")
     sooner = late_commands.acting_sooner([record_of(run) for run in held.runs], late)
     again = Engine(model, between_rows.with_between(sooner, between))
     return Identification(
         held,
-        vehicle,
+        given,
         after,
         tuple(names),
         found.estimate,
         found.noise,
-        replay_runs(again, model.bare_values, first),
+        replay_runs(again, {**model.bare_values, **as_given}, first),
         replay_runs(again, values, found.noise),
         (*known, *([found.remark] if found.remark else []), *_answered_gusts(found, apart)),
         *left_open(found.free, found.estimate.covariance),
         each_run(engine, found.free, lin, values, inflation),
         found.widened,
+    )
+
+
+def _in_voltage(vehicle: Vehicle, flight: Flight, also: Collection[str]) -> Vehicle:
+    """The vehicle whose speeds follow the battery's voltage, where the felt thrust shows it and the
+    vehicle does not know it; else as it is."""
+    felt = felt_voltage(flight, vehicle)
+    if VOLTAGE in {*vehicle.effects, *also} or not felt.is_shown(VOLTAGE_SHOWN):
+        return vehicle
+    return felt.known(vehicle, f"{_source(flight)} (felt thrust)")
+
+
+def _voltage_remark(vehicle: Vehicle) -> str:
+    """What is to be said of a voltage that was added. vehicle: with it."""
+    of_voltage = vehicle[PER_VOLT]
+    nominal = vehicle[f"{VOLTAGE}.nominal"]
+    return (
+        "by the felt thrust the rotors turn slower on a low battery, by"
+        f" {100.0 * of_voltage.value:.1f} +- {100.0 * of_voltage.std:.1f} % for each volt below"
+        f" {nominal.value:.1f} V: {plain(VOLTAGE)} was added to the vehicle"
     )
 
 
@@ -257,17 +292,22 @@ def _identified_vehicle(
     """
     covariance = found.estimate.covariance * np.sqrt(np.outer(inflation, inflation))
     stds = np.hypot(np.sqrt(np.diag(covariance)), apart).tolist()
-    where = flight.path.name if flight.path else "flight"
+    source = _source(flight)
     after = fitted_vehicle(
         vehicle,
         found.free,
         found.estimate.values,
         {f.name: with_timing(f, std, dt) for f, std in zip(found.free, stds, strict=True)},
         covariance,
-        f"identified from {where} (maximum likelihood)",
+        f"{source} (maximum likelihood)",
         flight,
     )
-    return replace(after, description=f"{vehicle.description}; identified from {where}")
+    return replace(after, description=f"{vehicle.description}; {source}")
+
+
+def _source(flight: Flight) -> str:
+    """What a number that is found has as its source, or the beginning of it."""
+    return f"identified from {flight.path.name if flight.path else 'flight'}"
 
 
 def _answered_gusts(found: OwnNumbers, apart: np.ndarray) -> list[str]:

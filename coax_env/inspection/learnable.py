@@ -10,11 +10,11 @@ from itertools import combinations
 
 import numpy as np
 
-from coax_env.diagnosis.battery import stated
 from coax_env.diagnosis.fits import start
 from coax_env.diagnosis.preparation import namable
 from coax_env.diagnosis.problem import Problem
 from coax_env.estimation import vibration
+from coax_env.estimation.battery import stated
 from coax_env.estimation.helicopter import HeliModel, record_of
 from coax_env.estimation.helicopter_noise import starting_noise
 from coax_env.estimation.quadratic import Quadratic

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from coax_env.diagnosis.battery import stated
 from coax_env.diagnosis.fits import linearise, noise_fitted, start, without_drifts
 from coax_env.diagnosis.onsets.changing import beginning
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation import vibration
+from coax_env.estimation.battery import stated
 from coax_env.estimation.changing_model import BEFORE, Lap, clock_of
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, Moment, record_of

@@ -7,13 +7,13 @@ import numpy as np
 
 from coax_env.comparison.two_logs.coordinates import ROTOR_SPEED, Coordinate, coordinates
 from coax_env.comparison.two_logs.logs import Logs
-from coax_env.diagnosis.battery import stated
 from coax_env.diagnosis.fits import fitted, noise_fitted, start
 from coax_env.diagnosis.preparation import namable
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.diagnosis.search import search
 from coax_env.diagnosis.settings import SETTINGS, Settings
 from coax_env.estimation import vibration
+from coax_env.estimation.battery import stated
 from coax_env.estimation.changing_model import BEFORE, ChangingModel, clock_of
 from coax_env.estimation.flown import flown_parts
 from coax_env.estimation.helicopter import HeliModel, Moment, record_of
