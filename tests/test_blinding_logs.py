@@ -128,8 +128,10 @@ def test_40_ms_of_nonsense_are_found_at_any_rate(rate, channel, nonsense):
     "name",
     [
         "open_none",
-        *(pytest.param(f"open_{w}", marks=pytest.mark.slow) for w in ("near_ground", "rigging")),
-        "open_outside",
+        *(
+            pytest.param(f"open_{w}", marks=pytest.mark.slow)
+            for w in ("near_ground", "rigging", "outside")
+        ),
     ],
 )
 def test_no_sound_flight_is_repaired(name):

@@ -48,6 +48,7 @@ def flight() -> Flight:
 # --- two logs of one flight -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_logs_of_one_flight_are_told_from_two_flights():
     log = flight()
     (first, second), rng = log.runs, np.random.default_rng(1)

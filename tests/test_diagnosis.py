@@ -452,6 +452,7 @@ def test_the_held_out_runs_are_taken_in_at_the_end(still):
     assert (std / alone).min() < 0.9
 
 
+@pytest.mark.slow
 def test_the_choice_of_the_hold_out_does_not_look_at_residuals(still, monkeypatch):
     """With every innovation and slope blotted out, the same runs are chosen."""
 

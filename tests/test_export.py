@@ -23,6 +23,7 @@ KINDS = (
     ("lqg", "onboard"), ("lqg", "mocap"), ("scheduled", "mocap"), ("pid", "onboard"),
     ("pid", "mocap"), ("ppo", None), ("ppo_outdoor", "onboard"), ("ppo_outdoor", "mocap"),
 )  # fmt: skip
+QUICK = (("lqg", "mocap"), ("pid", "onboard"), ("ppo", None), ("ppo_outdoor", "mocap"))
 FAR = [(10.0, 0.0, 1.5, 0.0), (12.0, 0.5, 2.0, 0.5)]
 
 
@@ -63,7 +64,7 @@ def readings(sensors: str, count: int, rows: int, seed: int) -> np.ndarray:
 @needs_compiler
 @pytest.mark.parametrize(
     ("kind", "sensors"),
-    [pytest.param(*k, marks=pytest.mark.slow) if k == ("scheduled", "mocap") else k for k in KINDS],
+    [k if k in QUICK else pytest.param(*k, marks=pytest.mark.slow) for k in KINDS],
 )
 def test_any_readings_give_the_same_commands(kind, sensors, exported):
     controller, c, _ = exported(kind, sensors)
@@ -81,7 +82,7 @@ def test_any_readings_give_the_same_commands(kind, sensors, exported):
 @pytest.mark.parametrize(
     ("kind", "sensors", "flown"),
     [
-        ("lqg", "onboard", {}),
+        pytest.param("lqg", "onboard", {}, marks=pytest.mark.slow),
         ("pid", "onboard", {}),
         ("ppo", None, {"wind": 2.0, "turbulence": "light"}),
         ("lqg", "mocap", {"task": "waypoints"}),

@@ -526,6 +526,7 @@ def test_headings_averaged_across_half_a_turn_are_found(
     assert not find_averaged_headings(t[:2], logged[:2]).any()
 
 
+@pytest.mark.slow
 def test_no_run_is_cut_where_a_heading_was_averaged(tmp_path: Path) -> None:
     """A row's reading is missing there, and nothing else: unwrapped it would lose a turn."""
     shutil.copytree(BUNDLED, tmp_path, dirs_exist_ok=True)

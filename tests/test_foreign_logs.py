@@ -428,7 +428,9 @@ def matrices(q: np.ndarray) -> np.ndarray:
     return np.stack(axes, axis=2)
 
 
-@pytest.mark.parametrize("kind", ["ros1", pytest.param("ros2", marks=pytest.mark.slow), "mcap"])
+@pytest.mark.parametrize(
+    "kind", [*(pytest.param(k, marks=pytest.mark.slow) for k in ("ros1", "ros2")), "mcap"]
+)
 def test_ros(tmp_path, kind):
     """FLU and ENU, as REP 103 has them: ours come out."""
     pytest.importorskip("rosbags")

@@ -185,7 +185,7 @@ def test_the_pass_is_the_textbooks_filter(sine, clock):
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-7)
 
 
-@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("known", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_what_changes_at_unknown_times_is_believed_as_little_as_it_deserves(known):
     """A torque that jumps once within each row, evenly anywhere: its mean is half of the next one's.
 
