@@ -79,6 +79,7 @@ def test_harmonics_are_all_those_of_the_band_dealt_out_in_turn():
         harmonics(2, 2.0, 1.0, 2.0)
 
 
+@pytest.mark.slow
 def test_a_history_is_a_sum_of_sines_of_equal_power_that_starts_from_rest():
     """Equal amplitudes at its harmonics and none elsewhere; it begins where it crosses 0 upwards."""
     for wave, numbers in zip(multisines(2, 10.0).T, harmonics(2, 10.0), strict=True):

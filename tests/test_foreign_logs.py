@@ -282,6 +282,7 @@ def test_px4(tmp_path):
     same(imported(tmp_path / "log.ulg", tmp_path / "f", take), SENSORS)
 
 
+@pytest.mark.slow
 def test_ardupilot(tmp_path):
     pytest.importorskip("pymavlink")
     c = commands()

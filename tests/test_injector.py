@@ -269,6 +269,7 @@ def test_a_gust_that_comes_together_turns_and_lifts() -> None:
     assert abs(alike[0, 1]) < 0.15 and abs(alike[0, 3]) < 0.15
 
 
+@pytest.mark.slow
 def test_each_day_has_its_own_gusts() -> None:
     stds = [history_of("days", 20_000, seed).std() for seed in range(30)]
     assert min(stds) < 0.5 and max(stds) > 1.3

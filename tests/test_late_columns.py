@@ -63,6 +63,7 @@ def test_what_is_written_late_is_read_as_if_it_were_not(tmp_path):
     assert all(any(name in note for note in flight.notes) for name in (*COMMANDS, "battery_v"))
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10_000), late=st.floats(0.0, 0.2))
 def test_a_held_command_keeps_its_area(seed: int, late: float):
     """Of uneven rows, too: what it adds up to by any row is what was held until so much later."""

@@ -52,6 +52,7 @@ def flown() -> tuple[Record, Record, Noise]:
     return replace(record, z=cut), replace(record, z=z), starting_noise(bundled(), LAMA)
 
 
+@pytest.mark.slow
 def test_readings_go_back_to_the_rows_that_they_are_of():
     """What was there before is there again; the variances of their clock errors go with them."""
     on_time, late, _ = flown()

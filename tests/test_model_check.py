@@ -75,6 +75,7 @@ def test_nothing_is_said_of_a_right_model(gusty):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_gusts_taken_for_too_weak_are_seen_a_second_ahead(gusty):
     """Yaw gusts a tenth of what they are: the heading's errors grow beyond what they should be."""
     problem, noise = gusty

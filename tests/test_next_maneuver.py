@@ -179,6 +179,7 @@ def test_wind_and_rigging_are_parted_by_a_turn():
 # --- the envelope -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_candidate_but_few_is_safe_with_the_bare_vehicle():
     flown = {plan.summary: Envelope().breach(fly(LAMA, plan, dt=ROW)) for plan in candidates()}
     assert sum(bool(why) for why in flown.values()) <= 2, flown

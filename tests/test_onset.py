@@ -132,6 +132,7 @@ def test_moved_from_a_row_on_is_the_model_that_changes_there(short):
     assert information[3:, 3:] * np.outer(unit, unit) == pytest.approx(exact, abs=0.01)
 
 
+@pytest.mark.slow
 def test_what_begins_and_what_always_was_share_the_rows_from_there_on(short):
     """Information across: the column of what begins, times that before and after together."""
     model, records, noise = short

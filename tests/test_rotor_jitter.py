@@ -363,6 +363,7 @@ def test_a_planted_level_and_memory_return(engine_and_noise):
     assert found.level(JITTER_MEMORY) == pytest.approx(0.06, rel=0.35)
 
 
+@pytest.mark.slow
 def test_jitter_of_one_run_alone_is_seen(engine_and_noise):
     """Also where the noise of a search is fitted on another one: on the first of three here."""
     (shaken,), noise = engine_and_noise[0].records, engine_and_noise[1]

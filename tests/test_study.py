@@ -532,6 +532,7 @@ def test_sizes_on_another_craft_do_what_they_do_on_the_papers() -> None:
         assert name in plan.SIZES[effect]
 
 
+@pytest.mark.slow
 def test_the_levels_of_an_air_are_its_own() -> None:
     levels = gust_levels(GUSTY, LAMA)
     known = {"force_xy": 0.2, "force_z": 0.2, "moment_xy": 0.006, "moment_z": 0.003}
