@@ -1,6 +1,7 @@
 """Maximum likelihood identification: planted numbers come back, and what cannot is said."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import injector
 import numpy as np
@@ -12,6 +13,8 @@ from coax_env import identify, load_vehicle, simulate
 from coax_env.errors import InputError
 from coax_env.estimation.helicopter import HeliModel
 from coax_env.estimation.prediction import pooled_rms, replay_runs
+from coax_env.estimation.state_space import FreeParameter
+from coax_env.identification.identify import _at_limits
 
 LAMA = load_vehicle("lama400d")
 AXES = ("lon_3211", "lat_3211", "heave_3211", "yaw_3211")
@@ -132,3 +135,23 @@ def test_sensor_biases_are_fitted_on_request():
         assert result.after[name].std < 0.002
     with pytest.raises(InputError, match="no effect 'bias'"):
         identify(simulate(LAMA, "hover"), LAMA, also=["bias"])
+
+
+@pytest.mark.parametrize(
+    ("mass", "gain", "words"),
+    [
+        (2.9, 0.5, ""),
+        (3.0, 0.5, "mass stands at a limit"),
+        (0.303, 1.0, "mass and swash gain gain stand at a limit"),
+        (1.0, 0.0, ""),  # none of an effect that may be none
+    ],
+)
+def test_what_stands_at_a_limit_is_said(mass, gain, words):
+    free = [
+        FreeParameter("mass", 1.0, 0.1, lower=0.3, upper=3.0),
+        FreeParameter("swash_gain.gain", 0.0, 0.2, lower=0.0, upper=1.0),
+    ]
+    values = {"mass": mass, "swash_gain.gain": gain}
+    found = SimpleNamespace(free=free, estimate=SimpleNamespace(values=values))
+    said = _at_limits(found)  # type: ignore[arg-type]
+    assert [line.startswith(words) for line in said] == ([True] if words else [])

@@ -26,10 +26,9 @@ from coax_env.diagnosis.settings import Settings
 from coax_env.diagnosis.unseen import Unseen
 from coax_env.diagnosis.where_shown import SizeWhereMost
 from coax_env.estimation.helicopter import MOST_USUAL_SIZES, UNUSUAL_FROM
+from coax_env.estimation.state_space import AT_LIMIT
 from coax_env.plain_words import and_list, channel_name, plain
 
-AT_BOUND = 0.99
-"""Share of the most usual sizes from which a number stands at its bound; ours."""
 SPEAKING_AGAINST = 2
 """Of what speaks against a name so much takes it; ours."""
 MOST = 0.5
@@ -164,16 +163,15 @@ def sizes(problem: Problem, fit: Fit, effect: str) -> dict[str, float]:
     acting = set(problem.acting_names(effect))
     found = {}
     for f in problem.model.effect_parameters(effect):
-        far = fit.values[f.name] - f.value
-        most = abs((f.upper if far > 0.0 else f.lower) - f.value)
-        limited = f.name in acting and abs(far) > AT_BOUND * most > 0.0
-        found[f.name] = MOST_USUAL_SIZES if limited else abs(far) / f.std
+        value = fit.values[f.name]
+        limited = f.name in acting and f.is_at_limit(value)
+        found[f.name] = MOST_USUAL_SIZES if limited else abs(value - f.value) / f.std
     return found
 
 
 def is_limit(size: float) -> bool:
     """Whether a number of so many usual sizes stands at the limit of what is believed."""
-    return size > AT_BOUND * MOST_USUAL_SIZES
+    return size > AT_LIMIT * MOST_USUAL_SIZES
 
 
 def has_limit(numbers: Mapping[str, float]) -> bool:

@@ -6,6 +6,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+AT_LIMIT = 0.99
+"""Share of the way from a prior's mean to a limit from which a number stands there; ours."""
+
 
 @dataclass(frozen=True)
 class FreeParameter:
@@ -23,6 +26,18 @@ class FreeParameter:
     upper: float = np.inf
     probe: float = 0.0
     reading_only: bool = False
+
+    def is_at_limit(self, value: float) -> bool:
+        """Whether a value is as far from the prior's mean as it may be.
+
+        Not where that mean is the limit: an effect that may be none has not gone far to be none.
+
+        Args:
+            value: a fitted one.
+        """
+        far = value - self.value
+        most = abs((self.upper if far > 0.0 else self.lower) - self.value)
+        return abs(far) > AT_LIMIT * most > 0.0
 
 
 class Strength(NamedTuple):

@@ -247,7 +247,12 @@ def _by_maximum_likelihood(
         found.noise,
         replay_runs(again, {**model.bare_values, **as_given}, first),
         replay_runs(again, values, found.noise),
-        (*known, *([found.remark] if found.remark else []), *_answered_gusts(found, apart)),
+        (
+            *known,
+            *([found.remark] if found.remark else []),
+            *_answered_gusts(found, apart),
+            *_at_limits(found),
+        ),
         *left_open(found.free, found.estimate.covariance),
         each_run(engine, found.free, lin, values, inflation),
         found.widened,
@@ -321,6 +326,18 @@ def _answered_gusts(found: OwnNumbers, apart: np.ndarray) -> list[str]:
     return [
         f"the commands answer gusts: where they show these, {names} would be elsewhere by more than"
         " the readings alone leave open; how far is a part of the std"
+    ]
+
+
+def _at_limits(found: OwnNumbers) -> list[str]:
+    """What is to be said of numbers that stand at the limit of what is believed."""
+    there = [plain(f.name) for f in found.free if f.is_at_limit(found.estimate.values[f.name])]
+    if not there:
+        return []
+    stand = "stand" if len(there) > 1 else "stands"
+    return [
+        f"{and_list(there)} {stand} at a limit of what is believed (of a vehicle's number 0.3 to 3"
+        " times the file's): what the flights show may be something else"
     ]
 
 
