@@ -1,4 +1,11 @@
-"""A log made ready for the search: what is fitted, what is held out, and what may be named."""
+"""A log made ready for the search: what is fitted, what is held out, and what may be named.
+
+Data flow::
+
+    flight -> its flown parts -> does it agree with itself? -> vibration taken out
+        -> rows at a rate that the filter has time for -> runs to fit, runs held out
+        -> how speeds follow the battery -> effects that may be named -> problem
+"""
 
 import math
 from collections.abc import Collection, Sequence
@@ -56,7 +63,6 @@ class Prepared:
             the battery's voltage.
         felt: how they do, where the felt thrust shows it.
         lines: of a vibration that the vehicle file does not have.
-        circular: whether an onboard filter made readings of other readings.
         remarks: what was found on the way.
     """
 
@@ -68,7 +74,6 @@ class Prepared:
     as_given: HeliModel
     felt: FeltVoltage | None
     lines: tuple[vibration.Line, ...]
-    circular: bool
     remarks: tuple[str, ...]
 
 
@@ -136,9 +141,7 @@ def prepared(
         *([slow_commands.of_seldom(between)] if seldom else []),
     )
     new_lines = lines if "vibration" not in vehicle.effects else ()
-    return Prepared(
-        flight, vehicle, problem, held, noise, as_given, felt, new_lines, circular, remarks
-    )
+    return Prepared(flight, vehicle, problem, held, noise, as_given, felt, new_lines, remarks)
 
 
 def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:
