@@ -9,6 +9,7 @@ from coax_env.diagnosis.confounding import of_undecided
 from coax_env.diagnosis.findings import stated_std
 from coax_env.diagnosis.flown_numbers import flying_nearest
 from coax_env.diagnosis.input_innovations import engine_as_fitted
+from coax_env.diagnosis.preparation import diagnosed_from
 from coax_env.diagnosis.problem import Fit, Problem
 from coax_env.estimation.engine import Engine, objective
 from coax_env.estimation.fitted_vehicle import fitted_vehicle, median_step, with_stated
@@ -74,11 +75,6 @@ def corrected_vehicle(
             for kind, (amplitude, std) in large(lines).items()
         }
     )
-
-
-def diagnosed_from(flight: Flight) -> str:
-    """The source of what a flight says. flight: any."""
-    return f"diagnosed from {flight.path.name if flight.path else 'flight'}"
 
 
 def with_held_out(

@@ -15,7 +15,6 @@ import numpy as np
 
 from coax_env.consistency.agreement import refuse_disagreement
 from coax_env.diagnosis import onboard_filter, slow_commands
-from coax_env.diagnosis.corrected_vehicle import diagnosed_from
 from coax_env.diagnosis.hold_out import check_hold_out, split
 from coax_env.diagnosis.problem import WEAK_OR_LATE, Problem
 from coax_env.diagnosis.settings import Settings
@@ -142,6 +141,11 @@ def prepared(
     )
     new_lines = lines if "vibration" not in vehicle.effects else ()
     return Prepared(flight, vehicle, problem, held, noise, as_given, felt, new_lines, remarks)
+
+
+def diagnosed_from(flight: Flight) -> str:
+    """The source of what a flight says. flight: any."""
+    return f"diagnosed from {flight.name}"
 
 
 def namable(exclude: Collection[str], vehicle: Vehicle, flight: Flight) -> tuple[str, ...]:

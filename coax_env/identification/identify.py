@@ -312,7 +312,7 @@ def _identified_vehicle(
 
 def _source(flight: Flight) -> str:
     """What a number that is found has as its source, or the beginning of it."""
-    return f"identified from {flight.path.name if flight.path else 'flight'}"
+    return f"identified from {flight.name}"
 
 
 def _answered_gusts(found: OwnNumbers, apart: np.ndarray) -> list[str]:

@@ -183,6 +183,11 @@ class Flight:
     synthetic: bool = False
 
     @property
+    def name(self) -> str:
+        """Its folder's name; of one without a folder "flight"."""
+        return self.path.name if self.path else "flight"
+
+    @property
     def run_names(self) -> tuple[str, ...]:
         """Names of the runs, in the card's order."""
         return tuple(run.name for run in self.runs)

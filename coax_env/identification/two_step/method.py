@@ -239,7 +239,7 @@ def _physical(
     cutoff: float,
     flight: Flight,
 ) -> tuple[tuple[PhysicalFit, ...], Vehicle]:
-    where = flight.path.name if flight.path else "flight"
+    where = flight.name
     fits, after = [], vehicle
     for physics in PHYSICS:  # thrusts first: the moments are theirs
         used = [run for run in runs if any(excites(run, axis) for axis in physics.axes)]
