@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -240,14 +241,25 @@ def test_a_group_is_what_flies_side_by_side():
 
 @pytest.mark.parametrize("larger", [True, False])
 def test_the_callers_share_grows_where_it_waits_and_falls_back_to_an_equal_one(larger):
-    """The other thread takes 2 ms and the caller none, or the caller does and the other none."""
-    balance = Balance()
+    """The other thread ends once the caller has found it at work, or the caller once the other has."""
+    found = threading.Event()
+
+    class Told(Balance):
+        def learn(self, waited: bool) -> None:
+            super().learn(waited)
+            found.set()
+
+    balance = Told()
     balance.more = 0.0 if larger else MOST_MORE
 
     def share(first: int, last: int) -> None:
-        time.sleep(0.002 if (first == 0) != larger else 0.0)
+        if larger and first > 0:
+            assert found.wait(60.0)
+        elif not larger and first == 0:
+            in_threads(lambda first, last: None, 2, 2)  # behind it in the one other thread
 
     for _ in range(3):
+        found.clear()
         in_threads(share, 800, 2, balance)
     assert 0.0 <= balance.more <= MOST_MORE
     assert (balance.more > 0.0) if larger else (balance.more < MOST_MORE)
